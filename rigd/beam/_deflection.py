@@ -92,7 +92,7 @@ class DeflectionFilter:
         step: Complex = np.exp(np.concatenate([pairs.ravel(), real_poles]) / rate_hz)
         # Row per mode, column per pole: weight of the pole in the mode.
         weights = np.zeros((z.size, step.size), dtype=np.complex128)
-        for i, residues in enumerate(_residues(z, pairs, beam, damping)):
+        for i, residues in enumerate(_mode_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
         if real_poles.size:
             weights[:, pairs.size :] = _branch_cut_weights(z, beam, damping, rate_hz, step, weights)
@@ -167,7 +167,7 @@ def _modal_stiffness_terms(
     return inertial + external, (1 + internal) * k_fourth, slope
 
 
-def _residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
+def _mode_residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
     """Return the residues of each H_i at its mode's two poles, shape (modes, 2), in rad/s."""
     load, _, slope = _modal_stiffness_terms(pairs, z[:, None], beam, damping)
     residues: Complex = load * pairs / slope

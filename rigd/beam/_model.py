@@ -149,9 +149,9 @@ class TransferGrid:
         """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         for part in self._parts:
-            c = 1 + damping.zeta * self._power(damping.alpha, part)
-            s_lambda = self._power(damping.lambda_, part)
-            f = _f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
+            c = 1 + damping.zeta * self._power_of_s(damping.alpha, part)
+            s_lambda = self._power_of_s(damping.lambda_, part)
+            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
             np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[part])
         return g.reshape(self.shape)
 
@@ -190,8 +190,8 @@ class TransferGrid:
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
         for part in self._parts:
-            s_alpha = self._power(damping.alpha, part)
-            s_lambda = self._power(damping.lambda_, part)
+            s_alpha = self._power_of_s(damping.alpha, part)
+            s_lambda = self._power_of_s(damping.lambda_, part)
             c = 1 + damping.zeta * s_alpha
             q = self._fourth_power_of_z(beam, damping, c, s_lambda, part)
             f, slope, remainder = _f_with_slope(q)
@@ -216,7 +216,7 @@ class TransferGrid:
                         row[:] = g[part]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
 
-    def _power(self, order: float, part: slice) -> Complex:
+    def _power_of_s(self, order: float, part: slice) -> Complex:
         """Return ``s^order`` on a part of the grid."""
         if self._log_magnitude is None:
             power = np.exp(order * self._log_s[part])
@@ -360,7 +360,7 @@ def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
     return root
 
 
-def _f(q: Complex) -> Complex:
+def _evaluate_f(q: Complex) -> Complex:
     """Return the function F(q) of the module's docstring."""
     f = np.empty_like(q)
     is_small = np.abs(q) < _SERIES_LIMIT

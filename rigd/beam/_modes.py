@@ -274,7 +274,7 @@ def poles_for_eigenvalues(
         )
     if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
         start = np.log(near_rad_s)
-        log_poles = _newton(start, omega_squared, external_coefficient, damping.zeta, damping)
+        log_poles = _newton_roots(start, omega_squared, external_coefficient, damping.zeta, damping)
         if bool((np.abs(log_poles - start) < SAME_ROOT_TOLERANCE).all()):
             upper = np.exp(log_poles)
             return np.stack([upper, upper.conj()], axis=1)
@@ -399,7 +399,7 @@ def _poles_by_continuation(
     """
     log_s: Complex = 0.5 * np.log(omega_squared) + 0.5j * np.pi
     for fraction in (np.arange(1, steps + 1) / steps) ** 2:
-        log_s = _newton(
+        log_s = _newton_roots(
             log_s, omega_squared, fraction * external_coefficient, fraction * damping.zeta, damping
         )
     poles: Complex = np.exp(log_s)
@@ -416,14 +416,16 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
     starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
     log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
-    log_s = _newton(log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping)
+    log_s = _newton_roots(
+        log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
+    )
     converged = ~np.isnan(log_s)
     first = np.argmax(converged, axis=1)[:, None]
     poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
     return poles
 
 
-def _newton(
+def _newton_roots(
     log_s: Complex,
     omega_squared: Real,
     external_coefficient: float,

@@ -104,11 +104,13 @@ class PointForceGrid:
         x = np.asarray(x_m, dtype=np.float64)
         out = np.empty((self._b4.size, x.size), dtype=np.complex128)
         b4 = self._b4[self._small_q_indices, None]
-        moment, shear = self._root_derivatives(b4, b4 * self._k(3), b4 * self._k(2))
+        moment, shear = self._root_derivatives(
+            b4, b4 * self._series_at_tip(3), b4 * self._series_at_tip(2)
+        )
         out[self._small_q_indices] = (
-            _series(b4, x.ravel(), 1, order)
-            + moment * _series(b4, x.ravel(), 2, order)
-            + shear * _series(b4, x.ravel(), 3, order)
+            _power_series(b4, x.ravel(), 1, order)
+            + moment * _power_series(b4, x.ravel(), 2, order)
+            + shear * _power_series(b4, x.ravel(), 3, order)
         )
         out[self._large_q_indices] = self._exponentials.response_per_angle(x.ravel(), order)
         return out.reshape((*self._shape, *x.shape))
@@ -142,11 +144,13 @@ class PointForceGrid:
         )
         distance_to_tip = self._length_m - at
         moment, shear = self._root_derivatives(
-            b4, _series(b4, distance_to_tip, 1), _series(b4, distance_to_tip, 0)
+            b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
         )
-        beyond_force = np.where(x > at, _series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
+        beyond_force = np.where(x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
         out[self._small_q_indices] = (
-            moment * _series(b4, x, 2, order) + shear * _series(b4, x, 3, order) + beyond_force
+            moment * _power_series(b4, x, 2, order)
+            + shear * _power_series(b4, x, 3, order)
+            + beyond_force
         ) / stiffness
         out[self._large_q_indices] = (
             self._exponentials.response_per_force_over_stiffness(x, at, order)
@@ -159,11 +163,11 @@ class PointForceGrid:
 
         The shape is that of the grid.
         """
-        return -self._stiffness() * self.per_angle(0.0, 2)
+        return -self._bending_stiffness() * self.per_angle(0.0, 2)
 
     def shear_per_angle(self) -> Complex:
         """Return the shear force at the root per angle in N/rad, in the shape of the grid."""
-        return self._stiffness() * self.per_angle(0.0, 3)
+        return self._bending_stiffness() * self.per_angle(0.0, 3)
 
     def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the motor's torque on the beam per point force on it, in N·m/N.
@@ -176,7 +180,7 @@ class PointForceGrid:
             Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return -self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
+        return -self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
 
     def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
         """Return the shear force at the root per point force on the beam, dimensionless.
@@ -189,15 +193,15 @@ class PointForceGrid:
             Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
+        return self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
 
-    def _stiffness(self, axes: int = 0) -> Complex:
+    def _bending_stiffness(self, axes: int = 0) -> Complex:
         """Return Q in N·m² in the shape of s, followed by `axes` axes of length 1."""
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
-    def _k(self, n: int) -> Complex:
+    def _series_at_tip(self, n: int) -> Complex:
         """Return the series ``K_n`` at the tip for the s with small q, shape (low, 1)."""
-        return _series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
+        return _power_series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
 
     def _root_derivatives(
         self, b4: Complex, tip_moment: Complex, tip_shear: Complex
@@ -206,21 +210,21 @@ class PointForceGrid:
 
         `tip_moment` and `tip_shear` are the derivatives y''(L) and y'''(L) of the other terms.
         """
-        k0, k1, k3 = self._k(0), self._k(1), self._k(3)
+        k0, k1, k3 = self._series_at_tip(0), self._series_at_tip(1), self._series_at_tip(3)
         determinant = k0 * k0 - b4 * k1 * k3
         moment: Complex = (k1 * tip_shear - k0 * tip_moment) / determinant
         shear: Complex = (b4 * k3 * tip_moment - k0 * tip_shear) / determinant
         return moment, shear
 
 
-def _series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
+def _power_series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
     """Return the series ``K_n`` or its derivative at the points x, shape (s, m).
 
     `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
     """
     n -= order
     if n < 0:
-        return b4 * _series(b4, x, n + 4)
+        return b4 * _power_series(b4, x, n + 4)
     argument = b4 * x**4
     total = np.full_like(argument, 1 / factorial(4 * (_SERIES_TERMS - 1) + n))
     for k in range(_SERIES_TERMS - 2, -1, -1):

@@ -483,7 +483,7 @@ class LoadedBeam:
             could not be followed.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            upper_poles = self._newton(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
+            upper_poles = self._newton_roots(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
             if bool((np.abs(upper_poles / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
                 return np.column_stack([upper_poles, upper_poles.conj()])
         return self._followed_roots(z, zeros=False)
@@ -541,7 +541,7 @@ class LoadedBeam:
             start = 2 * current - previous if step > 1 else current
             previous, current = (
                 current,
-                partial_beam._newton(
+                partial_beam._newton_roots(
                     start, _NEWTON_TOLERANCE if last else _INTERMEDIATE_TOLERANCE, zeros=zeros
                 ),
             )
@@ -551,7 +551,7 @@ class LoadedBeam:
         roots[has_root] = np.column_stack([first, second])
         return roots
 
-    def _newton(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
+    def _newton_roots(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
         """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
 
         `s` has the starts and `tolerance` is the relative length of the last step. The result is

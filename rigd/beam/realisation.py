@@ -674,7 +674,7 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     extended = np.zeros((n + 1, n + 1))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n] = model.b * duration_s
-    exponential = _expm(extended)
+    exponential = _matrix_exponential(extended)
     return exponential[:n, :n], exponential[:n, n]
 
 
@@ -694,10 +694,10 @@ def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
     extended = np.zeros((n + m, n + m))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n:] = inputs * duration_s
-    return _expm(extended)[:n, n:]
+    return _matrix_exponential(extended)[:n, n:]
 
 
-def _expm(matrix: Real) -> Real:
+def _matrix_exponential(matrix: Real) -> Real:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order

@@ -177,7 +177,7 @@ class Bench:
         Stalls are ignored, because they affect every rate. The best of several attempts counts,
         because other programs only degrade the result.
         """
-        results.search.append(max(results.sessions, key=_merit))
+        results.search.append(max(results.sessions, key=_sort_key))
         upwards = _holds(results.search[0])
         rate_hz = self._rate_hz
         while True:
@@ -186,7 +186,9 @@ class Bench:
                 return
             attempt = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
             if attempt.held < HELD_FRACTION:
-                attempt = max(attempt, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_merit)
+                attempt = max(
+                    attempt, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
+                )
             results.search.append(attempt)
             if _holds(attempt) is not upwards:
                 return
@@ -274,7 +276,7 @@ def cores_without_loop(granted: dict[str, str]) -> set[int]:
     return allowed - {loop_core(granted)} or allowed
 
 
-def _merit(measured: LoopMeasurement) -> tuple[bool, float]:
+def _sort_key(measured: LoopMeasurement) -> tuple[bool, float]:
     """Return the sort key that is largest for the best measurement at a rate."""
     return measured.held >= HELD_FRACTION, measured.held_between_stalls
 

@@ -40,7 +40,7 @@ def report_lines(results: Results) -> Iterator[str]:
     )
     yield f"Load of this computer before: {results.load_average[0]:.2f}."
     yield ""
-    yield from _table(_measurements(results))
+    yield from _latency_table(_measurements(results))
     yield ""
     yield from _peer_lines(results)
     yield ""
@@ -113,7 +113,7 @@ def _measurements(results: Results) -> list[LoopMeasurement]:
     return [results.alone, *([] if peer is None else [peer]), *results.sessions]
 
 
-def _table(rows: list[LoopMeasurement]) -> Iterator[str]:
+def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
     """Yield the lines of the table of latencies."""
     yield (
         f"{'':{_NAME_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
@@ -175,8 +175,8 @@ def _as_dict(each: LoopMeasurement) -> dict[str, object]:
         "held": each.held,
         "held_between_stalls": each.held_between_stalls,
         "stalls": each.stalls,
-        "lateness_us": _figures(each.lateness_us),
-        "work_us": _figures(each.work_us) if each.work_us.size else None,
+        "lateness_us": _percentiles_object(each.lateness_us),
+        "work_us": _percentiles_object(each.work_us) if each.work_us.size else None,
         "cpu_percent": each.cpu_percent,
         "page_faults": each.page_faults,
         "histogram_us": dict(
@@ -185,7 +185,7 @@ def _as_dict(each: LoopMeasurement) -> dict[str, object]:
     }
 
 
-def _figures(values: npt.NDArray[np.float64]) -> dict[str, float]:
+def _percentiles_object(values: npt.NDArray[np.float64]) -> dict[str, float]:
     """Return the percentiles of some values as a JSON object."""
     return asdict(percentiles(values))
 
@@ -236,18 +236,20 @@ def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> l
     header = " " * (_LABEL_WIDTH + 3) + "".join(f"{name:<{_BAR_WIDTH + 9}}" for name, _ in columns)
     lines = [header.rstrip()]
     for index in range(used_bins[0], used_bins[-1] + 1):
-        bars = (f"{_bar(counts[index], longest)}{counts[index]:>7}  " for counts in bin_counts)
-        lines.append(f"{_label(index):>{_LABEL_WIDTH}}   {''.join(bars)}".rstrip())
+        bars = (
+            f"{_histogram_bar(counts[index], longest)}{counts[index]:>7}  " for counts in bin_counts
+        )
+        lines.append(f"{_bin_label(index):>{_LABEL_WIDTH}}   {''.join(bars)}".rstrip())
     return lines
 
 
-def _bar(count: int, longest: int) -> str:
+def _histogram_bar(count: int, longest: int) -> str:
     """Return the bar of a bin; `longest` is the count of the longest bar."""
     length = round((_BAR_WIDTH - 1) * log10(1 + count) / log10(1 + longest))
     return f"{_BAR_CHARACTER * max(length, int(count > 0)):<{_BAR_WIDTH}}"
 
 
-def _label(index: int) -> str:
+def _bin_label(index: int) -> str:
     """Return the label of a bin with its edges."""
     edges = edges_us()
     if index + 1 == len(edges):

@@ -137,7 +137,7 @@ class Clearance:
     @property
     def refusals(self) -> tuple[str, ...]:
         """Messages that refuse the session, one for each failed row that is not accepted."""
-        return tuple(_refusal(each) for each in self.failed if not each.accepted)
+        return tuple(_refusal_message(each) for each in self.failed if not each.accepted)
 
     @property
     def accepted(self) -> tuple[FailedCheck, ...]:
@@ -218,7 +218,7 @@ def _failure_text(row: CheckRow) -> str:
     return f"{row.group}, {row.what}: {row.found.rstrip('.')}{requirement}. {row.detail}".strip()
 
 
-def _refusal(failed: FailedCheck) -> str:
+def _refusal_message(failed: FailedCheck) -> str:
     """Return the message that refuses a session because of a failed row."""
     remedy = f" To accept it for one session: --accept {failed.name}." if failed.acceptable else ""
     return f"rigd check fails ({failed.name}): {failed.text}{remedy}"

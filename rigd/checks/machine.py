@@ -42,7 +42,7 @@ _REQUIRED_SETTINGS = {  # Required setting, for settings that were not granted
     "cpu": "realtime.cpu: a core of this computer",
     "idle_states": "/dev/cpu_dma_latency is writable",
 }
-_IDLE_STATES_REMEDY = (  # Advice if the depth of the processor's idle states cannot be limited
+_IDLE_STATES_ADVICE = (  # Advice if the depth of the processor's idle states cannot be limited
     "Idle states: a sleeping core takes long to wake up. Let the group rigd bound that with this "
     "line in /etc/udev/rules.d/90-rigd.rules, then udevadm trigger: "
     'KERNEL=="cpu_dma_latency", GROUP="rigd", MODE="0660"'
@@ -100,14 +100,14 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
                 priority=settings.priority, supervision_priority=settings.supervision_priority
             ),
             grade(fail=False, warn=not_granted),
-            _remedy(name, settings) if not_granted else "",
+            _setting_advice(name, settings) if not_granted else "",
         )
 
 
-def _remedy(name: str, settings: RealtimeSettings) -> str:
+def _setting_advice(name: str, settings: RealtimeSettings) -> str:
     """Return the advice for a setting that was not granted, or "" if there is none."""
     if name == "idle_states":
-        return _IDLE_STATES_REMEDY
+        return _IDLE_STATES_ADVICE
     lines = {
         "memory": f"{_user_name()} - memlock unlimited",
         "scheduling": f"{_user_name()} - rtprio {settings.priority}",
@@ -227,7 +227,7 @@ def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
             f"Isolated core: set realtime.cpu to -1 or to one of {cores}.",
         )
     else:
-        found, remedy = cores or "none", _how_to_isolate((os.cpu_count() or 1) - 1)
+        found, remedy = cores or "none", _isolation_advice((os.cpu_count() or 1) - 1)
     return CheckRow(
         _COMPUTER_GROUP,
         "isolated core",
@@ -238,7 +238,7 @@ def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     )
 
 
-def _how_to_isolate(last: int) -> str:
+def _isolation_advice(last: int) -> str:
     """Return the advice to isolate the last core, whose number is `last`."""
     if last == 0:
         return (

@@ -199,10 +199,10 @@ def print_table(
         if row.detail:
             console.print(Text(row.detail))
             console.print()
-    console.print(Text(_verdict(rows, consequences), style="bold"))
+    console.print(Text(_verdict_line(rows, consequences), style="bold"))
 
 
-def _verdict(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
+def _verdict_line(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
     """Return the line under the table: verdict, numbers of rows by result, and consequence."""
     counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult}
     text = (

@@ -107,7 +107,7 @@ def motor(
             hardware=hardware,
             quiet_stdout=as_json,
         )
-    _, proposal = _estimate(files, profile)
+    _, proposal = _estimate_motor(files, profile)
     if as_json:
         document = {"files": [str(path) for path in files], **proposal.as_dict()}
         typer.echo(json.dumps(document))
@@ -171,7 +171,7 @@ def _run_sessions(
 
     try:
         trial = run(trial_session, with_cautious_controller, 0, group)
-        estimate = _estimate([trial], profile_name)[0]
+        estimate = _estimate_motor([trial], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":
             return with_tuned_controller(profile, estimate)
@@ -184,7 +184,7 @@ def _run_sessions(
         ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
 
 
-def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
+def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
     """Estimate the motor from session files, and propose values for the profile."""
     from rigd.identification import propose, read_recording
     from rigd.identification.estimate import estimate_motor

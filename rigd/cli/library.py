@@ -145,7 +145,7 @@ def _local_start(row: "SessionRow") -> str:
         return ""
 
 
-def _table(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def _table_lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table, without columns whose cells are all empty."""
     filled_columns = [column for column in range(len(titles)) if any(row[column] for row in rows)]
     widths = {column: max(len(row[column]) for row in (titles, *rows)) for column in filled_columns}
@@ -162,7 +162,7 @@ def _session_lines(rows: "list[SessionRow]") -> Iterator[str]:
         *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
         *("tip slope", "uniform beam", "report"),
     )
-    yield from _table(
+    yield from _table_lines(
         titles,
         [
             (
@@ -219,7 +219,7 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
         if number > 1:
             yield ""
         lowest_hz, highest_hz = _frequency_limits(trend)
-        yield from _table(
+        yield from _table_lines(
             (
                 *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
                 *("tip slope", "file"),

@@ -32,11 +32,11 @@ def stop_and_report(profile: str | None, *, wait: bool) -> int:
         name = load_profile(profile).name
         if name != profile:
             report = stop_all(name, wait=wait)
-    _print(report)
+    _print_report(report)
     return 0 if report.sure else EXIT_FAILED
 
 
-def _print(report: "StopReport") -> None:
+def _print_report(report: "StopReport") -> None:
     """Print the result of a stop to standard output, and problems to standard error."""
     lines = [f"Stopped: {text}." for text in report.stopped]
     lines += [f"{text} is being stopped." for text in report.stopping]

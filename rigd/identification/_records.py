@@ -94,7 +94,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
                 f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
                 "sessions of one rig."
             )
-        usable, expected = _passes(session, session_number, rig_data[0].rate_hz)
+        usable, expected = _read_passes(session, session_number, rig_data[0].rate_hz)
         windows += usable
         unusable += expected - len(usable)
     if first is None:
@@ -107,7 +107,7 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     return Recording(windows, *first, unusable)
 
 
-def _passes(
+def _read_passes(
     session: Session, session_number: int, rate_hz: float
 ) -> tuple[list[PassReadings], int]:
     """Return the usable windows of a session, and the number of its passes."""

@@ -191,7 +191,7 @@ def _fit_equation(
     for _ in range(_MAX_ITERATIONS):
         rows = [_equations(stack, timing, delay_s, scale, unknowns) for stack in stacks]
         weights = weights or [np.ones(row.y.shape[1]) for row in rows]
-        solution = _solve(rows, weights, free)
+        solution = _solve_mean_equations(rows, weights, free)
         residuals = [row.y - row.x @ solution for row in rows]
         change_s = float(solution[DELAY_INDEX])
         if abs(change_s) < _DELAY_TOLERANCE_S:
@@ -206,7 +206,7 @@ def _fit_equation(
     return None
 
 
-def _solve(
+def _solve_mean_equations(
     rows: Sequence[_MotionEquations], weights: Sequence[Real], free: NDArray[np.bool_]
 ) -> Real:
     """Return the least-squares solution of the repeats' mean equations.
@@ -486,8 +486,8 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
             f"Of {window_count} passes {len(windows)} can be used, and that is too few: it takes "
-            f"at least {LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
-            "standstill."
+            f"at least {LEAST_REPEATS} of the same kind in both directions, without gaps and "
+            "without a standstill."
         )
     sessions = {
         number: index

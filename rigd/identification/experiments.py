@@ -179,7 +179,7 @@ def _multisine_excitation(
     loop = close_loop(profile.loop_model())
     schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
     passes_rad = _passes_reference(schedule, profile)
-    multisine = _multisine(schedule, loop, _SPEED_MODULATION[excitation_name])
+    multisine = _multisine_reference(schedule, loop, _SPEED_MODULATION[excitation_name])
     passes_nm = _peak_torque(loop, passes_rad)
     peak_nm = _peak_torque(loop, passes_rad + multisine)
     fraction = 1.0
@@ -349,7 +349,7 @@ def _add_offsets(reference: Real, schedule: PassSchedule, profile: Profile) -> N
         offset = next_offset
 
 
-def _multisine(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+def _multisine_reference(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
     """Return the reference angle in rad of the multisine alone.
 
     The response of the loop to it changes the speed of the passes by the fraction `modulation`.

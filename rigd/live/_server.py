@@ -57,7 +57,7 @@ class RerunServer:
         self._rig = rig
         self._grpc_port = free_port(GRPC_PORT)
         self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
-        self._start()
+        self._start_program()
 
     def wait(self) -> LiveAddress:
         """Wait until the first server accepts connections, and return its address.
@@ -72,7 +72,7 @@ class RerunServer:
             if not self._program.running:
                 if not self._grpc_port:
                     raise RerunError(f"The Rerun server ended: {self._program.last_log_lines}.")
-                self._replace()
+                self._restart()
             if time.monotonic() > deadline:
                 self.close()
                 raise RerunError(
@@ -95,7 +95,7 @@ class RerunServer:
             # The program mistook a listener on its port for another Rerun server.
             program.kill()
         if age_s > _MIN_RESTART_INTERVAL_S and not program.running:
-            self._replace()
+            self._restart()
         return False
 
     def accepts_connections(self) -> bool:
@@ -127,7 +127,7 @@ class RerunServer:
             with suppress(OSError):  # readers of the file notice that its process has ended
                 withdraw(self._announced_address)
 
-    def _replace(self) -> None:
+    def _restart(self) -> None:
         """Start another server, if possible on the same port for viewers and tunnels.
 
         If the last server never accepted connections, the port was taken, and the system chooses
@@ -136,9 +136,9 @@ class RerunServer:
         if not self._program.grpc_port:
             self._grpc_port = 0
         with suppress(RerunError):  # `poll` tries again
-            self._start()
+            self._start_program()
 
-    def _start(self) -> None:
+    def _start_program(self) -> None:
         """Start Rerun's program as a server."""
         self._started_s = time.monotonic()
         self._sessions = 0

@@ -16,7 +16,7 @@ from rigd.devices.cia402.objects import MAX_SPEED_RPM, RATED_TORQUE
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
 from rigd.devices.eds import Eds
 from rigd.errors import FailureError
-from rigd.profile._load import ProfileError, profile_of
+from rigd.profile._load import ProfileError, profile_from_text
 from rigd.profile._schema import UNKNOWN, Profile, key_types
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
@@ -112,7 +112,7 @@ class Draft:
             if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
                 self._settings[question.key] = Setting(question.key, math.nan, UNKNOWN)
 
-    def _value(self, key: str) -> SettingValue:
+    def _draft_value(self, key: str) -> SettingValue:
         """Return the value of a key in the draft."""
         if key in self._settings:
             return self._settings[key].value
@@ -145,7 +145,7 @@ class Draft:
             value = TypeAdapter(annotation).validate_strings(text)
         except ValidationError as error:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
-        if value != self._value(key):
+        if value != self._draft_value(key):
             self._settings[key] = Setting(key, value, "datasheet")
 
     def value_text(self, key: str) -> str:
@@ -156,7 +156,7 @@ class Draft:
         key
             Dotted key of the profile.
         """
-        return UNKNOWN if self._is_unknown(key) else str(self._value(key))
+        return UNKNOWN if self._is_unknown(key) else str(self._draft_value(key))
 
     def _is_unknown(self, key: str) -> bool:
         """Return whether the draft states a key as unknown."""
@@ -172,7 +172,7 @@ class Draft:
         """
         accepted = Setting(_ACCEPT_KEY, tuple(self._accepted))
         text = with_settings(self._base.text, [*self._settings.values(), accepted])
-        findings = check_suitability(self._eds, profile_of(text, self._path).rig).findings
+        findings = check_suitability(self._eds, profile_from_text(text, self._path).rig).findings
         return [each for each in findings if each.accept and each.grade is Grade.REFUSED]
 
     def accept(self, name: str) -> None:
@@ -189,7 +189,7 @@ class Draft:
     def remarks(self) -> list[str]:
         """Sentences for the operator on what remains uncertain about this drive."""
         findings = check_suitability(
-            self._eds, profile_of(self._text_without_head(), self._path).rig
+            self._eds, profile_from_text(self._text_without_head(), self._path).rig
         ).findings
         remarks = [f.sentence for f in findings if f.sentence]
         return remarks + [
@@ -225,7 +225,7 @@ class Draft:
             If the values of the draft contradict one another.
         """
         text = self._text_without_head()
-        profile_of(text, self._path)
+        profile_from_text(text, self._path)
         return with_head(text, self._head_comment())
 
     def _text_without_head(self) -> str:
@@ -233,7 +233,7 @@ class Draft:
         marked_settings = [
             Setting(
                 question.key,
-                self._value(question.key),
+                self._draft_value(question.key),
                 UNKNOWN if self._is_unknown(question.key) else "assumed",
                 reason="TO FILL IN: " + question.text,
             )

@@ -68,7 +68,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
     (1000.0, 0.98)
     """
     path = _find_profile(name_or_path)
-    return profile_of(read_text(path), path)
+    return profile_from_text(read_text(path), path)
 
 
 def read_text(path: Path) -> str:
@@ -85,7 +85,7 @@ def read_text(path: Path) -> str:
         raise ProfileError(f"{path}: {error}.") from error
 
 
-def profile_of(text: str, path: Path) -> Profile:
+def profile_from_text(text: str, path: Path) -> Profile:
     """Validate the text of a profile and return the profile; `path` is its file, existing or not.
 
     Raises
@@ -93,14 +93,14 @@ def profile_of(text: str, path: Path) -> Profile:
     ProfileError
         If the text has mistakes.
     """
-    document = parse(text, path)
+    document = parse_document(text, path)
     problems: list[str] = []
     values, sources = flatten_document(document, problems)
     absent = {
         name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
     }
     unknown = frozenset(key for key, source in sources.items() if source == UNKNOWN)
-    values = validate(values, problems, frozenset(absent), unknown)
+    values = validate_values(values, problems, frozenset(absent), unknown)
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(diagnostics.contradictions(values))
@@ -143,7 +143,7 @@ def profile_of(text: str, path: Path) -> Profile:
     )
 
 
-def parse(text: str, path: Path) -> dict[str, Any]:
+def parse_document(text: str, path: Path) -> dict[str, Any]:
     """Return the TOML document in the text of a file.
 
     Raises
@@ -260,7 +260,7 @@ def _dotted_entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str
             yield dotted, entry
 
 
-def validate(
+def validate_values(
     values: Mapping[str, Any],
     problems: list[str],
     absent: frozenset[str],

@@ -10,10 +10,10 @@ from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._load import (
     ProfileError,
     flatten_document,
-    parse,
+    parse_document,
     problems_error,
     read_text,
-    validate,
+    validate_values,
 )
 from rigd.profile._locations import specimen_files
 from rigd.profile._schema import (
@@ -66,7 +66,7 @@ def load_specimen(path: Path) -> Specimen:
     if len(text.encode()) > _MAX_BYTES:
         raise ProfileError(f"{path}: is longer than {_MAX_BYTES} bytes; shorten its notes.")
     problems: list[str] = []
-    values, _ = flatten_document(parse(text, path), problems)
+    values, _ = flatten_document(parse_document(text, path), problems)
     note = values.pop(_NOTE_KEY, "")
     if not isinstance(note, str):
         problems.append(f"{_NOTE_KEY} = {note!r} must be text in quotes.")
@@ -81,7 +81,7 @@ def load_specimen(path: Path) -> Specimen:
         )
     sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
     sections |= {_DAMPING_SECTION for key in values if key.startswith(f"{_DAMPING_SECTION}.")}
-    values = validate(values, problems, frozenset({"", *SECTIONS} - sections))
+    values = validate_values(values, problems, frozenset({"", *SECTIONS} - sections))
     if not problems:
         problems.extend(diagnostics.first_mode_contradictions(values))
     if problems:

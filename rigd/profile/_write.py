@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.profile._load import ProfileError, profile_of
+from rigd.profile._load import ProfileError, profile_from_text
 from rigd.profile._schema import UNKNOWN, Profile, is_number, key_types
 
 SettingValue = bool | int | float | str | tuple[str, ...]
@@ -152,7 +152,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
                 f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
                 "under its [section], so that no changed copy can be made; copy the file, edit it."
             ) from None
-        profile_of(text, path)
+        profile_from_text(text, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:

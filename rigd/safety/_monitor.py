@@ -288,7 +288,7 @@ class LimitWatch:
             self._elapsed_ticks += 1
         else:
             checked_values += self._speed_and_jump(angle_rad)
-        return self._assess(checked_values)
+        return self._assess_values(checked_values)
 
     def _speed_and_jump(self, angle_rad: float) -> list[_CheckedValue]:
         """Return the shaft's speed, and the jump of the angle, since the last new angle.
@@ -346,7 +346,7 @@ class LimitWatch:
         if self._fraction_near:  # set by an old wrench, for which `_check_in_detail` is not called
             self._fraction_near, self.warning = False, True
         limits = self._limits
-        return self._assess(
+        return self._assess_values(
             (
                 _checked_value("stale angle", self._stale_angles, limits.stale_ticks_in_a_row),
                 _checked_value("stale wrench", self._stale_wrenches, limits.stale_ticks_in_a_row),
@@ -359,7 +359,9 @@ class LimitWatch:
     def check_torque(self, requested_nm: float) -> Violation | None:
         """Check the torque that the controller requests, before it is limited and commanded."""
         limit_nm = self._limits.torque_command_nm
-        return self._assess((("torque command", "", "", requested_nm, limit_nm, self._peak_nm),))
+        return self._assess_values(
+            (("torque command", "", "", requested_nm, limit_nm, self._peak_nm),)
+        )
 
     def check_missed(self, missed: int, missed_so_far: int, scheduled: int) -> Violation | None:
         """Check the number and the percentage of missed ticks.
@@ -378,7 +380,7 @@ class LimitWatch:
         return self._assess_fraction(
             _checked_value("missed ticks", missed, limits.missed_ticks_in_a_row),
             _checked_value(
-                "missed share", self._percent(missed_so_far, scheduled), limits.missed_percent
+                "missed share", self._percentage(missed_so_far, scheduled), limits.missed_percent
             ),
         )
 
@@ -399,11 +401,13 @@ class LimitWatch:
         """
         limit = self._limits.stale_percent
         return self._assess_fraction(
-            _checked_value("stale angle share", self._percent(stale_angles, scheduled), limit),
-            _checked_value("stale wrench share", self._percent(stale_wrenches, scheduled), limit),
+            _checked_value("stale angle share", self._percentage(stale_angles, scheduled), limit),
+            _checked_value(
+                "stale wrench share", self._percentage(stale_wrenches, scheduled), limit
+            ),
         )
 
-    def _percent(self, ticks: int, scheduled: int) -> float:
+    def _percentage(self, ticks: int, scheduled: int) -> float:
         """Return the percentage of ticks in the scheduled ones, of at least ten seconds."""
         return 100.0 * ticks / max(scheduled, self._fraction_window)
 
@@ -413,7 +417,7 @@ class LimitWatch:
         The next sample is flagged if a percentage is near its limit.
         """
         previous_warning, self.warning = self.warning, False
-        violation = self._assess(checked_values)
+        violation = self._assess_values(checked_values)
         # The next sample is flagged.
         self._fraction_near = self._fraction_near or self.warning
         self.warning = previous_warning or self.warning
@@ -455,7 +459,7 @@ class LimitWatch:
             -max(0.0, elapsed_s) / self._time_constant_s
         ) + torque_squares_nm2 / (self._rate_hz * self._time_constant_s)
         previous_warning, self.warning = self.warning, False
-        violation = self._assess(
+        violation = self._assess_values(
             (
                 _checked_value("i²t", sqrt(self._heat_nm2), self._continuous_nm),
                 _checked_value("recorder lag", recorder_lag_s, self._limits.recorder_lag_s),
@@ -468,7 +472,9 @@ class LimitWatch:
     def check_tare(self, drift_nm: float) -> Violation | None:
         """Return a violation if the coupling torque's zero drifted too far since the last tare."""
         limit_nm = self._limits.tare_drift_nm
-        return self._assess((("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),))
+        return self._assess_values(
+            (("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),)
+        )
 
     def take_notices(self) -> list[str]:
         """Return and clear the warnings on channels that came near their limits.
@@ -478,7 +484,7 @@ class LimitWatch:
         notices, self._notices = self._notices, []
         return notices
 
-    def _assess(self, checked_values: Sequence[_CheckedValue]) -> Violation | None:
+    def _assess_values(self, checked_values: Sequence[_CheckedValue]) -> Violation | None:
         """Return the violation furthest beyond its limit, and register warnings.
 
         A value that is not a number counts as infinitely far beyond its limit.
@@ -503,7 +509,7 @@ class LimitWatch:
             self.warning = True
             channel = checked[1] or checked[0]
             if channel not in self._last_warnings:
-                self._notices.append(str(_violation(checked, warns=True)))
+                self._notices.append(str(_make_violation(checked, warns=True)))
             self._last_warnings[channel] = self._slow_checks
         return None
 
@@ -512,7 +518,7 @@ class LimitWatch:
 
         Without a stall the advice is that of the interlock.
         """
-        violation, missed = _violation(checked, warns=False), self.after_missed
+        violation, missed = _make_violation(checked, warns=False), self.after_missed
         if not missed or not BY_NAME[checked[0]].follows_missed_ticks:
             return violation
         if OVERLOADED not in missed:
@@ -532,7 +538,7 @@ def _checked_value(name: str, value: float, limit: float) -> _CheckedValue:
     return name, "", "", value, limit, _warning_fraction(name) * limit
 
 
-def _violation(checked: _CheckedValue, *, warns: bool) -> Violation:
+def _make_violation(checked: _CheckedValue, *, warns: bool) -> Violation:
     """Return a reading's violation of its limit, or with `warns` of its warning level."""
     name, channel, unit, value, limit, warning = checked
     row = BY_NAME[name]

@@ -92,7 +92,7 @@ class ScaleWatch:
         self._windows += 1
         if self._windows < _MIN_WINDOWS or self._windows % _CHECK_WINDOWS:
             return None
-        return self._check()
+        return self._check_ratio()
 
     def estimate(self) -> tuple[float, float]:
         """Return the estimated ratio and its standard deviation.
@@ -120,7 +120,7 @@ class ScaleWatch:
             variance_nm2 = max(_MIN_TORQUE_STD_NM**2, float(squares) / weight)
         return ratio, deviation
 
-    def _check(self) -> Violation | None:
+    def _check_ratio(self) -> Violation | None:
         """Return a violation if the ratio is significantly beyond its limit."""
         ratio, deviation = self.estimate()
         row = BY_NAME["scales"]

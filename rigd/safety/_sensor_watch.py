@@ -156,9 +156,9 @@ class SensorWatch:
         elif self._limits is None or self._counted_ticks + 1 < _COUNT_TICKS:
             self._counted_ticks += 1
             return None
-        return None if self._limits is None else self._check()
+        return None if self._limits is None else self._check_repeats()
 
-    def _check(self) -> Violation | None:
+    def _check_repeats(self) -> Violation | None:
         """Compare the runs and the fraction of repeated readings with their limits."""
         runs, limits = self._runs, self._limits
         assert limits is not None

@@ -335,7 +335,7 @@ class ProbingMove:
             self._record_missed_ticks(angle_rad, coupling_torque_nm)
         self._compare_coupling_torque(angle_rad, coupling_torque_nm)
         if self.end is None:
-            self._check(angle_rad)
+            self._check_bounds(angle_rad)
         torque_nm = 0.0 if self.end is not None else self._stroke_torque(angle_rad)
         self._torque_nm = self.unlimited_torque_nm = torque_nm
         self._record_tick(angle_rad, torque_nm, coupling_torque_nm)
@@ -377,16 +377,16 @@ class ProbingMove:
 
     def _is_encoder_frozen(self, angle_rad: float) -> bool:
         """Return whether the encoder has shown the same angle for `_FROZEN_ENCODER_S`."""
-        recent = self.angles_rad[-max(3, self._ticks(_FROZEN_ENCODER_S)) :]
+        recent = self.angles_rad[-max(3, self._to_ticks(_FROZEN_ENCODER_S)) :]
         return all(each == angle_rad for each in recent)
 
-    def _check(self, angle_rad: float) -> None:
+    def _check_bounds(self, angle_rad: float) -> None:
         """End the move if angle, speed or duration exceeds its bound."""
         plan = self._plan
         if (
             abs(angle_rad) > plan.bound_rad
             or abs(self._speed_rad_s) > plan.velocity_bound_rad_s
-            or self._tick_count - self._stroke_start > self._ticks(_MAX_STROKE_S)
+            or self._tick_count - self._stroke_start > self._to_ticks(_MAX_STROKE_S)
         ):
             self.end = ProbeEnd.AWAY
 
@@ -395,7 +395,7 @@ class ProbingMove:
         """Number of recorded ticks."""
         return len(self.angles_rad)
 
-    def _ticks(self, duration_s: float) -> int:
+    def _to_ticks(self, duration_s: float) -> int:
         """Return the number of ticks in a duration."""
         return round(duration_s / self._period_s)
 

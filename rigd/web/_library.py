@@ -57,22 +57,22 @@ class Library:
         self._access = access
         self._jobs = jobs
         self._exporting = asyncio.Lock()
-        self._listing = asyncio.Lock()
+        self._list_lock = asyncio.Lock()
         """Lock so that one list is made at a time, because lists may be slow and requests many."""
 
     def routes(self) -> list[web.RouteDef]:
         """Return the HTTP routes of the recorded sessions."""
         return [
-            web.get("/api/sessions", self._list),
-            web.get("/api/sessions/{id}/file.{ending}", self._file),
-            web.get("/api/sessions/{id}/look", self._quick_look),
-            web.get("/api/sessions/{id}/report/", self._report),
-            web.get("/api/sessions/{id}/report/{name}", self._report),
+            web.get("/api/sessions", self._list_sessions),
+            web.get("/api/sessions/{id}/file.{ending}", self._send_file),
+            web.get("/api/sessions/{id}/look", self._send_quick_look),
+            web.get("/api/sessions/{id}/report/", self._send_report),
+            web.get("/api/sessions/{id}/report/{name}", self._send_report),
             web.post("/api/sessions/{id}/report", self._make_report),
-            web.get("/api/campaign/{name}/", self._campaign),
-            web.get("/api/campaign/{name}/{file}", self._campaign),
+            web.get("/api/campaign/{name}/", self._send_campaign_report),
+            web.get("/api/campaign/{name}/{file}", self._send_campaign_report),
             web.post("/api/campaign", self._make_campaign),
-            web.get("/api/frf", self._responses),
+            web.get("/api/frf", self._send_responses),
         ]
 
     async def rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
@@ -83,7 +83,7 @@ class Library:
         **filters
             Filters of `rigd.library.list_sessions`.
         """
-        async with self._listing:
+        async with self._list_lock:
             return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
@@ -113,7 +113,7 @@ class Library:
 
     # Rows
 
-    async def _list(self, request: web.Request) -> web.Response:
+    async def _list_sessions(self, request: web.Request) -> web.Response:
         """Send a part of the list of sessions."""
         filters = {name: value for name in _FILTERS if (value := request.query.get(name))}
         limit, offset = (
@@ -124,7 +124,7 @@ class Library:
         shown = rows[offset : offset + min(limit, _MAX_ROWS)]
         return web.json_response({"total": len(rows), "sessions": [row.as_dict() for row in shown]})
 
-    async def _quick_look(self, request: web.Request) -> web.Response:
+    async def _send_quick_look(self, request: web.Request) -> web.Response:
         """Send the quick look of a session."""
         quick_look = self._read_quick_look(self._requested_session(request).stem)
         return (
@@ -133,7 +133,7 @@ class Library:
             else web.json_response(quick_look)
         )
 
-    async def _responses(self, request: web.Request) -> web.Response:
+    async def _send_responses(self, request: web.Request) -> web.Response:
         """Send fitted models and measured responses of several sessions for comparison."""
         ids = [name for name in request.query.get("ids", "").split(",") if name]
         if not 1 <= len(ids) <= _MAX_RESPONSES:
@@ -154,7 +154,7 @@ class Library:
 
     # Downloads
 
-    async def _file(self, request: web.Request) -> web.StreamResponse:
+    async def _send_file(self, request: web.Request) -> web.StreamResponse:
         """Send a session file, converted if another format is requested."""
         path = self._requested_session(request)
         ending = request.match_info["ending"]
@@ -187,7 +187,7 @@ class Library:
 
     # Reports
 
-    async def _report(self, request: web.Request) -> web.StreamResponse:
+    async def _send_report(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a session's report."""
         path = self._requested_session(request)
         session_row = next((row for row in await self.rows() if row.path.name == path.name), None)
@@ -197,7 +197,7 @@ class Library:
             session_row.report.parent, request.match_info.get("name", REPORT_PAGE)
         )
 
-    async def _campaign(self, request: web.Request) -> web.StreamResponse:
+    async def _send_campaign_report(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a campaign's report."""
         folder = self._path_in_folder(request.match_info["name"])
         if not folder.name.startswith("campaign.report"):

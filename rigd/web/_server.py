@@ -105,7 +105,7 @@ class OperatorPageServer:
                 web.get("/static/{name}", self._static_file),
                 web.get(ICON, self._static_file),
                 web.get(LIVE, self._live_messages),
-                web.post("/api/command", self._command),
+                web.post("/api/command", self._forward_command),
                 *self._library.routes(),
             ]
         )
@@ -159,7 +159,7 @@ class OperatorPageServer:
         )
         return await self.pages.serve(request, filter(None, first_messages), self._stop_for_page)
 
-    async def _command(self, request: web.Request) -> web.Response:
+    async def _forward_command(self, request: web.Request) -> web.Response:
         """Send a command of the page to the daemon, and its reply to the page."""
         request_object = await read_json_object(request)
         command = request_object.get("command")
@@ -320,7 +320,7 @@ class OperatorPageServer:
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
     """Yield the name and the options of each excitation, for the page's form."""
     for name, function in KINDS.items():
-        descriptions = _descriptions(cleandoc(function.__doc__ or ""))
+        descriptions = _parameter_descriptions(cleandoc(function.__doc__ or ""))
         yield (
             name,
             [
@@ -337,7 +337,7 @@ def _excitations() -> Iterator[tuple[str, list[Document]]]:
         )
 
 
-def _descriptions(text: str) -> dict[str, str]:
+def _parameter_descriptions(text: str) -> dict[str, str]:
     """Return the descriptions of the parameters in a numpydoc docstring, by name."""
     section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
     entries = re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section[1], re.MULTILINE) if section else []
@@ -362,23 +362,23 @@ def run_page() -> None:
     logging.disable()
     job = json.loads(sys.stdin.readline() or "null")
     if job is not None:
-        asyncio.run(_run(job))
+        asyncio.run(_serve_until_end(job))
 
 
-async def _run(job: Document) -> None:
+async def _serve_until_end(job: Document) -> None:
     """Serve the page of a job until standard input ends or the server fails."""
     try:
         server, _, listening = await open_page(job)
     except OSError as error:
-        _report(error=f"port {job['port']} cannot be had: {error.strerror}")
+        _report_to_daemon(error=f"port {job['port']} cannot be had: {error.strerror}")
         return
-    _report(port=port_of(listening))
+    _report_to_daemon(port=port_of(listening))
     running = asyncio.create_task(server.run())
     input_ended = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
     await asyncio.wait((running, input_ended), return_when=asyncio.FIRST_COMPLETED)
     failed = running.done()
     if failed:
-        _report(error=f"unexpected error ({running.exception()!r})")
+        _report_to_daemon(error=f"unexpected error ({running.exception()!r})")
     # The successor of this process or of the daemon may need the port.
     listening.close()
     server.end(_FAILED_MESSAGE if failed else "The daemon has ended; start it with rigd serve.")
@@ -387,7 +387,7 @@ async def _run(job: Document) -> None:
     os._exit(1 if failed else 0)
 
 
-def _report(**message: Any) -> None:  # noqa: ANN401 - what JSON has
+def _report_to_daemon(**message: Any) -> None:  # noqa: ANN401 - what JSON has
     """Send a message to the daemon, which reads standard output."""
     print(json.dumps(message), flush=True)  # noqa: T201
 
