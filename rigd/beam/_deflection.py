@@ -89,19 +89,21 @@ class DeflectionFilter:
         pairs, z = pairs[:mode_count], z[:mode_count]
 
         real_poles = _branch_cut_poles(damping, rate_hz)
-        step: Complex = np.exp(np.concatenate([pairs.ravel(), real_poles]) / rate_hz)
+        pole_factors: Complex = np.exp(np.concatenate([pairs.ravel(), real_poles]) / rate_hz)
         # Row per mode, column per pole: weight of the pole in the mode.
-        weights = np.zeros((z.size, step.size), dtype=np.complex128)
+        weights = np.zeros((z.size, pole_factors.size), dtype=np.complex128)
         for i, residues in enumerate(_mode_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
         if real_poles.size:
-            weights[:, pairs.size :] = _branch_cut_weights(z, beam, damping, rate_hz, step, weights)
+            weights[:, pairs.size :] = _branch_cut_weights(
+                z, beam, damping, rate_hz, pole_factors, weights
+            )
 
         # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
-        self._powers: Complex = step[:, None] ** np.arange(_CHUNK, -1, -1)
+        self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK, -1, -1)
         self._scaled_shapes: Complex = -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ weights
-        self._direct: Real = -(self._scaled_shapes @ _steady_states(step)).real
-        self._state: Complex = np.zeros(step.size, dtype=np.complex128)
+        self._direct: Real = -(self._scaled_shapes @ _steady_states(pole_factors)).real
+        self._state: Complex = np.zeros(pole_factors.size, dtype=np.complex128)
         self._start_rad: float | None = None
 
     def feed(self, angle_rad: Real) -> Real:
@@ -149,9 +151,9 @@ def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
     return poles
 
 
-def _steady_states(step: Complex) -> Complex:
-    """Return the steady states of the discrete poles `step` for a constant angle of 1."""
-    state: Complex = 1 / (1 - step)
+def _steady_states(pole_factors: Complex) -> Complex:
+    """Return the steady states of the discrete poles `pole_factors` for a constant angle of 1."""
+    state: Complex = 1 / (1 - pole_factors)
     return state
 
 
@@ -175,7 +177,7 @@ def _mode_residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Com
 
 
 def _branch_cut_weights(
-    z: Real, beam: Beam, damping: Damping, rate_hz: float, step: Complex, weights: Complex
+    z: Real, beam: Beam, damping: Damping, rate_hz: float, pole_factors: Complex, weights: Complex
 ) -> Real:
     """Return the weight of each real pole in each mode, shape (modes, real poles).
 
@@ -188,7 +190,7 @@ def _branch_cut_weights(
     s = 2j * np.pi * frequency_hz[:, None]
     load, spring, _ = _modal_stiffness_terms(s, z, beam, damping)
     exact = load / (spring + load)
-    columns = 1 / (1 - step * np.exp(-s / rate_hz)) - _steady_states(step)
+    columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
     residual = exact - columns @ weights.T
     cut = np.empty((z.size, _REAL_POLES))
     for i in range(z.size):

@@ -72,16 +72,16 @@ def clamped_free_eigenvalues(n: int) -> Real:
 def _cached_eigenvalues(n: int) -> Real:
     """Return the first `n` clamped–free eigenvalues as a cached array that must not be changed."""
     i = np.arange(1, n + 1)
-    middle = (i - 0.5) * np.pi
+    asymptotic_root = (i - 0.5) * np.pi
     sign = np.where(i % 2 == 1, 1.0, -1.0)
     # With z = (i - 1/2) pi + d the equation is sin d = ±sech z: no growing term, small d.
     d = np.zeros(n)
     for _ in range(8):
-        decay = np.exp(-(middle + d))
+        decay = np.exp(-(asymptotic_root + d))
         sech = 2 * decay / (1 + decay * decay)
         tanh = (1 - decay * decay) / (1 + decay * decay)
         d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
-    return middle + d
+    return asymptotic_root + d
 
 
 def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
@@ -450,5 +450,5 @@ def _newton_roots(
                 break
         scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
-        solved = np.abs(residual) < 1e-9 * scale
-        return np.where(solved & on_sheet, log_s, np.nan + 0j)
+        is_solution = np.abs(residual) < 1e-9 * scale
+        return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

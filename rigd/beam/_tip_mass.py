@@ -100,7 +100,11 @@ class LoadedResponse:
 
 
 def loaded_response(
-    s_squared: Complex, elastic: Complex, inertial: Complex, beam: Beam, tip_mass_kg: float
+    s_squared: Complex,
+    elastic_factor: Complex,
+    inertial_factor: Complex,
+    beam: Beam,
+    tip_mass_kg: float,
 ) -> LoadedResponse:
     """Return the coupling torque per angle of a rigidly clamped beam with a tip mass.
 
@@ -108,7 +112,7 @@ def loaded_response(
     ----------
     s_squared : ndarray of complex
         Square of the Laplace variable in rad²/s², not 0.
-    elastic, inertial : ndarray of complex
+    elastic_factor, inertial_factor : ndarray of complex
         Elastic factor c and inertial factor p at these s.
     beam : Beam
         Beam with this stiffness and length. Its density is not used: p contains it.
@@ -116,8 +120,8 @@ def loaded_response(
         Point mass at the tip.
     """
     stiffness, length = beam.bending_stiffness_n_m2, beam.length_m
-    f, u, f_slope, u_slope = _response_functions(-(length**4) * inertial / elastic)
-    per_mass = s_squared / (length * stiffness * inertial)
+    f, u, f_slope, u_slope = _response_functions(-(length**4) * inertial_factor / elastic_factor)
+    per_mass = s_squared / (length * stiffness * inertial_factor)
     mass_ratio = tip_mass_kg * per_mass
     inverse = 1 / (1 - mass_ratio * f)
     loaded = (f + mass_ratio * u) * inverse
@@ -125,32 +129,32 @@ def loaded_response(
     slope = (f_slope + mass_ratio * u_slope + mass_ratio * loaded * f_slope) * inverse
     per_length = -stiffness / length
     return LoadedResponse(
-        response=per_length * elastic * loaded,
+        response=per_length * elastic_factor * loaded,
         by_elastic=per_length * (loaded - slope),
-        by_inertial=per_length * elastic / inertial * (slope - mass_ratio * by_ratio),
-        by_mass=per_length * elastic * per_mass * by_ratio,
+        by_inertial=per_length * elastic_factor / inertial_factor * (slope - mass_ratio * by_ratio),
+        by_mass=per_length * elastic_factor * per_mass * by_ratio,
     )
 
 
 def _add_stiffness_offsets(
     uniform_response: LoadedResponse,
-    elastic: Complex,
-    inertial: Complex,
+    elastic_factor: Complex,
+    inertial_factor: Complex,
     beam: Beam,
     stiffness_offsets: tuple[float, ...],
 ) -> LoadedResponse:
     """Return the response after the stiffness offsets of modes 2, 3, … are applied to it."""
     length, stiffness = beam.length_m, beam.bending_stiffness_n_m2
-    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic)), dtype=np.complex128)
+    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic_factor)), dtype=np.complex128)
     z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
     for k4, offset in zip((z / length) ** 4, stiffness_offsets, strict=True):
         # a² EI k⁴, with the participation a² = 4 L³ / z⁴
         weight, stiffer = 4 * stiffness / length, 1 + offset
-        uniform = 1 / (elastic * k4 + inertial)
-        offset_mode = 1 / (elastic * k4 * stiffer + inertial)
-        total += weight * inertial**2 * elastic * offset * uniform * offset_mode
-        by_elastic += weight * inertial**2 * (stiffer * offset_mode**2 - uniform**2)
-        by_inertial += weight * elastic**2 * k4 * ((stiffer * offset_mode) ** 2 - uniform**2)
+        uniform = 1 / (elastic_factor * k4 + inertial_factor)
+        offset_mode = 1 / (elastic_factor * k4 * stiffer + inertial_factor)
+        total += weight * inertial_factor**2 * elastic_factor * offset * uniform * offset_mode
+        by_elastic += weight * inertial_factor**2 * (stiffer * offset_mode**2 - uniform**2)
+        by_inertial += weight * elastic_factor**2 * k4 * ((stiffer * offset_mode) ** 2 - uniform**2)
     return replace(
         uniform_response,
         response=uniform_response.response + total,
@@ -195,10 +199,12 @@ def differentiated_response(
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
     inertia = beam.density_over_stiffness * s_squared
-    elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
-    response = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
+    elastic_factor, inertial_factor = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
+    response = loaded_response(s_squared, elastic_factor, inertial_factor, beam, tip_mass_kg)
     if stiffness_offsets:
-        response = _add_stiffness_offsets(response, elastic, inertial, beam, stiffness_offsets)
+        response = _add_stiffness_offsets(
+            response, elastic_factor, inertial_factor, beam, stiffness_offsets
+        )
     return response, {
         "zeta": lambda: response.by_elastic * s_alpha,
         "alpha": lambda: response.by_elastic * (damping.zeta * log_s * s_alpha),
@@ -300,9 +306,9 @@ class LoadedBeam:
             Its derivative with respect to each parameter.
         """
         at, by = self._response_and_slopes(s)
-        factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
+        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
         gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
-        return at.response * factor, gradient * factor * factor
+        return at.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
         """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).
@@ -323,9 +329,9 @@ class LoadedBeam:
         at, by = self._response_and_slopes(s)
         slope = self.derivative_by_s(s, at)
         gradients = np.zeros((s.size, len(wrt)), dtype=np.complex128)
-        for column, name in zip(gradients.T, wrt, strict=True):
+        for gradient_column, name in zip(gradients.T, wrt, strict=True):
             if name in by:
-                column[:] = -by[name]() / slope
+                gradient_column[:] = -by[name]() / slope
         return gradients
 
     def _require_uniform(self) -> None:
@@ -362,15 +368,16 @@ class LoadedBeam:
         """
         grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
         displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
-        elastic, inertial = self.elastic_and_inertial_factors(s)
+        elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
         for index, offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
             k4, rotation_part = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
-            offset_term = inertial * rotation_part * elastic * k4 * offset
+            offset_term = inertial_factor * rotation_part * elastic_factor * k4 * offset
             offset_term = offset_term / (
-                (elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial)
+                (elastic_factor * k4 + inertial_factor)
+                * (elastic_factor * k4 * (1 + offset) + inertial_factor)
             )
             displacement = displacement + 2 * offset_term
             slope = slope + tip_slopes[index] * offset_term
@@ -378,8 +385,10 @@ class LoadedBeam:
             tip_force = self._tip_force_per_angle(s, grid)
             displacement = displacement + grid.per_force(tip, tip) * tip_force
             slope = slope + grid.per_force(tip, tip, 1) * tip_force
-        root = 1 / (1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response)
-        return displacement * root, slope * root
+        clamp_factor = 1 / (
+            1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
+        )
+        return displacement * clamp_factor, slope * clamp_factor
 
     def _tip_force_per_angle(self, s: Complex, grid: PointForceGrid) -> Complex:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
@@ -404,12 +413,14 @@ class LoadedBeam:
 
     def rigid_clamp_response(self, s: Complex) -> LoadedResponse:
         """Return the response at `s` (rad/s) that the beam would have on a rigid clamp."""
-        elastic, inertial = self.elastic_and_inertial_factors(s)
-        response = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+        elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
+        response = loaded_response(
+            s * s, elastic_factor, inertial_factor, self.beam, self.tip_mass_kg
+        )
         if not any(self.stiffness_offsets):
             return response
         return _add_stiffness_offsets(
-            response, elastic, inertial, self.beam, self.stiffness_offsets
+            response, elastic_factor, inertial_factor, self.beam, self.stiffness_offsets
         )
 
     def residues(self, poles_rad_s: Complex) -> Complex:
@@ -439,9 +450,9 @@ class LoadedBeam:
     def elastic_and_inertial_factors(self, s: Complex) -> tuple[Complex, Complex]:
         """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
         log_s, damping = np.log(s), self.damping
-        elastic = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
+        elastic_factor = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
         external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
-        return elastic, self.beam.density_over_stiffness * s * s + external
+        return elastic_factor, self.beam.density_over_stiffness * s * s + external
 
     def derivative_by_s(self, s: Complex, at: LoadedResponse) -> Complex:
         """Return the derivative of the response on a rigid clamp with respect to s.
@@ -456,9 +467,11 @@ class LoadedBeam:
         log_s, damping = np.log(s), self.damping
         internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
         external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
-        inertial = 2 * self.beam.density_over_stiffness * s * s + external
+        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external
         by_log_s: Complex = (
-            at.by_elastic * internal + at.by_inertial * inertial + 2 * self.tip_mass_kg * at.by_mass
+            at.by_elastic * internal
+            + at.by_inertial * inertial_factor
+            + 2 * self.tip_mass_kg * at.by_mass
         )
         return by_log_s / s
 
@@ -537,12 +550,14 @@ class LoadedBeam:
                 fraction * self.root_compliance_rad_per_nm,
                 tuple((fraction if zeros else 1.0) * offsets),
             )
-            last = step == steps
+            is_last_step = step == steps
             start = 2 * current - previous if step > 1 else current
             previous, current = (
                 current,
                 partial_beam._newton_roots(
-                    start, _NEWTON_TOLERANCE if last else _INTERMEDIATE_TOLERANCE, zeros=zeros
+                    start,
+                    _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
+                    zeros=zeros,
                 ),
             )
         first = current[: oscillating.size]

@@ -125,19 +125,21 @@ def tip_motion(
     for start in range(0, s.size, _BLOCK_POINTS):
         block_slice = slice(start, start + _BLOCK_POINTS)
         angle_spectrum = deflection[block_slice].copy()
-        root: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
+        root_angle: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
         if loaded.is_uniform_cantilever:
             tip_displacement, slope = tip_response(beam, damping, s[block_slice])
             tip_displacement -= beam.length_m
             slope -= 1
         else:
             tip_displacement, slope = loaded.tip_response(s[block_slice])
-            root = angle_spectrum * (
+            root_angle = angle_spectrum * (
                 1 - root_compliance_rad_per_nm * loaded.transfer(s[block_slice])
             )
         deflection[block_slice] = tip_displacement * angle_spectrum
         tip_slope[block_slice] = slope * angle_spectrum
-        tip_speed[block_slice] = s[block_slice] * (deflection[block_slice] + beam.length_m * root)
+        tip_speed[block_slice] = s[block_slice] * (
+            deflection[block_slice] + beam.length_m * root_angle
+        )
     del s
 
     def largest(spectrum: Complex) -> float:

@@ -56,20 +56,23 @@ def report_lines(results: Results) -> Iterator[str]:
 
 def verdict(results: Results) -> str:
     """Return sentences on the rate that this computer can hold, and on what limits it."""
-    highest_hz, between_hz = results.highest_rate_hz, results.highest_rate_between_stalls_hz
+    highest_hz, between_stalls_hz = (
+        results.highest_rate_hz,
+        results.highest_rate_between_stalls_hz,
+    )
     criterion = f"{100 * HELD_FRACTION:g} % of the ticks or more"
     if highest_hz is not None:
         text = f"This computer holds {highest_hz:g} Hz: {criterion}."
     else:
-        best = max(results.search, key=lambda each: each.held)
+        best_measurement = max(results.search, key=lambda each: each.held)
         text = (
-            f"This computer holds none of these rates: {best.rate_hz:g} Hz came nearest, with "
-            f"{100 * best.held:.2f} % of the ticks."
+            f"This computer holds none of these rates: {best_measurement.rate_hz:g} Hz came "
+            f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
         )
-    if between_hz is not None and between_hz != highest_hz:
+    if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         text += (
             f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
-            f"hold {between_hz:g} Hz."
+            f"hold {between_stalls_hz:g} Hz."
         )
     refused = [name for name, text in results.granted.items() if text.startswith(REFUSED)]
     if refused:

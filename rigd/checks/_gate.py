@@ -177,23 +177,25 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
     UnknownRowError
         If no row has such a name, or its failure cannot be accepted.
     """
-    for name in accept:
-        _check_name(name)
+    for row_name in accept:
+        _check_name(row_name)
     failed: dict[str, FailedCheck] = {}
     for check in PAPER_CHECKS:
         for row in _rows_of_check(check, profile) if check.names else ():
             if row.verdict is not CheckResult.FAIL:
                 continue
-            name, text = row.name, _failure_text(row)
-            if name in failed:  # several rows of one name: an EDS file that lacks two objects
-                text = f"{failed[name].text}\n{text}"
-            failed[name] = FailedCheck(name, text, not check.not_acceptable, name in accept)
-    accepted_needlessly = [name for name in dict.fromkeys(accept) if name not in failed]
+            row_name, text = row.name, _failure_text(row)
+            if row_name in failed:  # several rows of one name: an EDS file that lacks two objects
+                text = f"{failed[row_name].text}\n{text}"
+            failed[row_name] = FailedCheck(
+                row_name, text, not check.not_acceptable, row_name in accept
+            )
+    accepted_needlessly = [row_name for row_name in dict.fromkeys(accept) if row_name not in failed]
     return Clearance(
         tuple(failed.values()),
         tuple(
-            f"--accept {name}: it did not fail; nothing was accepted."
-            for name in accepted_needlessly
+            f"--accept {row_name}: it did not fail; nothing was accepted."
+            for row_name in accepted_needlessly
         ),
     )
 

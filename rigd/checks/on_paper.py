@@ -228,22 +228,22 @@ def worst_travel(
     without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
     with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
     speed_rad_s = limits.velocity_rad_s
-    driven_rad = 0.0
+    under_torque_rad = 0.0
     steps = round(torque_on_s / _TIME_STEP_S)
     for step in range(steps):
         torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
         faster_rad_s = max(0.0, speed_rad_s + torque_nm / without_beam_kg_m2 * _TIME_STEP_S)
         previous_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
-        driven_rad += 0.5 * (previous_rad_s + speed_rad_s) * _TIME_STEP_S
+        under_torque_rad += 0.5 * (previous_rad_s + speed_rad_s) * _TIME_STEP_S
         if speed_rad_s == previous_rad_s:  # it goes on like this
-            driven_rad += speed_rad_s * (steps - 1 - step) * _TIME_STEP_S
+            under_torque_rad += speed_rad_s * (steps - 1 - step) * _TIME_STEP_S
             break
-        if driven_rad > _MAX_TRAVEL_RAD:
+        if under_torque_rad > _MAX_TRAVEL_RAD:
             break
-    if driven_rad > _MAX_TRAVEL_RAD:
+    if under_torque_rad > _MAX_TRAVEL_RAD:
         return Travel(inf, inf)
     coasting_rad = _coasting_rad(with_beam_kg_m2, motor, speed_rad_s)
-    return Travel(driven_rad, coasting_rad if coasting_rad <= _MAX_TRAVEL_RAD else inf)
+    return Travel(under_torque_rad, coasting_rad if coasting_rad <= _MAX_TRAVEL_RAD else inf)
 
 
 def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
@@ -257,8 +257,8 @@ def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> f
         return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
     if viscous == 0.0:
         return inf if speed_rad_s > 0.0 else 0.0
-    braked = log1p(ratio) / ratio if isfinite(ratio) else 0.0
-    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - braked)
+    coulomb_correction = log1p(ratio) / ratio if isfinite(ratio) else 0.0
+    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - coulomb_correction)
 
 
 @dataclass(frozen=True, slots=True)

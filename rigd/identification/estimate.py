@@ -382,9 +382,9 @@ class MotorEstimate:
     actuation_delay_s: MotorQuantity
     """Delay from the command to the torque."""
     windows: int
-    """Number of windows that were used."""
+    """Number of windows in which the shaft never stood still."""
     dropped: int
-    """Number of windows that were not used because the shaft may have stood still."""
+    """Number of windows that were dropped because the shaft may have stood still."""
     misfit: float
     """Mean square of the residual over that expected from scatter: 1 if the equation holds."""
     friction_departure_nm: float

@@ -167,11 +167,11 @@ def free_port(preferred_port: int) -> int:
     For port 0 the system chooses a free port. Rerun's program cannot check the port itself: it may
     mistake a listener for another Rerun server.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as test_socket:
         # Connections of a server that has just ended do not count.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        test_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((LOOPBACK, preferred_port))
+            test_socket.bind((LOOPBACK, preferred_port))
         except OSError:
             return 0
     return preferred_port

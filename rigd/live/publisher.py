@@ -550,9 +550,13 @@ class HealthReader:
         if ticks and scheduled < ticks[-1][1]:
             ticks.clear()  # another session
         ticks.append((now_s, scheduled))
-        (first_s, first), (last_s, last) = ticks[0], ticks[-1]
+        (first_time_s, first_count), (last_time_s, last_count) = ticks[0], ticks[-1]
         # While the count is constant, there is no session, or it is in preparation.
-        return (last - first) / (last_s - first_s) if last > first else None
+        return (
+            (last_count - first_count) / (last_time_s - first_time_s)
+            if last_count > first_count
+            else None
+        )
 
 
 if __name__ == "__main__":

@@ -417,19 +417,19 @@ def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
 def _section_problems(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for missing and for unused sections of the selected devices."""
     drive, sensor = values["devices.drive"], values["devices.sensor"]
-    needed = {*DEVICE_SECTIONS.get(drive, ()), *DEVICE_SECTIONS.get(sensor, ())}
-    present = {
+    required = {*DEVICE_SECTIONS.get(drive, ()), *DEVICE_SECTIONS.get(sensor, ())}
+    used_sections = {
         section
         for section in {name for names in DEVICE_SECTIONS.values() for name in names}
         if any(key in values for key, _ in section_fields(section))
     }
-    for section in sorted(needed - present):
+    for section in sorted(required - used_sections):
         yield (
             f'section [{section}] is missing, which devices.drive = "{drive}" with '
             f'devices.sensor = "{sensor}" needs.'
         )
     # Any profile may have the noise and offset of a simulated rig.
-    for section in sorted(present - needed - {"simulation"}):
+    for section in sorted(used_sections - required - {"simulation"}):
         yield (
             f'section [{section}] belongs to none of devices.drive = "{drive}" and '
             f'devices.sensor = "{sensor}"; remove it.'

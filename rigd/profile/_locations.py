@@ -80,13 +80,13 @@ def user_folder() -> Path | None:
 
     The folder need not exist.
     """
-    base = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    if not base.is_absolute():  # the XDG specification ignores relative paths
+    config_folder = Path(os.environ.get("XDG_CONFIG_HOME", ""))
+    if not config_folder.is_absolute():  # the XDG specification ignores relative paths
         try:
-            base = Path.home() / ".config"
+            config_folder = Path.home() / ".config"
         except RuntimeError:  # for example in a container, with an unknown user id
             return None
-    return base / "rigd" / "profiles"
+    return config_folder / "rigd" / "profiles"
 
 
 def _search_folders() -> Iterator[tuple[Origin, Path]]:

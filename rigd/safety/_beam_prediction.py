@@ -74,21 +74,21 @@ class BeamPrediction:
         gain[2 * m] = _OFFSET_BANDWIDTH_RAD_S * period_s
         for number, pole in enumerate(oscillating_poles):
             # φ = 2 Re(r z) with z' = p z + θ, and θ is linear between two ticks.
-            rows = slice(2 * number, 2 * number + 2)
+            mode_rows = slice(2 * number, 2 * number + 2)
             step_factor = cexp(pole * period_s)
-            now = (step_factor - 1.0 - pole * period_s) / (pole**2 * period_s)
-            previous_gain = (step_factor - 1.0) / pole - now
-            a[rows, rows] = (
+            present_gain = (step_factor - 1.0 - pole * period_s) / (pole**2 * period_s)
+            previous_gain = (step_factor - 1.0) / pole - present_gain
+            a[mode_rows, mode_rows] = (
                 (step_factor.real, -step_factor.imag),
                 (step_factor.imag, step_factor.real),
             )
-            a[rows, 2 * m + 1] = previous_gain.real, previous_gain.imag
-            a[rows, 2 * m + 2] = now.real, now.imag
+            a[mode_rows, 2 * m + 1] = previous_gain.real, previous_gain.imag
+            a[mode_rows, 2 * m + 2] = present_gain.real, present_gain.imag
             factor = stiffness_nm * abs(pole) ** 2 / (2j * pole.imag)
-            error += 2.0 * np.array([factor.real, -factor.imag]) @ a[rows]
+            error += 2.0 * np.array([factor.real, -factor.imag]) @ a[mode_rows]
             error[2 * m + 2] -= stiffness_nm
             gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / factor
-            gain[rows] = gain_of_mode.real, gain_of_mode.imag
+            gain[mode_rows] = gain_of_mode.real, gain_of_mode.imag
         matrix = a + np.outer(gain, error)
         matrix[-1] = error
         self._state_size = size

@@ -234,8 +234,8 @@ class EncoderWatch:
             self.skip(1, angle_rad)
             return None
         error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
-        net, motor = self._torque_history[-1]
-        self._torque_history.append((net + motor_nm - coupling_nm, motor + motor_nm))
+        net_sum, motor_sum = self._torque_history[-1]
+        self._torque_history.append((net_sum + motor_nm - coupling_nm, motor_sum + motor_nm))
         self._error_sums.append(self._error_sums[-1] + error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
         self._count += 1
@@ -289,13 +289,13 @@ class EncoderWatch:
         angle_rad
             Last angle that was read.
         """
-        net, motor = self._torque_history[-1]
-        error = self._error_sums[-1]
+        net_sum, motor_sum = self._torque_history[-1]
+        error_sum = self._error_sums[-1]
         for _ in range(ticks):
             if self._prediction is not None:
                 self._prediction.skip(angle_rad)
-            self._torque_history.append((net, motor))
-            self._error_sums.append(error)
+            self._torque_history.append((net_sum, motor_sum))
+            self._error_sums.append(error_sum)
         self._standstill_count = 0
         self._irregular_ticks = self._angles.maxlen or 0
 
@@ -305,14 +305,14 @@ class EncoderWatch:
         The shortest window is checked in every tick, the others in turn.
         """
         windows = self._windows
-        ticks, turn_nm = windows[0]
+        ticks, max_turning_nm = windows[0]
         if standstill_ticks < ticks:
             return None
-        violation = self._check_net_torque(ticks, turn_nm)
-        ticks, turn_nm = windows[1 + self._count % (len(windows) - 1)]
+        violation = self._check_net_torque(ticks, max_turning_nm)
+        ticks, max_turning_nm = windows[1 + self._count % (len(windows) - 1)]
         if violation is not None or standstill_ticks < ticks:
             return violation
-        violation = self._check_net_torque(ticks, turn_nm)
+        violation = self._check_net_torque(ticks, max_turning_nm)
         if (
             violation is None
             and standstill_ticks >= self._min_test_ticks
@@ -335,27 +335,30 @@ class EncoderWatch:
         ):
             return None
         ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
-        net, motor = self._torque_sums(ticks)
+        net_sum, motor_sum = self._torque_sums(ticks)
         per_tick_nm = _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
         needed_nm = per_tick_nm * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
-        braking_nm = max(0.0, -net if moved_rad > 0 else net)
+        braking_nm = max(0.0, -net_sum if moved_rad > 0 else net_sum)
         allowed_nm = (
             self._breakaway_nm
-            + ((1.0 + _TORQUE_RELATIVE_ERROR) * braking_nm + _TORQUE_RELATIVE_ERROR * abs(motor))
+            + (
+                (1.0 + _TORQUE_RELATIVE_ERROR) * braking_nm
+                + _TORQUE_RELATIVE_ERROR * abs(motor_sum)
+            )
             / _STANDSTILL_TICKS_AT_STOP
         )
         if needed_nm <= allowed_nm:
             return None
         return BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
 
-    def _check_net_torque(self, ticks: int, turn_nm: float) -> Violation | None:
+    def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
 
-        `turn_nm` is the torque that may turn the shaft within an encoder step in this time.
+        `max_turning_nm` is the torque that may turn the shaft within an encoder step in this time.
         """
-        net, motor = self._torque_sums(ticks)
-        net_nm, coupling_nm = net / ticks, (motor - net) / ticks
-        limit_nm = self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + turn_nm
+        net_sum, motor_sum = self._torque_sums(ticks)
+        net_nm, coupling_nm = net_sum / ticks, (motor_sum - net_sum) / ticks
+        limit_nm = self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
         if -limit_nm < net_nm < limit_nm:
             return None
         return BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
@@ -416,29 +419,29 @@ class EncoderWatch:
         ):
             return None
         # Weighted like the difference of two mean speeds, the torques match the acceleration.
-        net = motor = 0.0
+        net_nm = motor_nm = 0.0
         for j in range(1, SPEED_TICKS + 1):
-            for last in (torques[-1 - j], torques[-2 - j]):
-                net, motor = net + last[0], motor + last[1]
-            for first in (torques[-1 - j - n], torques[-2 - j - n]):
-                net, motor = net - first[0], motor - first[1]
-        net, motor = net / (2 * SPEED_TICKS * n), motor / (2 * SPEED_TICKS * n)
+            for window_end in (torques[-1 - j], torques[-2 - j]):
+                net_nm, motor_nm = net_nm + window_end[0], motor_nm + window_end[1]
+            for window_start in (torques[-1 - j - n], torques[-2 - j - n]):
+                net_nm, motor_nm = net_nm - window_start[0], motor_nm - window_start[1]
+        net_nm, motor_nm = net_nm / (2 * SPEED_TICKS * n), motor_nm / (2 * SPEED_TICKS * n)
         acceleration_rad_s2 = (
             (recent_movement_rad - previous_movement_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
         )
         speed_rad_s = (
             (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
         )
-        return scales.add(acceleration_rad_s2, speed_rad_s, motor - net, net)
+        return scales.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
 
     def _torque_sums(self, ticks: int) -> tuple[float, float]:
         """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.
 
         The present tick is excluded: its torque turns the shaft from now on.
         """
-        net, motor = self._torque_history[-2]
-        net_before, motor_before = self._torque_history[-2 - ticks]
-        return net - net_before, motor - motor_before
+        net_sum, motor_sum = self._torque_history[-2]
+        earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - ticks]
+        return net_sum - earlier_net_sum, motor_sum - earlier_motor_sum
 
     def _end_test(self) -> None:
         """Stop the test of the encoder and remove its torque."""

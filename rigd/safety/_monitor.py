@@ -514,10 +514,7 @@ class LimitWatch:
         return None
 
     def _violation_with_cause(self, checked: _CheckedValue) -> Violation:
-        """Return the violation of a limit; its advice names a stall of the computer as the cause.
-
-        Without a stall the advice is that of the interlock.
-        """
+        """Return the violation of a limit, with advice that mentions ticks missed just before."""
         violation, missed = _make_violation(checked, warns=False), self.after_missed
         if not missed or not BY_NAME[checked[0]].follows_missed_ticks:
             return violation

@@ -146,12 +146,12 @@ class SensorWatch:
         if self._any_run or any(map(eq, reading, previous)):
             runs, repeat_counts = self._runs, self._repeat_counts
             repeated = [*map(eq, reading, previous), reading == previous]
-            for number, repeats in enumerate(repeated):
+            for channel_index, repeats in enumerate(repeated):
                 if repeats:
-                    runs[number] += 1
-                    repeat_counts[number] += 1
+                    runs[channel_index] += 1
+                    repeat_counts[channel_index] += 1
                 else:
-                    runs[number] = 0
+                    runs[channel_index] = 0
             self._any_run = any(repeated)
         elif self._limits is None or self._counted_ticks + 1 < _COUNT_TICKS:
             self._counted_ticks += 1
@@ -171,15 +171,17 @@ class SensorWatch:
                 [0] * len(runs),
                 0,
             )
-            for number, count in enumerate(repeat_counts):
-                fraction, limit = count / _COUNT_TICKS, self._fraction_limits[number]
+            for channel_index, count in enumerate(repeat_counts):
+                fraction, limit = count / _COUNT_TICKS, self._fraction_limits[channel_index]
                 if (
                     limit < fraction
                     and limit < _MAX_FRACTION_LIMIT
-                    and runs[number] <= limits[number]
+                    and runs[channel_index] <= limits[channel_index]
                 ):
                     all_channels = 2 * repeat_counts[-1] > count
-                    repeated_part = "whole wrench" if all_channels else self._channels[number]
+                    repeated_part = (
+                        "whole wrench" if all_channels else self._channels[channel_index]
+                    )
                     return BY_NAME["repeated wrench"].violated(
                         100.0 * fraction, 100.0 * limit, repeated_part
                     )

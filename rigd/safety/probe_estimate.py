@@ -389,11 +389,11 @@ def _motor_contradiction(estimate: ProbeEstimate) -> str:
          "the inertia of the profile (motor.inertia_kg_m2)"),
     )  # fmt: skip
     unknown = []
-    for verb, ratio, std, quantity in rows:
+    for clause, ratio, std, quantity in rows:
         if ratio is None or std is None:
             unknown.append(quantity)
         elif not _is_accepted(ratio):
-            return f"{verb} {ratio:.2g} ± {std:.1g} times {quantity}."
+            return f"{clause} {ratio:.2g} ± {std:.1g} times {quantity}."
         elif std > _MAX_RELATIVE_STD * ratio:
             unknown.append(quantity)
     if unknown:

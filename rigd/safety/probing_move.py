@@ -192,7 +192,7 @@ def plan_probe(rig: ProbedRig) -> ProbePlan:
     first = abs(complex(poles(rig.beam, rig.damping, 1)[0, 0]))
     period_s = 2.0 * pi / first
     cruise_s = period_s * max(1, round(_MIN_CRUISE_S / period_s + 0.3))
-    fast_rad_s = min(
+    fast_speed_rad_s = min(
         2.0 * _FIRST_SPEED_RAD_S,
         2.0 * _FIRST_TRAVEL_RAD / cruise_s,
         _MAX_SPEED_FRACTION * rig.velocity_limit_rad_s,
@@ -200,7 +200,7 @@ def plan_probe(rig: ProbedRig) -> ProbePlan:
     )
     torque_nm = min(_BLOCKED_TORQUE_FRACTION * rig.rated_torque_nm, rig.peak_torque_nm)
     return ProbePlan(
-        0.5 * fast_rad_s, cruise_s, torque_nm, _RATED_TORQUES_PER_S * rig.rated_torque_nm
+        0.5 * fast_speed_rad_s, cruise_s, torque_nm, _RATED_TORQUES_PER_S * rig.rated_torque_nm
     )
 
 

@@ -77,7 +77,7 @@ _SECURITY_HEADERS: Final = {  # Security headers of all responses
 
 
 class WebAccess:
-    """Checks of each request's origin and of its permission to act.
+    """Checks the origin of each request and its permission to act.
 
     Parameters
     ----------
