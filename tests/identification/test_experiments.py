@@ -123,7 +123,7 @@ def test_other_metadata_hold_no_layout(profile, change):
 
 
 def test_a_session_counts_once(short_chirps, tmp_path, monkeypatch):
-    monkeypatch.setattr(_records, "_passes", lambda *_: ([], 0))
+    monkeypatch.setattr(_records, "_read_passes", lambda *_: ([], 0))
     copied = tmp_path / "copied.mcap"
     shutil.copy(short_chirps[0], copied)
     named = rf"copied\.mcap: it has samples of .*{short_chirps[0].name}"

@@ -62,7 +62,7 @@ def test_sessions_leave_nothing_behind(publisher):
 
 
 def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receive, own_port):
-    publisher = start_publisher(first=f"{own_port}; outlet._MOST_SESSIONS = 2")
+    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
     first = publisher.address
     publisher.finish()
     run_session(publisher, "second")
