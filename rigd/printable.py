@@ -17,7 +17,7 @@ _MAX_LINES: Final = 40
 """Largest number of lines of a displayed message."""
 _MAX_LINE_CHARACTERS: Final = 2000
 """Largest number of characters of a displayed line."""
-_LINE_END: Final = 500
+_LINE_END_LENGTH: Final = 500
 """Number of characters at the end of a truncated line that are shown: they state the remedy."""
 
 _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
@@ -71,7 +71,7 @@ def readable_message(message: str) -> str:
 def _readable_line(line: str) -> str:
     """Return a line as safe text for a terminal, without the middle of a very long line."""
     if len(line) > _MAX_LINE_CHARACTERS:
-        line = f"{line[: _MAX_LINE_CHARACTERS - _LINE_END]} … {line[-_LINE_END:]}"
+        line = f"{line[: _MAX_LINE_CHARACTERS - _LINE_END_LENGTH]} … {line[-_LINE_END_LENGTH:]}"
     return printable(line)
 
 

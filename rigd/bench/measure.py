@@ -65,7 +65,7 @@ class UsageMeter:
         self._readings: list[tuple[float, Usage]] = []
 
     def sample(self, phase: Phase) -> None:
-        """Read the process's usage if the session's phase is that of the record."""
+        """Read the processor time and page faults so far, if the session's record is running."""
         if phase == Phase.RUNNING:
             try:
                 usage = process_usage(self._pid)

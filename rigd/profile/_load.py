@@ -182,7 +182,7 @@ def _find_profile(name_or_path: str | Path) -> Path:
 
 
 def known_profiles() -> list[str]:
-    """Return the names of all profiles in the working folder, the user's folder, and shipped."""
+    """Return the names of all profiles: in the working folder, the user's folder, and shipped."""
     return list(profile_files())
 
 

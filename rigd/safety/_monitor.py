@@ -261,7 +261,7 @@ class LimitWatch:
         wrench: Sequence[float],
         angle_stale: bool,
     ) -> Violation | None:
-        """Check a tick in which a value may be near or beyond a limit, with all details."""
+        """Return the worst violation in a tick in which a value may be near or beyond its limit."""
         self.warning = self._slow_value_near or self._fraction_near
         self._fraction_near = False
         limits = self._limits

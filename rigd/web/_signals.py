@@ -52,7 +52,7 @@ class PageSignalBlock:
     first_tick: int
     """Number of the block's first tick."""
     rate_hz: float
-    """Rate of the ticks."""
+    """Loop rate in ticks per second."""
     values: Real
     """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
