@@ -16,7 +16,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rigd.bench import _loops as loops
-from rigd.bench.measure import LoopMeasurement, figures, measurement
+from rigd.bench.measure import LoopMeasurement, percentiles, record_measurement
 from rigd.engine.processes import LIVE
 from rigd.engine.shared_state import Phase
 from rigd.excitation import make_excitation
@@ -80,13 +80,13 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
     tuple
         What the loop did; a text on the live view; processor time of the publisher, %.
     """
-    profile = loops.rig_for(load_profile("sim"), RATE_HZ, 0.0)
+    profile = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
     options = {"amplitude_rad": 0.005, "start_hz": 0.5, "stop_hz": 50.0, "duration_s": seconds}
     excitation = make_excitation("chirp", options | {"rest_s": 0.0, "ring_down_s": 0.0}, RATE_HZ)
     text, percent = "", 0.0
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        loops.connected(profile, live=live) as (rig, group),
+        loops.connected_rig(profile, live=live) as (rig, group),
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
@@ -110,7 +110,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
                 f"{result.live_dropped} samples not shown"
             )
         samples = read_session(result.path).samples
-    found = measurement(
+    found = record_measurement(
         "with" if live else "without",
         RATE_HZ,
         samples,
@@ -131,7 +131,7 @@ def main() -> None:
         p99 = {}
         for live in (False, True):
             found, text, percent = run(seconds, live=live)
-            late = figures(found.lateness_us)
+            late = percentiles(found.lateness_us)
             p99[live] = late.p99
             print(
                 f"{found.name:8s} late p50 {late.p50:5.0f} p99 {late.p99:6.0f} p99.9 "

@@ -14,10 +14,10 @@ import statistics
 import sys
 from pathlib import Path
 
-from rigd.bench import HIGHEST_HZ, core_of, cores_without_loop
+from rigd.bench import HIGHEST_HZ, cores_without_loop, loop_core
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench.measure import HELD, Figures, LoopMeasurement, figures
+from rigd.bench.measure import HELD_FRACTION, LatencyPercentiles, LoopMeasurement, percentiles
 from rigd.checks.machine import settings_granted
 from rigd.profile import load_profile
 from rigd.runtime import use_one_thread
@@ -40,11 +40,11 @@ def quiet() -> None:
 def one_round(seconds: float, granted: dict[str, str]) -> dict[str, LoopMeasurement]:
     """Measure each once."""
     profile = load_profile("sim")
-    plain = loops.rig_for(profile, RATE_HZ, 0.0)
-    spinning = loops.rig_for(profile, RATE_HZ, SPIN_US)
+    plain = loops.simulated_profile(profile, RATE_HZ, 0.0)
+    spinning = loops.simulated_profile(profile, RATE_HZ, SPIN_US)
     found = {
         PEER: cyclictest.run(
-            RATE_HZ, seconds, cpu=core_of(granted), priority=profile.realtime.priority
+            RATE_HZ, seconds, cpu=loop_core(granted), priority=profile.realtime.priority
         ),
         IDLE: loops.run_alone(IDLE, plain, seconds, quiet),
         SPUN: loops.run_alone(SPUN, spinning, seconds, quiet),
@@ -58,13 +58,13 @@ def show(found: dict[str, LoopMeasurement]) -> None:
     """Print a round, in µs."""
     print(f"load {os.getloadavg()[0]:.2f}, steal since boot {steal_s():.2f} s")
     for name, one in found.items():
-        late = figures(one.lateness_us)
+        late = percentiles(one.lateness_us)
         line = (
             f"  {name:17s} late p50 {late.p50:5.0f} p90 {late.p90:5.0f} p99 {late.p99:6.0f} "
             f"p99.9 {late.p999:6.0f} max {late.largest:6.0f}  missed {100 * (1 - one.held):.2f} %"
         )
         if one.work_us.size:
-            work = figures(one.work_us)
+            work = percentiles(one.work_us)
             line += f"  work p50 {work.p50:4.0f} p99 {work.p99:4.0f}  CPU {one.cpu_percent:.1f} %"
             line += f"  page faults {one.page_faults}"
         print(line, flush=True)
@@ -79,12 +79,12 @@ def steal_s() -> float:
 def ratio(rounds: list[dict[str, LoopMeasurement]], over: str, under: str, which: str) -> float:
     """Return the median over the rounds of the ratio of two lateness figures."""
 
-    def value(late: Figures) -> float:
+    def value(late: LatencyPercentiles) -> float:
         # cyclictest counts whole microseconds.
         return max(1.0, getattr(late, which))
 
     return statistics.median(
-        value(figures(found[over].lateness_us)) / value(figures(found[under].lateness_us))
+        value(percentiles(found[over].lateness_us)) / value(percentiles(found[under].lateness_us))
         for found in rounds
     )
 
@@ -95,12 +95,12 @@ def highest_rate(seconds: float) -> None:
     rate_hz = RATE_HZ
     highest_hz: dict[str, float] = {}
     while rate_hz <= HIGHEST_HZ:
-        rig = loops.rig_for(profile, rate_hz, 0.0)
+        rig = loops.simulated_profile(profile, rate_hz, 0.0)
         tries = [loops.run_session("session", rig, seconds, quiet) for _ in range(TRIES)]
         held = max(one.held for one in tries)
         between = max(one.held_between_stalls for one in tries)
         best = max(tries, key=lambda one: one.held_between_stalls)
-        late, work = figures(best.lateness_us), figures(best.work_us)
+        late, work = percentiles(best.lateness_us), percentiles(best.work_us)
         print(
             f"  {rate_hz:6.0f} Hz held {100 * held:7.3f} %, but for stalls {100 * between:7.3f} %  "
             f"late p99 {late.p99:4.0f}  work p50 {work.p50:3.0f} p99 {work.p99:4.0f}  "
@@ -108,10 +108,10 @@ def highest_rate(seconds: float) -> None:
             flush=True,
         )
         for what, share in (("all ticks", held), ("but for stalls", between)):
-            if share >= HELD:
+            if share >= HELD_FRACTION:
                 highest_hz[what] = rate_hz
         rate_hz *= 2.0
-    print(f"highest rate that holds {100 * HELD:g} %: {highest_hz}")
+    print(f"highest rate that holds {100 * HELD_FRACTION:g} %: {highest_hz}")
 
 
 def main() -> None:
@@ -121,7 +121,7 @@ def main() -> None:
     use_one_thread()
     granted = settings_granted(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
-    if not cyclictest.installed():
+    if not cyclictest.is_installed():
         raise SystemExit("cyclictest is not installed (package rt-tests).")
     rounds = []
     for _ in range(count):
@@ -134,7 +134,7 @@ def main() -> None:
     ):
         p50, p99 = (ratio(rounds, over, under, which) for which in ("p50", "p99"))
         print(f"lateness, {text}: p50 {p50:.2f}, p99 {p99:.2f} ({limit})")
-    worst = max(figures(found[LOADED].work_us).p99 for found in rounds)
+    worst = max(percentiles(found[LOADED].work_us).p99 for found in rounds)
     print(f"work p99, worst of the rounds with all: {worst:.0f} µs (below 150)")
     costs = [
         statistics.median(found[name].cpu_percent for found in rounds) for name in (IDLE, SPUN)

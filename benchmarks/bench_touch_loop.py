@@ -19,7 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from rigd.bench import _loops as loops
-from rigd.bench.measure import Figures, LoopMeasurement, UsageMeter, figures, measurement
+from rigd.bench.measure import (
+    LatencyPercentiles,
+    LoopMeasurement,
+    UsageMeter,
+    percentiles,
+    record_measurement,
+)
 from rigd.checks.machine import settings_granted
 from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
@@ -53,7 +59,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
     """Run a session and measure its loop."""
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        loops.connected(profile) as (rig, group),
+        loops.connected_rig(profile) as (rig, group),
     ):
         meter = UsageMeter(group.control.pid)
 
@@ -72,7 +78,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         samples = read_session(result.path).samples
     if np.any(samples["status"] & int(Status.TOUCHED)):
         raise SystemExit("A touch was detected where there was none: the motions differ.")
-    return measurement(
+    return record_measurement(
         name,
         RATE_HZ,
         samples,
@@ -82,9 +88,9 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
     )
 
 
-def show(one: LoopMeasurement) -> tuple[Figures, Figures]:
+def show(one: LoopMeasurement) -> tuple[LatencyPercentiles, LatencyPercentiles]:
     """Print a session, in µs; return its lateness and work."""
-    late, work = figures(one.lateness_us), figures(one.work_us)
+    late, work = percentiles(one.lateness_us), percentiles(one.work_us)
     cpu = "" if one.cpu_percent is None else f"  CPU {one.cpu_percent:.1f} %"
     print(
         f"  {one.name:17s} late p50 {late.p50:5.1f} p99 {late.p99:6.1f} max {late.largest:6.0f}  "
@@ -100,7 +106,7 @@ def main() -> None:
     passes = int(sys.argv[1]) if len(sys.argv) > 1 else 5
     rounds = int(sys.argv[2]) if len(sys.argv) > 2 else 6
     use_one_thread()
-    profile = loops.rig_for(load_profile("sim"), RATE_HZ, 0.0)
+    profile = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
     granted = settings_granted(profile.realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     searching = search(profile, passes)

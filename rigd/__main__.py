@@ -1,16 +1,17 @@
-"""Entry point of ``rigd``, in a module that takes no time to import."""
+"""Entry point of the command ``rigd``, in a module that is imported quickly."""
 
 import os
 import select
 import signal
 import sys
 
-_NOTHING_BEGAN = b"Stopped before anything began.\n"
+_NOTHING_BEGAN_MESSAGE = b"Stopped before anything began.\n"
+"""Message after Ctrl-C before a command has started."""
 
 
 def main() -> None:
-    """Run the command line; Ctrl-C ends it with 130 even while it is still being imported."""
-    signal.signal(signal.SIGINT, _end)
+    """Run the command line ``rigd``; Ctrl-C during its import ends it with exit code 130."""
+    signal.signal(signal.SIGINT, _end_on_interrupt)
     _fill_standard_descriptors()
     from rigd.runtime import ignore_handled_signals, use_one_thread
 
@@ -25,18 +26,18 @@ def main() -> None:
         ignore_handled_signals()
 
 
-def _end(*_: object) -> None:
-    """Say that nothing has begun, where somebody listens, and end at once."""
+def _end_on_interrupt(*_: object) -> None:
+    """Write to standard error that nothing has begun, and end the process at once."""
     try:
-        if select.select([], [2], [], 0)[1]:  # a full pipe would be waited for
-            os.write(2, _NOTHING_BEGAN)
+        if select.select([], [2], [], 0)[1]:  # a write to a full pipe would block
+            os.write(2, _NOTHING_BEGAN_MESSAGE)
     except OSError:
         pass  # closed, or its terminal is gone
     os._exit(130)
 
 
 def _fill_standard_descriptors() -> None:
-    """Reopen closed standard descriptors: other files would get the numbers 0 to 2."""
+    """Open closed standard descriptors, so that no other file gets the numbers 0 to 2."""
     while (fd := os.open(os.devnull, os.O_RDWR)) <= 2:
         os.set_inheritable(fd, True)
     os.close(fd)

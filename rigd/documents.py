@@ -1,4 +1,4 @@
-"""TOML and JSON documents of users, read with limits of their size.
+"""Reader of users' TOML and JSON documents, with limits of their size and depth.
 
 A document of a few kilobytes can be nested deeper than the interpreter's stack, contain a number
 with thousands of digits, or take twenty times its size in memory. Such documents are refused with
@@ -14,29 +14,33 @@ from typing import Any, Final
 from rigd.runtime import open_plain_file
 from rigd.text_table import decode_text
 
-MOST_TOML_BYTES: Final = 250_000
-MOST_JSON_BYTES: Final = 12_000_000
-"""Largest size of JSON; the worst document takes thirty times as much memory."""
-_MOST_ENTRIES: Final = 3000
+MAX_TOML_BYTES: Final = 250_000
+"""Largest size of a TOML file in bytes."""
+MAX_JSON_BYTES: Final = 12_000_000
+"""Largest size of a JSON file in bytes; the worst document takes thirty times as much memory."""
+_MAX_ENTRIES: Final = 3000
 """Largest number of keys and elements of a TOML document; a profile has 150."""
-_LONGEST_LINE: Final = 4096
-"""Longest line of TOML, characters: the memory for a dotted key grows quadratically."""
-_DEEPEST: Final = 16
+_MAX_LINE_CHARACTERS: Final = 4096
+"""Largest number of characters in a line of TOML.
+
+The memory for a dotted key grows with the square of its length."""
+_MAX_DEPTH: Final = 16
+"""Largest depth of nested tables and arrays in a TOML document."""
 
 
 class DocumentError(ValueError):
-    """A document cannot be read; the message completes a sentence after the file name."""
+    """A document cannot be read; the message is a clause that follows the file's name."""
 
 
-def read_text(path: Path, most_bytes: int = MOST_TOML_BYTES) -> str:
-    """Return the text of a file.
+def read_text(path: Path, most_bytes: int = MAX_TOML_BYTES) -> str:
+    """Return the text of a user's file of limited size.
 
     Parameters
     ----------
     path
-        Name of the file.
+        Path of the file.
     most_bytes
-        Size of the largest file that is read.
+        Largest accepted size of the file in bytes.
 
     Raises
     ------
@@ -53,22 +57,25 @@ def read_text(path: Path, most_bytes: int = MOST_TOML_BYTES) -> str:
 
 
 def parse_toml(text: str) -> dict[str, Any]:
-    """Return the document of a TOML text.
+    """Parse a TOML document.
 
     Parameters
     ----------
     text
-        The text.
+        Text of the document.
 
     Raises
     ------
     DocumentError
-        If it is not TOML, is nested too deeply, or is larger than a document written by a person.
+        If the text is not TOML, is nested too deeply, or is larger than a document written by a
+        person.
     """
-    if len(text) > MOST_TOML_BYTES:
-        raise DocumentError(f"has more than {MOST_TOML_BYTES} characters; shorten it")
-    if any(len(line) > _LONGEST_LINE for line in text.splitlines()):
-        raise DocumentError(f"has a line of more than {_LONGEST_LINE} characters; shorten it")
+    if len(text) > MAX_TOML_BYTES:
+        raise DocumentError(f"has more than {MAX_TOML_BYTES} characters; shorten it")
+    if any(len(line) > _MAX_LINE_CHARACTERS for line in text.splitlines()):
+        raise DocumentError(
+            f"has a line of more than {_MAX_LINE_CHARACTERS} characters; shorten it"
+        )
     try:
         document = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
@@ -77,19 +84,19 @@ def parse_toml(text: str) -> dict[str, Any]:
         raise DocumentError("is not valid TOML: it is nested too deeply") from error
     except ValueError as error:  # the interpreter's limit on digits
         raise DocumentError("is not valid TOML: a number has too many digits") from error
-    _check_extent(document)
+    _require_small_document(document)
     return document
 
 
-def read_json(path: Path, most_bytes: int = MOST_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
-    """Return the value of a JSON file.
+def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN401 - any JSON value
+    """Read a JSON file of limited size, and return its value.
 
     Parameters
     ----------
     path
-        Name of the file.
+        Path of the file.
     most_bytes
-        Size of the largest file that is read.
+        Largest accepted size of the file in bytes.
 
     Raises
     ------
@@ -105,19 +112,21 @@ def read_json(path: Path, most_bytes: int = MOST_JSON_BYTES) -> Any:  # noqa: AN
         raise DocumentError(f"is not a JSON document ({error})") from error
 
 
-def _check_extent(document: Mapping[str, Any]) -> None:
+def _require_small_document(document: Mapping[str, Any]) -> None:
+    """Raise DocumentError if a document has too many entries or is nested too deeply."""
     entries = 0
     level: list[Any] = [document]
-    for _ in range(_DEEPEST):
-        level = [each for part in level for each in _parts(part)]
+    for _ in range(_MAX_DEPTH):
+        level = [each for parent in level for each in _children(parent)]
         entries += len(level)
-        if entries > _MOST_ENTRIES:
-            raise DocumentError(f"has more than {_MOST_ENTRIES} keys and numbers; shorten it")
-    if any(_parts(each) for each in level):
-        raise DocumentError(f"has tables nested deeper than {_DEEPEST} levels; flatten it")
+        if entries > _MAX_ENTRIES:
+            raise DocumentError(f"has more than {_MAX_ENTRIES} keys and numbers; shorten it")
+    if any(_children(each) for each in level):
+        raise DocumentError(f"has tables nested deeper than {_MAX_DEPTH} levels; flatten it")
 
 
-def _parts(value: object) -> list[Any]:
+def _children(value: object) -> list[Any]:
+    """Return the values in a table or array, or an empty list for any other value."""
     if isinstance(value, dict):
         return [*value.values()]
     return value if isinstance(value, list) else []

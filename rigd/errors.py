@@ -47,21 +47,21 @@ exception.
 
 
 class RigdError(Exception):
-    """An error whose message is for the operator."""
+    """Base class of all errors whose message is for the operator."""
 
     wrong_use = False
     """Whether the request must be changed; otherwise the same request may succeed later."""
 
     def full_message(self) -> str:
-        """Return the message for the operator; this may take some seconds for further checks."""
+        """Return the message for the operator, which further checks may complete for seconds."""
         return str(self)
 
 
 class UserError(RigdError):
-    """A request that must be changed."""
+    """Base class of errors after which the operator must change the request: exit code 2."""
 
     wrong_use = True
 
 
 class FailureError(RigdError):
-    """A valid request that failed."""
+    """Base class of errors after which the same request may succeed later: exit code 1."""

@@ -1,7 +1,7 @@
-"""Identified beam of an analysis, read from the document of ``analyze --json``.
+"""Reader of the beam that an analysis has identified, from the document of ``analyze --json``.
 
-Every parameter and every finding of the document is either taken into account or refused by name;
-none is ignored.
+Every parameter and every finding of the document is either taken into account or causes an error
+that names it; none is ignored.
 """
 
 import json
@@ -16,102 +16,113 @@ from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
 from rigd.units import finite_number, is_usable_size
 
-_NEEDED: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-_TWO_SIDED_95: Final = 1.959964
-_REMEDY: Final = "write it with analyze session.mcap --json model.json"
+_REQUIRED_PARAMETERS: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+"""Names of the parameters that every document must have."""
+_HALF_WIDTH_95_STDS: Final = 1.959964
+"""Half-width of the two-sided 95 % interval of a normal distribution, in standard deviations."""
+_ADVICE: Final = "write it with analyze session.mcap --json model.json"
+"""Advice in messages about unusable documents."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Parameter:
-    """Unit and range of a parameter of the document."""
+    """Unit and valid range of a parameter in the document, and the effect that it describes."""
 
     unit: str = ""
-    least: float = 0.0
-    below: float = inf
-    words: str = ""
-    """Description of an effect beyond a uniform beam with ideal channels; else empty."""
+    """Unit of the parameter, or "" for a dimensionless one."""
+    lower_limit: float = 0.0
+    """Smallest valid value."""
+    upper_limit: float = inf
+    """Upper limit, which valid values do not reach."""
+    effect: str = ""
+    """Description of the effect, or "" for parameters of a uniform beam with ideal channels."""
     remedy: str = ""
-    """How to obtain a document without the effect."""
+    """Advice how to obtain a document without the effect."""
 
 
-_OFFSET: Final = "stiffness_offset_"
-_AT_ENDS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
-_STATE_FILTER: Final = (
+_OFFSET_PREFIX: Final = "stiffness_offset_"
+"""Beginning of the names of modal stiffness offsets, before the number of the mode."""
+_END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
+"""Names of the parameters of the beam's ends."""
+_FILTER_ADVICE: Final = (  # Advice if the analysis found a low-pass filter
     "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), "
     "record again and analyze that session"
 )
 _PARAMETERS: Final[Mapping[str, _Parameter]] = {
-    "zeta": _Parameter("s^alpha", below=1.0),
-    "alpha": _Parameter(below=2.0),
+    "zeta": _Parameter("s^alpha", upper_limit=1.0),
+    "alpha": _Parameter(upper_limit=2.0),
     "gamma": _Parameter("s^lambda/m⁴"),
-    "lambda": _Parameter(below=2.0),
+    "lambda": _Parameter(upper_limit=2.0),
     "density_over_stiffness": _Parameter("s²/m⁴"),
     "bending_stiffness_n_m2": _Parameter("N·m²"),
     "tool_inertia_kg_m2": _Parameter("kg·m²"),
-    "delay_s": _Parameter("s", least=-inf),
+    "delay_s": _Parameter("s", lower_limit=-inf),
     "tip_mass_kg": _Parameter(
-        "kg", words="a mass at the tip", remedy="take it off, and record and analyze again"
+        "kg", effect="a mass at the tip", remedy="take it off, and record and analyze again"
     ),
     "root_compliance_rad_per_nm": _Parameter(
         "rad/(N·m)",
-        words="an elastic clamp",
+        effect="an elastic clamp",
         remedy="tighten or stiffen the clamp, and record and analyze again",
     ),
-    _OFFSET: _Parameter(
-        least=-0.9,
-        below=10.0,
-        words="a mode whose stiffness is not that of a uniform beam",
+    _OFFSET_PREFIX: _Parameter(
+        lower_limit=-0.9,
+        upper_limit=10.0,
+        effect="a mode whose stiffness is not that of a uniform beam",
         remedy="look for an added mass or a section that varies, and record and analyze again",
     ),
     "filter_time_constant_s": _Parameter(
-        "s", words="a low-pass filter of the torque", remedy=_STATE_FILTER
+        "s", effect="a low-pass filter of the torque", remedy=_FILTER_ADVICE
     ),
     "second_order_filter_time_constant_s": _Parameter(
-        "s", words="a low-pass filter of the torque", remedy=_STATE_FILTER
+        "s", effect="a low-pass filter of the torque", remedy=_FILTER_ADVICE
     ),
     "clock_rate_difference": _Parameter(
-        least=-1.0,
-        below=1.0,
-        words="clocks of different rates",
+        lower_limit=-1.0,
+        upper_limit=1.0,
+        effect="clocks of different rates",
         remedy="sample angle and torque by one clock, and record and analyze again",
     ),
     "drag": _Parameter(
         "m",
-        words="drag of the air",
+        effect="drag of the air",
         remedy="leave --model out, and expect more vibration than stated",
     ),
 }
-"""All parameters of documents of this version or an older one. Offsets of modes, the compliance of
-the clamp and the difference of clocks are no longer estimated. A document with an unknown parameter
-is refused, because its effect is unknown."""
+"""All parameters of documents of this version or an older one, by name.
 
-_WITHOUT_EFFECT: Final = frozenset(
+Offsets of modes, the compliance of the clamp and the difference of clocks are no longer estimated.
+A document with an unknown parameter is refused, because its effect is unknown."""
+
+_FINDINGS_IN_ESTIMATES: Final = frozenset(
     {"hum", "sensor drift", "ringing start", "knock", "clipping", "stop"}
 )
-"""Findings on one record, which the estimates take into account; doubtful numbers are flagged."""
+"""Kinds of findings on a record that the estimates take into account.
 
-_IN_PARAMETERS: Final = frozenset(
+Doubtful numbers are flagged."""
+
+_FINDINGS_IN_PARAMETERS: Final = frozenset(
     {
         *("delay", "tool inertia", "beam data", "air drag", "rival explanations"),
         # From analyses with model variants other than the uniform beam:
         *("not uniform", "elastic clamp", "tip mass", "torque filter"),
     }
 )
-"""Findings whose magnitude is among the parameters."""
+"""Kinds of findings whose magnitude is among the parameters."""
 
 
 class IdentifiedBeamError(UserError, ValueError):
-    """A document has no usable beam; the message names file, key and remedy."""
+    """The document of an analysis has no usable beam; the message names file, key and remedy."""
 
 
 @dataclass(frozen=True, slots=True)
 class Use:
-    """Purpose of an identified beam: effects taken into account and required parameters."""
+    """Purpose for which an identified beam is used, with its requirements on the document."""
 
     name: str
-    """Name in messages, such as "a move"."""
+    """Name of the purpose in messages, such as "a move"."""
     effects: frozenset[str]
-    """Additional parameters that are taken into account."""
+    """Parameters of effects beyond a uniform beam that are taken into account."""
     certain: frozenset[str]
     """Parameters that must not be flagged, unless their standard deviation covers the doubt."""
     modes: bool = False
@@ -120,36 +131,40 @@ class Use:
 
 MOVE: Final = Use(
     "a move",
-    frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
-    frozenset({*_NEEDED, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET}),
+    frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET_PREFIX}),
+    frozenset({*_REQUIRED_PARAMETERS, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET_PREFIX}),
     modes=True,
 )
-"""A vibration-free move depends on the modes and hardly on the composition of their damping."""
+"""Use of a beam for a vibration-free move.
+
+The move depends on the modes and hardly on the composition of their damping."""
 
 TOUCH: Final = Use(
     "a search for touches",
     frozenset(),
-    frozenset(_NEEDED),
+    frozenset(_REQUIRED_PARAMETERS),
 )
-"""A touch is located by the exact model of a uniform beam with a free tip on a rigid clamp."""
+"""Use of a beam to locate touches.
+
+They are located by the exact model of a uniform beam with a free tip on a rigid clamp."""
 
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedBeam:
-    """Parameters of the exact model from an analysis."""
+    """Beam, damping and delays that an analysis has identified, with uncertainties."""
 
     beam: Beam
     """Beam with the given length and the identified stiffness and density."""
     damping: Damping
     """Identified damping; a coefficient of 0 means that the structure has no such damping."""
     tool_inertia_kg_m2: float | None
-    """Inertia between sensor and beam; None: not identified."""
+    """Inertia between sensor and beam, or None if it was not identified."""
     delay_s: float | None
-    """Delay of the torque less that of the angle; None: not identified."""
+    """Delay of the torque minus that of the angle, or None if it was not identified."""
     std: Mapping[str, float]
-    """Known standard deviations by parameter name in the document."""
+    """Known standard deviations of parameters, by their names in the document."""
     tip_mass_kg: float = 0.0
-    """Point mass at the tip."""
+    """Point mass at the tip of the beam."""
     root_compliance_rad_per_nm: float = 0.0
     """Rotational compliance of the clamp."""
     stiffness_offsets: tuple[float, ...] = ()
@@ -159,7 +174,7 @@ class IdentifiedBeam:
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """Beam with its damping and end conditions."""
+        """Identified beam with its damping, tip mass, clamp and modal stiffness offsets."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -169,25 +184,28 @@ class IdentifiedBeam:
         )
 
     def pole_uncertainty(self, modes: int) -> tuple[float, ...]:
-        """Return the relative standard uncertainty of the poles of some modes.
+        """Return the relative standard uncertainty of the poles of the first modes.
 
         Parameters
         ----------
         modes
-            Number of modes, from the first. A mode that is not in the document gets the largest
-            uncertainty of those in it.
+            Number of modes, from the first on. For a mode that is not in the document it is the
+            largest uncertainty of the modes in the document.
         """
-        of_beam = 0.5 * self.std.get(_NEEDED[0], 0.0) / self.beam.density_over_stiffness
-        further = max(self.mode_uncertainty, default=of_beam)
-        return (*self.mode_uncertainty, *(further,) * modes)[:modes]
+        from_density = (
+            0.5 * self.std.get(_REQUIRED_PARAMETERS[0], 0.0) / self.beam.density_over_stiffness
+        )
+        other_modes = max(self.mode_uncertainty, default=from_density)
+        return (*self.mode_uncertainty, *(other_modes,) * modes)[:modes]
 
 
 def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
-    """Return the beam of the headline of an analysis; for a campaign, the pooled one.
+    """Read the identified beam from the document of an analysis or a campaign.
 
-    If a uniform beam predicts the modes, the parameters are those of an exactly uniform beam, which
-    predict the record best. Otherwise no uniform beam describes the rig, and the modes themselves
-    are used if the purpose permits it.
+    It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
+    predicts the modes, the parameters are those of an exactly uniform beam, which predict the
+    record best. Otherwise no uniform beam describes the rig, and the modes themselves are used if
+    the purpose permits it.
 
     Parameters
     ----------
@@ -199,6 +217,11 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
     use
         Purpose of the beam: `MOVE` or `TOUCH`.
 
+    Returns
+    -------
+    IdentifiedBeam
+        Beam, damping and uncertainties.
+
     Raises
     ------
     IdentifiedBeamError
@@ -206,36 +229,40 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         use does not take into account, or if a required number is flagged.
     """
     path = Path(path)
-    where, headline, refused = _headline(path)
+    label, headline, refused = _read_headline(path)
     if refused and not use.modes:
         raise IdentifiedBeamError(
-            f"{where}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
+            f"{label}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
             "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
             "record and analyze again, or leave out --model."
         )
-    _refuse_findings(where, headline.get("named"), use)
+    _require_known_findings(label, headline.get("named"), use)
     source = headline
     if not refused and isinstance(exact := headline.get("exact_geometry"), dict):
-        where, source = f"{where}.exact_geometry", exact
+        label, source = f"{label}.exact_geometry", exact
     parameters = source.get("parameters")
     if not isinstance(parameters, dict):
-        raise IdentifiedBeamError(f"{where}.parameters is missing; {_REMEDY}.")
-    values = parameter_values(where, parameters)
+        raise IdentifiedBeamError(f"{label}.parameters is missing; {_ADVICE}.")
+    values = parameter_values(label, parameters)
     if refused:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
-        values = {n: v for n, v in values.items() if _of(n) not in (_OFFSET, *_AT_ENDS)}
-    _refuse_effects(where, values, use)
+        values = {
+            n: v
+            for n, v in values.items()
+            if _parameter_key(n) not in (_OFFSET_PREFIX, *_END_PARAMETERS)
+        }
+    _require_known_effects(label, values, use)
     std = {}
     for name in values:
         deviation = (
-            _deviation(parameters[name])
+            _standard_deviation(parameters[name])
             if refused
-            else _deviation_for(where, name, parameters[name], use)
+            else _required_deviation(label, name, parameters[name], use)
         )
         if deviation is not None:
             std[name] = deviation
-    density_over_stiffness, stiffness = (values[name] for name in _NEEDED)
-    found = IdentifiedBeam(
+    density_over_stiffness, stiffness = (values[name] for name in _REQUIRED_PARAMETERS)
+    identified = IdentifiedBeam(
         beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
         damping=Damping(
             zeta=values.get("zeta", 0.0),
@@ -248,15 +275,25 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         std=std,
         tip_mass_kg=values.get("tip_mass_kg", 0.0),
         root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_offsets(where, values),
-        mode_uncertainty=_mode_uncertainty(where, source.get("modes")),
+        stiffness_offsets=_stiffness_offsets(label, values),
+        mode_uncertainty=_mode_uncertainty(label, source.get("modes")),
     )
-    return _with_modes(where, found, headline.get("modes"), refused) if refused else found
+    return (
+        _with_observed_modes(label, identified, headline.get("modes"), refused)
+        if refused
+        else identified
+    )
 
 
-def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) -> IdentifiedBeam:
-    """Return a beam with observed mode frequencies and participation of the first mode."""
-    shown: list[tuple[float, float, float | None]] = []
+def _with_observed_modes(
+    label: str, found: IdentifiedBeam, modes: object, refused: str
+) -> IdentifiedBeam:
+    """Return the beam after its modes are replaced by the observed ones.
+
+    Stiffness offsets give it the observed frequencies, and its inertia follows from the first
+    mode's participation. `refused` is the reason why no uniform beam can be used.
+    """
+    observed: list[tuple[float, float, float | None]] = []
     for entry in modes if isinstance(modes, list) else []:
         if not isinstance(entry, dict) or not entry.get("shown", True):
             break
@@ -268,55 +305,61 @@ def _with_modes(where: str, found: IdentifiedBeam, modes: object, refused: str) 
         flags = [each.get("flag") for each in quantities if isinstance(each, dict)]
         if not hz or not ratio or hz < 0 or any(flags):
             break
-        shown.append((hz, ratio, inertia))
-    if not shown:
+        observed.append((hz, ratio, inertia))
+    if not observed:
         raise IdentifiedBeamError(
-            f"{where}.modes: {refused}, and no mode is shown without a flag that could take its "
+            f"{label}.modes: {refused}, and no mode is shown without a flag that could take its "
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        like = found.loaded_beam.with_frequencies([hz for hz, _, _ in shown])
+        offset_beam = found.loaded_beam.with_frequencies([hz for hz, _, _ in observed])
     except ValueError as error:
-        raise IdentifiedBeamError(f"{where}.parameters: {error} Leave out --model.") from None
-    beam, inertia = like.beam, shown[0][2]
+        raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
+    beam, inertia = offset_beam.beam, observed[0][2]
     if inertia and inertia > 0:
-        size = inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
+        scale = inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
             beam,
-            density_kg_per_m=size * beam.density_kg_per_m,
-            bending_stiffness_n_m2=size * beam.bending_stiffness_n_m2,
+            density_kg_per_m=scale * beam.density_kg_per_m,
+            bending_stiffness_n_m2=scale * beam.bending_stiffness_n_m2,
         )
-    found = replace(found, beam=beam, stiffness_offsets=like.stiffness_offsets)
-    poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(shown)))[:, 0]
+    found = replace(found, beam=beam, stiffness_offsets=offset_beam.stiffness_offsets)
+    poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(observed)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     uncertainty = (
-        hypot(own, abs(ratio + pole.real / abs(pole)))
-        for own, (_, ratio, _), pole in zip(found.mode_uncertainty, shown, poles, strict=False)
+        hypot(parameter_std, abs(ratio + pole.real / abs(pole)))
+        for parameter_std, (_, ratio, _), pole in zip(
+            found.mode_uncertainty, observed, poles, strict=False
+        )
     )
     return replace(found, mode_uncertainty=tuple(uncertainty))
 
 
-def _headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
-    """Return a headline after its name in messages, and why it excludes a uniform beam."""
+def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
+    """Return the name of a headline in messages, the headline, and why no uniform beam can be used.
+
+    The reason is "" if a uniform beam can be used.
+    """
     document: Any = read_document(path)
-    where, headline = select_headline(path, document)
-    # One record of a campaign that excludes it is enough.
+    label, headline = select_headline(path, document)
+    # A single record of a campaign can exclude a uniform beam.
     pooled = headline.get("file", "") is None
-    counting = filter(_is_object, document["headlines"]) if pooled else [headline]
-    return where, headline, next(filter(None, map(_refusal, counting)), "")
+    headlines = filter(_is_json_object, document["headlines"]) if pooled else [headline]
+    return label, headline, next(filter(None, map(_uniform_beam_refusal, headlines)), "")
 
 
-def _is_object(entry: object) -> bool:
-    """Return whether a value of a document is an object."""
+def _is_json_object(entry: object) -> bool:
+    """Return whether a value of a document is a JSON object."""
     return isinstance(entry, dict)
 
 
 def read_document(path: Path) -> object:
-    """Read a document of ``analyze --json``.
+    """Read the JSON document of an analysis.
 
     Parameters
     ----------
     path
+        File that ``analyze --json`` has written.
 
     Raises
     ------
@@ -326,214 +369,240 @@ def read_document(path: Path) -> object:
     try:
         return read_json(path)
     except DocumentError as error:
-        raise IdentifiedBeamError(f"{path}: {error}; {_REMEDY}.") from error
+        raise IdentifiedBeamError(f"{path}: {error}; {_ADVICE}.") from error
 
 
 def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any]]:
-    """Return the name in messages and the first headline of a document, pooled for a campaign.
+    """Return the first headline of an analysis' document, after its name in messages.
+
+    For a campaign it is the pooled headline.
 
     Parameters
     ----------
     path
         File of the document, for messages.
     document
-        As `read_document` returns it.
+        Document as returned by `read_document`.
 
     Raises
     ------
     IdentifiedBeamError
-        If there is none.
+        If the document has no headline with parameters.
     """
     headlines = document.get("headlines") if isinstance(document, dict) else None
     if not isinstance(headlines, list):
         headlines = []
-    found = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
-    pooled = [(k, each) for k, each in found if each.get("file", "") is None]
-    index, headline = next(iter(pooled + found), (0, {}))
+    numbered_headlines = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
+    pooled = [(k, each) for k, each in numbered_headlines if each.get("file", "") is None]
+    index, headline = next(iter(pooled + numbered_headlines), (0, {}))
     if not isinstance(headline.get("parameters"), dict):
-        raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_REMEDY}.")
+        raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_ADVICE}.")
     return f"{path}: headlines[{index}]", headline
 
 
-def _refusal(headline: Mapping[str, Any]) -> str:
-    """Return why a uniform beam does not predict the modes of a record; empty if it may."""
+def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
+    """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
     validity = headline.get("validity")
-    test = validity.get("uniform_beam") if isinstance(validity, dict) else None
-    if not isinstance(test, dict) or test.get("status") != "refused":
+    uniform_beam_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
+    if not isinstance(uniform_beam_test, dict) or uniform_beam_test.get("status") != "refused":
         return ""
-    p_value = finite_number(test.get("p_value"))
+    p_value = finite_number(uniform_beam_test.get("p_value"))
     p = "" if p_value is None else f" (p = {p_value:.1g})"
     return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
-def parameter_values(where: str, parameters: Mapping[str, Any]) -> dict[str, float]:
-    """Return the values of a headline's parameters, each within its range.
+def parameter_values(label: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+    """Return the values of a headline's parameters, after a check of their ranges.
 
     Parameters
     ----------
-    where
+    label
         Name of the headline in messages.
     parameters
-        ``parameters`` of the headline.
+        Object ``parameters`` of the headline.
 
     Raises
     ------
     IdentifiedBeamError
         If a parameter is unknown or out of range, or a required parameter is missing.
     """
-    values = {name: _value(where, name, entry) for name, entry in parameters.items()}
-    for name in _NEEDED:
+    values = {name: _parameter_value(label, name, entry) for name, entry in parameters.items()}
+    for name in _REQUIRED_PARAMETERS:
         if name not in values:
             raise IdentifiedBeamError(
-                f"{where}.parameters.{name} is missing; take the document of an analysis that "
+                f"{label}.parameters.{name} is missing; take the document of an analysis that "
                 "found it (analyze session.mcap --json model.json)."
             )
     return values
 
 
 def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
-    """Return index, kind and sentence of the findings whose effect no parameter describes.
+    """Return the findings of an analysis whose effect no parameter describes.
 
-    Findings on one record only, which do not concern the antenna, are omitted.
+    Each one is a tuple of index, kind and sentence. Findings that concern only the record and not
+    the antenna are omitted.
 
     Parameters
     ----------
     named
-        ``named`` of a headline.
+        List ``named`` of a headline.
     """
-    found = []
+    findings = []
     for number, entry in enumerate(named if isinstance(named, list) else []):
-        given = entry if isinstance(entry, dict) else {}
-        what = given.get("what")
-        if what not in _WITHOUT_EFFECT and what not in _IN_PARAMETERS:
-            found.append((number, str(what)[:60], str(given.get("sentence"))[:200]))
-    return found
+        finding = entry if isinstance(entry, dict) else {}
+        kind = finding.get("what")
+        if kind not in _FINDINGS_IN_ESTIMATES and kind not in _FINDINGS_IN_PARAMETERS:
+            findings.append((number, str(kind)[:60], str(finding.get("sentence"))[:200]))
+    return findings
 
 
-def _of(name: str) -> str:
-    """Return the name of a parameter in `_PARAMETERS`, for a mode's offset without the mode."""
-    return _OFFSET if name.startswith(_OFFSET) and name[len(_OFFSET) :].isdecimal() else name
-
-
-def _value(where: str, name: str, entry: object) -> float:
-    """Return the value of a parameter in the valid range of the exact model."""
-    known = _PARAMETERS.get(_of(name))
-    if known is None or name == _OFFSET:
-        raise IdentifiedBeamError(
-            f"{where}.parameters.{name[:60]!r} is not known to this version, so what it changes "
-            "cannot be taken into account; update rigd, or do without this document."
-        )
-    given = entry.get("value") if isinstance(entry, dict) else None
-    value = finite_number(given)
-    in_range = value is not None and known.least <= value < known.below and is_usable_size(value)
-    if value is not None and in_range and (value > 0.0 or name not in _NEEDED):
-        return value
-    bound = "any size"
-    if known.least > -inf:
-        bound = "more than 0" if name in _NEEDED else f"{known.least:g} or more"
-    if known.below < inf:
-        bound += f" below {known.below:g}"
-    unit = f" {known.unit}" if known.unit else ""
-    raise IdentifiedBeamError(
-        f"{where}.parameters.{name}.value = {json.dumps(given, default=str)[:60]} "
-        f"must be a number of {bound}{unit}; {_REMEDY}."
+def _parameter_key(name: str) -> str:
+    """Return the key of a parameter in `_PARAMETERS`; that of an offset lacks the mode's number."""
+    return (
+        _OFFSET_PREFIX
+        if name.startswith(_OFFSET_PREFIX) and name[len(_OFFSET_PREFIX) :].isdecimal()
+        else name
     )
 
 
-def _refuse_effects(where: str, values: Mapping[str, float], use: Use) -> None:
-    """Raise for effects in addition to a uniform beam that the use does not take into account."""
+def _parameter_value(label: str, name: str, entry: object) -> float:
+    """Return the value of a parameter, or raise if it is unknown or outside its range."""
+    definition = _PARAMETERS.get(_parameter_key(name))
+    if definition is None or name == _OFFSET_PREFIX:
+        raise IdentifiedBeamError(
+            f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
+            "cannot be taken into account; update rigd, or do without this document."
+        )
+    stated_value = entry.get("value") if isinstance(entry, dict) else None
+    value = finite_number(stated_value)
+    in_range = (
+        value is not None
+        and definition.lower_limit <= value < definition.upper_limit
+        and is_usable_size(value)
+    )
+    if value is not None and in_range and (value > 0.0 or name not in _REQUIRED_PARAMETERS):
+        return value
+    bound = "any size"
+    if definition.lower_limit > -inf:
+        bound = (
+            "more than 0" if name in _REQUIRED_PARAMETERS else f"{definition.lower_limit:g} or more"
+        )
+    if definition.upper_limit < inf:
+        bound += f" below {definition.upper_limit:g}"
+    unit = f" {definition.unit}" if definition.unit else ""
+    raise IdentifiedBeamError(
+        f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
+        f"must be a number of {bound}{unit}; {_ADVICE}."
+    )
+
+
+def _require_known_effects(label: str, values: Mapping[str, float], use: Use) -> None:
+    """Raise if the analysis found an effect that the use does not take into account."""
     for name, value in values.items():
-        known = _PARAMETERS[_of(name)]
-        if not known.words or not value or _of(name) in use.effects:
+        definition = _PARAMETERS[_parameter_key(name)]
+        if not definition.effect or not value or _parameter_key(name) in use.effects:
             continue
         corner_hz = 0.0 if "filter" not in name else 1.0 / (2.0 * pi * value)
-        remedy = known.remedy.format(
+        remedy = definition.remedy.format(
             corner_hz=corner_hz, order=2 if name.startswith("second") else 1
         )
-        unit = f" {known.unit}" if known.unit else ""
+        unit = f" {definition.unit}" if definition.unit else ""
         raise IdentifiedBeamError(
-            f"{where}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
-            f"{known.words}, which {use.name} does not take into account; {remedy}."
+            f"{label}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
+            f"{definition.effect}, which {use.name} does not take into account; {remedy}."
         )
-    if values.get("tip_mass_kg") and any(values[n] for n in values if _of(n) == _OFFSET):
+    if values.get("tip_mass_kg") and any(
+        values[n] for n in values if _parameter_key(n) == _OFFSET_PREFIX
+    ):
         raise IdentifiedBeamError(
-            f"{where}.parameters: tip_mass_kg and {_OFFSET}… together are not defined; take the "
-            "document of an analysis that found one of them."
+            f"{label}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
+            "the document of an analysis that found one of them."
         )
 
 
-def _refuse_findings(where: str, named: object, use: Use) -> None:
-    """Raise for findings without a parameter that change the beam or make the record doubtful."""
-    for number, what, sentence in findings_without_parameter(named):
+def _require_known_findings(label: str, named: object, use: Use) -> None:
+    """Raise if the analysis has a finding whose effect no parameter describes."""
+    for number, kind, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
-            f"{where}.named[{number}]: {what}, which {use.name} does not take into "
+            f"{label}.named[{number}]: {kind}, which {use.name} does not take into "
             f"account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
 
 
-def _deviation_for(where: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
-    """Return the standard deviation of a parameter, including the doubt of a flag."""
+def _required_deviation(label: str, name: str, entry: Mapping[str, Any], use: Use) -> float | None:
+    """Return the standard deviation of a parameter, or None if it is unknown.
+
+    Raises if the parameter is flagged and the use relies on it.
+    """
     flag = entry.get("flag")
     if flag is None:
-        return _deviation(entry)
+        return _standard_deviation(entry)
     # From analyses with other model variants: the deviation over all of them.
-    any_rig = finite_number(entry.get("std_any_rig"))
-    if any_rig is not None and any_rig > 0:
-        return any_rig
-    deviation = _deviation(entry)
+    std_any_rig = finite_number(entry.get("std_any_rig"))
+    if std_any_rig is not None and std_any_rig > 0:
+        return std_any_rig
+    deviation = _standard_deviation(entry)
     # For a move the uncertainty of the modes includes the damping.
-    in_modes = use is MOVE and not _PARAMETERS[_of(name)].words
-    if _of(name) not in use.certain and (deviation is not None or in_modes):
+    covered_by_modes = use is MOVE and not _PARAMETERS[_parameter_key(name)].effect
+    if _parameter_key(name) not in use.certain and (deviation is not None or covered_by_modes):
         return deviation
     raise IdentifiedBeamError(
-        f"{where}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
+        f"{label}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
         "record a session that shows more modes or is longer and analyze it, or leave out --model."
     )
 
 
-def _deviation(entry: Mapping[str, Any]) -> float | None:
-    """Return the 95 % half-width over 1.96, valid for all structures; else the std."""
-    ends, std = entry.get("interval_95"), finite_number(entry.get("std"))
-    if isinstance(ends, list) and len(ends) == 2:
-        low, high = map(finite_number, ends)
+def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
+    """Return the standard deviation of a parameter, or None if it is unknown.
+
+    It follows from the 95 % interval, which is valid for all structures, if there is one.
+    """
+    interval, std = entry.get("interval_95"), finite_number(entry.get("std"))
+    if isinstance(interval, list) and len(interval) == 2:
+        low, high = map(finite_number, interval)
         if low is not None and high is not None:
-            return abs(high - low) / (2 * _TWO_SIDED_95)
+            return abs(high - low) / (2 * _HALF_WIDTH_95_STDS)
     return std if std is not None and std > 0 else None
 
 
-def _offsets(where: str, values: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the offsets of modes 2, 3, … up to the last one in the document."""
-    found = {int(n[len(_OFFSET) :]): value for n, value in values.items() if _of(n) == _OFFSET}
-    modes = range(2, 2 + len(found))
-    if sorted(found) != list(modes):
-        given = ", ".join(map(str, sorted(found)))
+def _stiffness_offsets(label: str, values: Mapping[str, float]) -> tuple[float, ...]:
+    """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
+    offset_by_mode = {
+        int(n[len(_OFFSET_PREFIX) :]): value
+        for n, value in values.items()
+        if _parameter_key(n) == _OFFSET_PREFIX
+    }
+    modes = range(2, 2 + len(offset_by_mode))
+    if sorted(offset_by_mode) != list(modes):
+        given_modes = ", ".join(map(str, sorted(offset_by_mode)))
         raise IdentifiedBeamError(
-            f"{where}.parameters: {_OFFSET}… are those of modes {given}, but must be those of "
-            f"modes 2 to {modes[-1]}; {_REMEDY}."
+            f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given_modes}, but must be "
+            f"those of modes 2 to {modes[-1]}; {_ADVICE}."
         )
-    return tuple(found[mode] for mode in modes)
+    return tuple(offset_by_mode[mode] for mode in modes)
 
 
-def _mode_uncertainty(where: str, modes: object) -> tuple[float, ...]:
-    """Return the relative standard uncertainty of the poles of modes 1, 2, …."""
-    found: list[float] = []
+def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:
+    """Return the relative standard uncertainty of the pole of each mode in the document."""
+    uncertainties: list[float] = []
     for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
-        given = entry if isinstance(entry, dict) else {}
+        mode_object = entry if isinstance(entry, dict) else {}
         hz, ratio = (
-            of if isinstance(of := given.get(name), dict) else {}
+            of if isinstance(of := mode_object.get(name), dict) else {}
             for name in ("frequency_hz", "damping_ratio")
         )
         value_hz = finite_number(hz.get("value"))
-        if not value_hz or not ratio or given.get("mode") != number:
+        if not value_hz or not ratio or mode_object.get("mode") != number:
             raise IdentifiedBeamError(
-                f"{where}.modes[{number - 1}] is not mode {number} with frequency_hz and "
-                f"damping_ratio; {_REMEDY}."
+                f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
+                f"damping_ratio; {_ADVICE}."
             )
-        found.append(hypot(_of_mode(hz) / value_hz, _of_mode(ratio)))
-    return tuple(found)
+        uncertainties.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(ratio)))
+    return tuple(uncertainties)
 
 
-def _of_mode(entry: Mapping[str, Any]) -> float:
-    any_rig = finite_number(entry.get("std_any_rig"))
-    return max(any_rig or 0.0, _deviation(entry) or 0.0)
+def _mode_deviation(entry: Mapping[str, Any]) -> float:
+    """Return the standard deviation of a mode's quantity, or 0 if it is unknown."""
+    std_any_rig = finite_number(entry.get("std_any_rig"))
+    return max(std_any_rig or 0.0, _standard_deviation(entry) or 0.0)

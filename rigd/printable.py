@@ -1,4 +1,4 @@
-"""Text for terminals: harmless text from outside, counts, progress with the remaining time."""
+"""Text for terminals: safe display of texts from outside, counts, and progress lines."""
 
 import contextlib
 from collections.abc import Iterator, Mapping, Sequence
@@ -8,22 +8,24 @@ if TYPE_CHECKING:
     from rich.progress import Progress
 
 UNPRINTABLE: Final = "?"
-"""Replacement of a character that cannot be printed."""
+"""Character that replaces one that cannot be printed."""
 
-_FROM: Final = 10_000
-"""Smallest number with separated thousands."""
+_MIN_GROUPED_NUMBER: Final = 10_000
+"""Smallest number whose thousands are separated."""
 
-_MOST_LINES: Final = 40
-_LONGEST_LINE: Final = 2000
-_LINE_ENDING: Final = 500
-"""Characters at the end of a truncated line that remain, because they state the remedy."""
+_MAX_LINES: Final = 40
+"""Largest number of lines of a displayed message."""
+_MAX_LINE_CHARACTERS: Final = 2000
+"""Largest number of characters of a displayed line."""
+_LINE_END_LENGTH: Final = 500
+"""Number of characters at the end of a truncated line that are shown: they state the remedy."""
 
 _BAR_STYLES: Final = {"bar.complete": "cyan", "bar.finished": "green", "bar.pulse": "cyan"}
 """Styles of a progress bar; the default red is reserved for alarms."""
 
 
-def printable(text: str, most: int | None = None) -> str:
-    """Return a text without characters that a terminal would interpret.
+def printable(text: str, max_characters: int | None = None) -> str:
+    """Return a text in which characters that a terminal would interpret are replaced.
 
     Control characters, line breaks and all other unprintable characters are each replaced by
     :data:`UNPRINTABLE`.
@@ -32,17 +34,17 @@ def printable(text: str, most: int | None = None) -> str:
     ----------
     text
         Text from a file, a device, or a path.
-    most
-        Largest number of characters; an ellipsis replaces the others. None: all characters.
+    max_characters
+        Largest number of characters, or None for all; an ellipsis replaces the others.
     """
-    shown = text[:most]
+    shown = text[:max_characters]
     if not shown.isprintable():
         shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
     return shown if len(shown) == len(text) else f"{shown}…"
 
 
 def readable_message(message: str) -> str:
-    r"""Return an error message as harmless text of readable length.
+    r"""Return an error message as safe text for a terminal, shortened to a readable length.
 
     Lines after the fortieth are only counted, and the middle of a line of more than 2000 characters
     is omitted.
@@ -59,22 +61,23 @@ def readable_message(message: str) -> str:
     a.toml: x = ?[2J is unknown.
     """
     # A line break of a quotation and one of the message are indistinguishable and both harmless.
-    lines = message.split("\n", _MOST_LINES)
-    shown = [_readable_line(line) for line in lines[:_MOST_LINES]]
-    if len(lines) > _MOST_LINES:
+    lines = message.split("\n", _MAX_LINES)
+    shown = [_readable_line(line) for line in lines[:_MAX_LINES]]
+    if len(lines) > _MAX_LINES:
         shown.append(f"… and {grouped(lines[-1].count(chr(10)) + 1)} more lines.")
     return "\n".join(shown)
 
 
 def _readable_line(line: str) -> str:
-    if len(line) > _LONGEST_LINE:
-        line = f"{line[: _LONGEST_LINE - _LINE_ENDING]} … {line[-_LINE_ENDING:]}"
+    """Return a line as safe text for a terminal, without the middle of a very long line."""
+    if len(line) > _MAX_LINE_CHARACTERS:
+        line = f"{line[: _MAX_LINE_CHARACTERS - _LINE_END_LENGTH]} … {line[-_LINE_END_LENGTH:]}"
     return printable(line)
 
 
 @contextlib.contextmanager
 def readable_errors() -> Iterator[None]:
-    """Make the message of a usage error readable, whatever value it quotes."""
+    """Make the message of a usage error in this context safe and short, whatever it quotes."""
     try:
         yield
     except Exception as error:
@@ -85,7 +88,7 @@ def readable_errors() -> Iterator[None]:
 
 
 def grouped(count: int) -> str:
-    """Return a whole number with separated thousands.
+    """Format a whole number with separated thousands.
 
     Examples
     --------
@@ -93,16 +96,16 @@ def grouped(count: int) -> str:
     >>> print(grouped(136000), grouped(1200))
     136 000 1200
     """
-    return f"{count:,}".replace(",", " ") if count >= _FROM else str(count)
+    return f"{count:,}".replace(",", " ") if count >= _MIN_GROUPED_NUMBER else str(count)
 
 
 def listed(parts: Sequence[str]) -> str:
-    """Return the parts of a list joined with commas and "and".
+    """Join texts with commas and a final "and".
 
     Parameters
     ----------
     parts
-        At least one part.
+        At least one text.
 
     Examples
     --------
@@ -115,14 +118,14 @@ def listed(parts: Sequence[str]) -> str:
 
 
 def counts_text(counts: Mapping[str, Any]) -> str:
-    """Return the counts of recorded, missed, late and lost samples of a session as text.
+    """Format the numbers of recorded, missed, late and lost samples of a session.
 
     Parameters
     ----------
     counts
         ``recorded``, ``scheduled``, ``missed``, ``late``, ``lost``, ``stale_angles`` and
         ``stale_wrenches``, as numbers or as texts. The last three are reported only if they are not
-        0. None: not known, as for a file that could not be read.
+        0. A count is None if it is unknown, as for a file that could not be read.
 
     Examples
     --------
@@ -130,20 +133,21 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     >>> print(counts_text({"recorded": 11_998, "scheduled": 12_000, "missed": 2, "late": 5}))
     11 998 of 12 000 samples, 2 missed, 5 late
     """
-    rare = ("lost", "stale_angles", "stale_wrenches")
-    counted = [
+    names_if_nonzero = ("lost", "stale_angles", "stale_wrenches")
+    phrases = [
         f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
         *(f"{_count_text(counts[name])} {name}" for name in ("missed", "late")),
         *(
             f"{_count_text(counts[name])} {name.replace('_', ' ')}"
-            for name in rare
+            for name in names_if_nonzero
             if name in counts and (counts[name] is None or int(counts[name]))
         ),
     ]
-    return ", ".join(counted)
+    return ", ".join(phrases)
 
 
 def _count_text(count: int | str | None) -> str:
+    """Format a count, or return "unknown" for None."""
     return "unknown" if count is None else grouped(int(count))
 
 
@@ -157,7 +161,7 @@ def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
     *texts
         Texts between the bar and the remaining time, in the format of rich's task columns.
     auto_refresh
-        Draw the line in a thread of rich; otherwise only by its `refresh`.
+        Whether a thread of rich draws the line; otherwise only its `refresh` does.
     """
     from rich.console import Console
     from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn

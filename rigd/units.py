@@ -1,4 +1,4 @@
-"""Units and numbers: units from the suffixes of keys, numbers of documents, displayed digits."""
+"""Units from the suffixes of keys, numbers in documents, and rounding to significant digits."""
 
 from collections.abc import Sequence
 from math import floor, inf, isfinite, log10
@@ -36,14 +36,15 @@ UNITS: Final = MappingProxyType(
         "_c": "°C",
     }
 )
-"""Units by suffix of a key, the longer suffixes first; the first match applies."""
+"""Map from a key's suffix to its unit, the longer suffixes first; the first match applies."""
 
 
-_MOST_DECIMALS: Final = 9
+_MAX_DECIMALS: Final = 9
+"""Largest number of decimals; smaller uncertainties are written with an exponent."""
 
 
 def suffix_of(key: str) -> str:
-    """Return the suffix of a key that names its unit; empty if there is none.
+    """Return the suffix of a key that names its unit, or "" if there is none.
 
     Examples
     --------
@@ -54,7 +55,7 @@ def suffix_of(key: str) -> str:
 
 
 def unit_of(key: str) -> str:
-    """Return the unit named by the suffix of a key; empty if there is none.
+    """Return the unit that the suffix of a key names, or "" if there is none.
 
     Examples
     --------
@@ -65,16 +66,16 @@ def unit_of(key: str) -> str:
 
 
 def with_half_width(value: float, interval: Sequence[float] | None, scale: float = 1.0) -> str:
-    """Return a number and the half-width of its interval as text, to two digits of the half-width.
+    """Format a number and the half-width of its interval, to two digits of the half-width.
 
     Parameters
     ----------
     value
-        The number.
+        Number to format.
     interval
-        Lower and upper limit; None if they are not known.
+        Lower and upper limit of the number, or None if they are unknown.
     scale
-        Factor of the unit in which it is written.
+        Factor by which number and interval are multiplied, such as 100 for per cent.
 
     Examples
     --------
@@ -90,17 +91,17 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
 def to_uncertainty(
     values: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
 ) -> tuple[str, ...]:
-    """Return numbers as text, rounded to two digits of their uncertainty.
+    """Format numbers, rounded to two digits of their uncertainty.
 
     Parameters
     ----------
     values
-        The numbers.
+        Numbers to format.
     uncertainty
         Standard deviation or half-width of an interval. If it is 0 or not finite, five significant
         digits are written.
     scale
-        Factor of the unit in which they are written.
+        Factor by which numbers and uncertainty are multiplied, such as 100 for per cent.
     sign
         "+" to write the sign of positive numbers too.
 
@@ -115,7 +116,7 @@ def to_uncertainty(
     if not 0 < size < inf:
         return tuple(f"{scale * value:{sign}.5g}" for value in values)
     digits = decimals(size)
-    if digits <= _MOST_DECIMALS:
+    if digits <= _MAX_DECIMALS:
         return tuple(f"{scale * value:{sign}.{digits}f}" for value in values)
     largest = max((abs(scale * value) for value in values), default=0.0) or size
     power = digits + floor(log10(largest))
@@ -123,14 +124,14 @@ def to_uncertainty(
 
 
 def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
-    """Return an interval as text, rounded to two digits of its half-width.
+    """Format an interval, rounded to two digits of its half-width.
 
     Parameters
     ----------
     interval
         Lower and upper limit.
     scale
-        Factor of the unit in which it is written.
+        Factor by which the limits are multiplied, such as 100 for per cent.
     sign
         "+" to write the sign of positive limits too.
 
@@ -144,12 +145,12 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
 
 
 def with_percentage(std: float, value: float) -> str:
-    """Return a standard deviation as text, with its percentage of the value unless that is 0.
+    """Format a standard deviation, with its percentage of the value unless the value is 0.
 
     Parameters
     ----------
     std, value
-        Both in the same unit.
+        Standard deviation and value in the same unit.
 
     Examples
     --------
@@ -160,7 +161,7 @@ def with_percentage(std: float, value: float) -> str:
 
 
 def decimals(uncertainty: float) -> int:
-    """Return the number of decimals for two digits of an uncertainty.
+    """Return the number of decimals that shows two significant digits of an uncertainty.
 
     Examples
     --------
@@ -170,11 +171,12 @@ def decimals(uncertainty: float) -> int:
     return max(1 - floor(log10(uncertainty)), 0)
 
 
-_SMALLEST, _LARGEST = 1e-12, 1e12
+_SMALLEST_SIZE, _LARGEST_SIZE = 1e-12, 1e12
+"""Smallest and largest plausible magnitude of a number in the unit of its key."""
 
 
 def is_usable_size(value: float) -> bool:
-    """Return whether a number in the unit of its key is 0 or of a plausible size for a rig.
+    """Return whether a number is 0 or has a plausible magnitude for a rig.
 
     Outside this range powers and products of a model overflow or underflow.
 
@@ -184,11 +186,11 @@ def is_usable_size(value: float) -> bool:
     >>> is_usable_size(0.98), is_usable_size(0.0), is_usable_size(1e300), is_usable_size(-5e-324)
     (True, True, False, False)
     """
-    return value == 0.0 or _SMALLEST <= abs(value) <= _LARGEST
+    return value == 0.0 or _SMALLEST_SIZE <= abs(value) <= _LARGEST_SIZE
 
 
 def finite_number(value: object) -> float | None:
-    """Return a value of a document as a finite number; None if it is not one.
+    """Return a value of a document as a finite number, or None if it is not one.
 
     Examples
     --------

@@ -113,7 +113,7 @@ def test_what_neither_accounts_for_is_refused_by_name(analysed, use, effect, say
 
 def test_an_effect_of_no_size_changes_nothing(analysed):
     none = {"drag": {"value": 0.0}, "filter_time_constant_s": {"value": 0.0}}
-    assert read_identified_beam(analysed(**none), LENGTH_M, TOUCH).loaded_beam.plain
+    assert read_identified_beam(analysed(**none), LENGTH_M, TOUCH).loaded_beam.is_uniform_cantilever
 
 
 @pytest.mark.parametrize("use", [MOVE, TOUCH])

@@ -24,38 +24,41 @@ from rigd.beam._modes import clamped_free_eigenvalues, mode_shape
 Real = NDArray[np.float64]
 
 AIR_DENSITY_KG_PER_M3 = 1.2
-"""Dry air at 20 °C and 1013 hPa has 1.204. In a laboratory at another temperature or height it
-differs by a few per cent, with the same relative error of C_D d."""
+"""Density of air that the drag coefficients refer to.
+
+Dry air at 20 °C and 1013 hPa has 1.204. In a laboratory at another temperature or height it differs
+by a few per cent, with the same relative error of C_D d."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DragGrid:
-    """Points along the beam, and the modes that transmit the force to the root."""
+    """Quadrature points along the beam for the air's drag, with the mode shapes at the points."""
 
     x_m: Real
-    """Distance from the motor's axis, shape (g,)."""
+    """Distance of each point from the motor's axis, shape (g,)."""
     weight_m: Real
-    """Length of beam per point, shape (g,)."""
+    """Quadrature weight of each point, a length of beam, shape (g,)."""
     shapes: Real
-    """Modes at the points, shape (n, g), each of mean square 1 over the beam."""
+    """Mode shapes at the points, shape (n, g), each of mean square 1 over the beam."""
     leverage_m: Real
-    """``b_i = ∫ x phi_i dx / L`` of each mode, shape (n,)."""
+    """First moment ``b_i = ∫ x phi_i dx / L`` of each mode shape phi_i, shape (n,)."""
 
     @classmethod
     def of(cls, beam: Beam, modes: int, points: int) -> "DragGrid":
-        """Return the grid of a beam.
+        """Return a grid of Gauss-Legendre points along a beam.
 
         Parameters
         ----------
         beam
+            Beam with this length.
         modes
-            Number of modes.
+            Number of modes whose shapes are evaluated.
         points
             Number of points of the Gauss-Legendre rule. The force is smooth except for kinks where
             the speed changes its sign along the beam.
         """
-        node, weight = np.polynomial.legendre.leggauss(points)
-        x = 0.5 * (node + 1)
+        nodes, weight = np.polynomial.legendre.leggauss(points)
+        x = 0.5 * (nodes + 1)
         numbers = np.arange(1, modes + 1)
         z = clamped_free_eigenvalues(modes)
         return cls(
@@ -67,13 +70,16 @@ class DragGrid:
 
     @property
     def to_modes(self) -> Real:
-        """Matrix from force per metre at the points to modal forces, (n, g), dimensionless."""
+        """Matrix that converts force per metre at the points into modal forces, shape (n, g)."""
         length_m = self.weight_m.sum()
         projection: Real = self.shapes * self.weight_m / length_m
         return projection
 
     @property
     def to_moment(self) -> Real:
-        """Row from force per metre at the points to its moment about the axis, (g,), in m²."""
+        """Row in m², shape (g,), that converts force per metre at the points into a moment.
+
+        The moment is about the motor's axis.
+        """
         moment: Real = self.x_m * self.weight_m
         return moment

@@ -26,34 +26,38 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 _CHUNK = 256
-"""Samples processed at once: a table of this many powers of each pole is stored."""
+"""Number of samples processed at once; a table of as many powers of each pole is stored."""
 
-_HIGHEST = 0.5
-"""Fastest mode in use, as a fraction of the sampling rate: a faster one would be aliased to a
-slower one."""
+_MAX_FREQUENCY_FRACTION = 0.5
+"""Highest modal frequency in use, as a fraction of the sampling rate: higher ones would alias."""
 
-_LADDER = 10
-"""Real poles for the branch cut, from `_SLOWEST_RAD_S` to the sampling rate: two a decade."""
-_SLOWEST_RAD_S = 0.03
+_REAL_POLES = 10
+"""Number of real poles for the branch cut, about two a decade.
+
+They range from `_SLOWEST_POLE_RAD_S` to the sampling rate."""
+_SLOWEST_POLE_RAD_S = 0.03
+"""Slowest real pole in rad/s (magnitude)."""
 _FIT_FROM_HZ = 0.05
-_FIT_TO = 0.1
-"""End of the ladder's fit, as a fraction of the sampling rate."""
-_SMALL = 0.01
-"""Size of H below which the fit's absolute, not relative, error counts: deflections of a hundredth
-of the rigid motion."""
+"""Lowest frequency in Hz to which the real poles' weights are fitted."""
+_FIT_TO_FRACTION = 0.1
+"""Highest frequency of the real poles' fit, as a fraction of the sampling rate."""
+_SMALL_RESPONSE = 0.01
+"""Magnitude of H_i below which the fit minimises the absolute, not relative, error.
+
+It corresponds to deflections of a hundredth of the rigid motion."""
 
 
 class DeflectionFilter:
-    """Deflection of the beam, relative to the tangent at its root.
+    """Recursive filter from the motor's angle to the beam's deflection from its root's tangent.
 
     Parameters
     ----------
     beam, damping
         Parameters of the exact model.
     rate_hz
-        Samples of the angle a second.
+        Sampling rate of the angle.
     modes
-        Number of separate modes, without those too fast for the sampling rate. One more
+        Number of separate modes, without those too fast for the sampling rate. One additional mode
         represents all others, approximated without inertia of their own.
     points
         Number of points along the beam.
@@ -81,76 +85,82 @@ class DeflectionFilter:
         self.x_m: Real = np.linspace(0.0, beam.length_m, points)
         z = clamped_free_eigenvalues(modes + 1)
         pairs = poles_for_eigenvalues(z, beam, damping)
-        followed = _followed(pairs, rate_hz)
-        pairs, z = pairs[:followed], z[:followed]
+        mode_count = _usable_mode_count(pairs, rate_hz)
+        pairs, z = pairs[:mode_count], z[:mode_count]
 
-        ladder = _ladder(damping, rate_hz)
-        step: Complex = np.exp(np.concatenate([pairs.ravel(), ladder]) / rate_hz)
+        real_poles = _branch_cut_poles(damping, rate_hz)
+        pole_factors: Complex = np.exp(np.concatenate([pairs.ravel(), real_poles]) / rate_hz)
         # Row per mode, column per pole: weight of the pole in the mode.
-        weights = np.zeros((z.size, step.size), dtype=np.complex128)
-        for i, residues in enumerate(_residues(z, pairs, beam, damping)):
+        weights = np.zeros((z.size, pole_factors.size), dtype=np.complex128)
+        for i, residues in enumerate(_mode_residues(z, pairs, beam, damping)):
             weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
-        if ladder.size:
-            weights[:, pairs.size :] = _cut(z, beam, damping, rate_hz, step, weights)
+        if real_poles.size:
+            weights[:, pairs.size :] = _branch_cut_weights(
+                z, beam, damping, rate_hz, pole_factors, weights
+            )
 
         # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
-        self._powers: Complex = step[:, None] ** np.arange(_CHUNK, -1, -1)
-        self._shapes: Complex = -_shapes(beam, self.x_m / beam.length_m, z) @ weights
-        self._direct: Real = -(self._shapes @ _standing(step)).real
-        self._state: Complex = np.zeros(step.size, dtype=np.complex128)
-        self._rest_rad: float | None = None
+        self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK, -1, -1)
+        self._scaled_shapes: Complex = -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ weights
+        self._direct: Real = -(self._scaled_shapes @ _steady_states(pole_factors)).real
+        self._state: Complex = np.zeros(pole_factors.size, dtype=np.complex128)
+        self._start_rad: float | None = None
 
     def feed(self, angle_rad: Real) -> Real:
-        """Process samples of the motor's angle, at the sampling rate and without gaps.
+        """Process samples of the motor's angle and return the deflection at the last one.
 
-        The beam is assumed to be at rest before the first one.
+        Successive calls continue the samples at the sampling rate, without gaps. The beam is
+        assumed to be at rest before the first sample.
 
         Parameters
         ----------
         angle_rad
-            Shape (n,), n ≥ 1.
+            Motor angle, shape (n,), n ≥ 1.
 
         Returns
         -------
         deflection_m
-            At the last sample, shape (points,); positive in the direction of a positive angle.
+            Deflection at the positions `x_m`, shape (points,); positive in the direction of a
+            positive angle.
         """
-        if self._rest_rad is None:
-            self._rest_rad = float(angle_rad[0])
-        turned = angle_rad - self._rest_rad
-        for start in range(0, turned.size, _CHUNK):
-            chunk = turned[start : start + _CHUNK]
+        if self._start_rad is None:
+            self._start_rad = float(angle_rad[0])
+        turned_rad = angle_rad - self._start_rad
+        for start in range(0, turned_rad.size, _CHUNK):
+            chunk = turned_rad[start : start + _CHUNK]
             powers = self._powers[:, _CHUNK - chunk.size :]
             self._state = powers[:, 0] * self._state + powers[:, 1:] @ chunk
-        deflection: Real = (self._shapes @ self._state).real + self._direct * turned[-1]
+        deflection: Real = (self._scaled_shapes @ self._state).real + self._direct * turned_rad[-1]
         return deflection
 
 
-def _followed(pairs: Complex, rate_hz: float) -> int:
-    """Return the number of modes, from the first on, with poles slow enough for the rate."""
-    slow = np.abs(pairs[:, 0].imag) < 2 * np.pi * _HIGHEST * rate_hz
-    usable = slow & ~np.isnan(pairs[:, 0])
+def _usable_mode_count(pairs: Complex, rate_hz: float) -> int:
+    """Return the number of modes, from the first on, slow enough for the sampling rate."""
+    below_limit = np.abs(pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_FRACTION * rate_hz
+    usable = below_limit & ~np.isnan(pairs[:, 0])
     return usable.size if usable.all() else int(np.argmin(usable))
 
 
-def _ladder(damping: Damping, rate_hz: float) -> Real:
-    """Return real poles in rad/s for the branch cut; none if there is no cut."""
+def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
+    """Return real poles in rad/s for the branch cut, or an empty array if there is no cut."""
     internal_integer = damping.zeta == 0 or damping.alpha in (0, 1)
     external_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
     if internal_integer and external_integer:
         return np.zeros(0)
-    poles: Real = -np.geomspace(_SLOWEST_RAD_S, rate_hz, _LADDER)
+    poles: Real = -np.geomspace(_SLOWEST_POLE_RAD_S, rate_hz, _REAL_POLES)
     return poles
 
 
-def _standing(step: Complex) -> Complex:
-    """Return the state of the discrete poles for a constant angle of 1."""
-    state: Complex = 1 / (1 - step)
+def _steady_states(pole_factors: Complex) -> Complex:
+    """Return the steady states of the discrete poles `pole_factors` for a constant angle of 1."""
+    state: Complex = 1 / (1 - pole_factors)
     return state
 
 
-def _loads(s: Complex, z: Real, beam: Beam, damping: Damping) -> tuple[Complex, Complex, Complex]:
-    """Return P and ``Q k⁴`` of the modes, both over EI, and ``s d/ds`` of their sum."""
+def _modal_stiffness_terms(
+    s: Complex, z: Real, beam: Beam, damping: Damping
+) -> tuple[Complex, Complex, Complex]:
+    """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for modes at `s` (rad/s)."""
     inertial = beam.density_over_stiffness * s * s
     external = damping.gamma * s**damping.lambda_
     internal = damping.zeta * s**damping.alpha
@@ -159,27 +169,33 @@ def _loads(s: Complex, z: Real, beam: Beam, damping: Damping) -> tuple[Complex, 
     return inertial + external, (1 + internal) * k_fourth, slope
 
 
-def _residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
-    """Return residues of H_i at its mode's poles, shape (modes, 2), in rad/s."""
-    load, _, slope = _loads(pairs, z[:, None], beam, damping)
+def _mode_residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
+    """Return the residues of each H_i at its mode's two poles, shape (modes, 2), in rad/s."""
+    load, _, slope = _modal_stiffness_terms(pairs, z[:, None], beam, damping)
     residues: Complex = load * pairs / slope
     return residues
 
 
-def _cut(
-    z: Real, beam: Beam, damping: Damping, rate_hz: float, step: Complex, weights: Complex
+def _branch_cut_weights(
+    z: Real, beam: Beam, damping: Damping, rate_hz: float, pole_factors: Complex, weights: Complex
 ) -> Real:
-    """Fit the weights of the ladder (the last poles) in each mode to the residual of the pairs."""
-    frequency_hz = np.geomspace(_FIT_FROM_HZ, max(_FIT_TO * rate_hz, 2 * _FIT_FROM_HZ), 200)
+    """Return the weight of each real pole in each mode, shape (modes, real poles).
+
+    They are fitted to the difference between the exact H_i and its pole pairs, whose `weights` are
+    given.
+    """
+    frequency_hz = np.geomspace(
+        _FIT_FROM_HZ, max(_FIT_TO_FRACTION * rate_hz, 2 * _FIT_FROM_HZ), 200
+    )
     s = 2j * np.pi * frequency_hz[:, None]
-    load, spring, _ = _loads(s, z, beam, damping)
+    load, spring, _ = _modal_stiffness_terms(s, z, beam, damping)
     exact = load / (spring + load)
-    columns = 1 / (1 - step * np.exp(-s / rate_hz)) - _standing(step)
-    missing = exact - columns @ weights.T
-    cut = np.empty((z.size, _LADDER))
+    columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
+    residual = exact - columns @ weights.T
+    cut = np.empty((z.size, _REAL_POLES))
     for i in range(z.size):
-        weight = 1 / (np.abs(exact[:, i, None]) + _SMALL)
-        matrix, target = columns[:, -_LADDER:] * weight, missing[:, i, None] * weight
+        weight = 1 / (np.abs(exact[:, i, None]) + _SMALL_RESPONSE)
+        matrix, target = columns[:, -_REAL_POLES:] * weight, residual[:, i, None] * weight
         cut[i] = np.linalg.lstsq(
             np.concatenate([matrix.real, matrix.imag]),
             np.concatenate([target.real, target.imag])[:, 0],
@@ -187,8 +203,8 @@ def _cut(
     return cut
 
 
-def _shapes(beam: Beam, x: Real, z: Real) -> Real:
-    """Return ``b_i phi_i`` at x = 0…1 for the used modes, shape (x.size, z.size), in m.
+def _scaled_shapes(beam: Beam, x: Real, z: Real) -> Real:
+    """Return ``b_i phi_i`` in m of the used modes at x = 0…1, shape (x.size, z.size).
 
     The last one includes all later modes by their low-frequency sum: the ``b_i phi_i / k_i⁴`` of
     all modes add up to the bend under a load that grows like x.

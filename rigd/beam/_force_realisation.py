@@ -1,4 +1,4 @@
-"""State-space realisation of the beam under forces at points, its root held.
+"""State-space realisation of the beam under point forces while the motor holds its root.
 
 The response to a force is that of the modes, whose pairs of poles and residues are exact. The
 remainder is smooth: the static part of the omitted modes, the branch cut of the fractional orders,
@@ -20,54 +20,73 @@ from rigd.beam.realisation import RealisationError
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_MOST_MODES = 80
-_HEAVY_DAMPING = 0.9
-"""Damping ratio from which the ladder represents a mode: its poles lie on the cut, or near it."""
-_LIGHT_DAMPING = 0.3
-_SLOWEST_RAD_S = 0.03
-_PER_DECADE = 5
-_MODES_BEYOND = 2.0
-"""Modes up to this multiple of the highest frequency of interest are included, so that the omitted
-ones are static below it."""
-_LADDER_BEYOND = 10.0
-_TAIL_BEYOND = 30.0
+_MAX_MODES = 80
+"""Largest number of modes in a realisation."""
+_HEAVY_DAMPING_RATIO = 0.9
+"""Damping ratio from which the real poles represent a mode.
+
+The mode's own poles lie on the branch cut, or near it."""
+_RESONANT_DAMPING_RATIO = 0.3
+"""Damping ratio below which the last mode counts as resonant, like the omitted modes above it."""
+_SLOWEST_POLE_RAD_S = 0.03
+"""Slowest real pole in rad/s (magnitude)."""
+_REAL_POLES_PER_DECADE = 5
+"""Number of real poles per decade of frequency."""
+_MODES_UP_TO_FACTOR = 2.0
+"""Multiple of the highest frequency of interest up to which modes are included.
+
+The omitted modes are static below the highest frequency."""
+_REAL_POLES_UP_TO_FACTOR = 10.0
+"""Multiple of the highest frequency of interest up to which there are real poles."""
+_TAIL_UP_TO_FACTOR = 30.0
+"""Multiple of the highest frequency of interest up to which the fit bounds the response."""
 _TAIL_WEIGHT = 1e-2
-"""Weight of the fit beyond the highest frequency, on a line halfway between the axes, where no
-omitted mode resonates: it bounds the response there."""
+"""Weight of the fit beyond the highest frequency, which bounds the response there.
+
+It applies on a line halfway between the axes, where no omitted mode resonates."""
 _POINTS_PER_DECADE = 40
-_SMALL = 0.01
-"""Torque per force over the lever arm, and shear per force, below which the absolute, not relative,
-error of the fit counts."""
-_RCOND = 1e-11
+"""Number of fitted frequencies per decade."""
+_SMALL_RESPONSE = 0.01
+"""Size of a response below which the fit minimises its absolute, not relative, error.
+
+The responses are torque per force over the lever arm, and shear per force."""
+_SINGULAR_VALUE_CUTOFF = 1e-11
+"""Relative singular value below which the least-squares fit drops a combination of poles."""
 _HIGHEST_ORDER = 1.5
-"""For orders up to it the displacements of 580 random beams were right to 0.6 %."""
+"""Highest damping order that is accepted.
+
+For orders up to it the displacements of 580 random beams were right to 0.6 %."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ForceRealisation:
-    """State space ``x' = a x + b F`` of a force at a point, and its outputs.
+    """State space ``x' = a x + b F`` of the beam's response to a point force F in N.
 
-    A force at another point has the same `a` and `b`, but other rows.
+    A force at another point of the beam has the same `a` and `b`, but other output rows.
     """
 
     a: Real
-    """(n, n) in 1/s: 2 × 2 blocks of the modes, then the real poles. Of two realisations of a beam
-    the one up to a higher frequency has the poles of the other, and more of both."""
+    """State matrix, shape (n, n), in 1/s: 2 × 2 blocks of the modes, then the real poles.
+
+    A realisation of the same beam up to a higher frequency has all these poles and additional modal
+    and real ones."""
     modes: int
-    """Number of modes."""
+    """Number of modes in the state space."""
     b: Real
-    """(n,)."""
+    """Input vector of the force, shape (n,)."""
     rows: Real
-    """(outputs, n): displacement at each output point (m), torque (N·m) and shear (N) of the motor
-    on the beam."""
+    """Output matrix, shape (outputs, n).
+
+    The outputs are the displacement at each output point (m), then the torque (N·m) and the shear
+    force (N) of the motor on the beam."""
     direct: Real
-    """(outputs,), per N of the force: direct term."""
+    """Change of each output per N of the force without delay, shape (outputs,)."""
 
 
 def realise_force(
     beam: Beam, damping: Damping, force_at_m: float, output_at_m: Real, highest_rad_s: float
 ) -> ForceRealisation:
-    """Return a state-space realisation of the response to a force on the beam.
+    """Return a state-space realisation of the beam's response to a point force.
 
     Parameters
     ----------
@@ -98,15 +117,21 @@ def realise_force(
     """
     check_order(damping)
     x = np.append(output_at_m, force_at_m) / beam.length_m
-    poles, residues = _modal(beam, damping, x, highest_rad_s)
-    if poles.size == _MOST_MODES and -poles[-1].real < _LIGHT_DAMPING * np.abs(poles[-1]):
+    poles, residues = _modal_poles_and_residues(beam, damping, x, highest_rad_s)
+    if poles.size == _MAX_MODES and -poles[-1].real < _RESONANT_DAMPING_RATIO * np.abs(poles[-1]):
         # The next modes resonate and are not included.
-        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_BEYOND)
+        highest_rad_s = min(highest_rad_s, float(np.abs(poles[-1])) / _MODES_UP_TO_FACTOR)
 
-    low, high = _SLOWEST_RAD_S / 300, highest_rad_s
-    s = 1j * np.geomspace(low, high, int(_POINTS_PER_DECADE * np.log10(high / low)))
+    lowest_fit_rad_s, highest_fit_rad_s = _SLOWEST_POLE_RAD_S / 300, highest_rad_s
+    s = 1j * np.geomspace(
+        lowest_fit_rad_s,
+        highest_fit_rad_s,
+        int(_POINTS_PER_DECADE * np.log10(highest_fit_rad_s / lowest_fit_rad_s)),
+    )
     s = s[np.abs(s[:, None] - poles).min(axis=1, initial=np.inf) > 1e-6 * np.abs(s)]
-    tail = np.geomspace(high, _TAIL_BEYOND * high, _POINTS_PER_DECADE) * np.exp(0.25j * np.pi)
+    tail = np.geomspace(
+        highest_fit_rad_s, _TAIL_UP_TO_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
+    ) * np.exp(0.25j * np.pi)
     emphasis = np.append(np.ones(s.size), np.full(tail.size, _TAIL_WEIGHT))
     s = np.append(s, tail)
     grid = PointForceGrid(s, beam, damping)
@@ -117,49 +142,55 @@ def realise_force(
             grid.shear_per_force(force_at_m),
         ]
     )
-    # The same poles for each highest frequency, up to it.
-    rungs = ceil(_PER_DECADE * np.log10(_LADDER_BEYOND * high / _SLOWEST_RAD_S)) + 1
-    ladder = -_SLOWEST_RAD_S * 10 ** (np.arange(rungs) / _PER_DECADE)
+    # Real poles at fixed frequencies, whatever the highest frequency is.
+    real_pole_count = (
+        ceil(
+            _REAL_POLES_PER_DECADE
+            * np.log10(_REAL_POLES_UP_TO_FACTOR * highest_fit_rad_s / _SLOWEST_POLE_RAD_S)
+        )
+        + 1
+    )
+    real_poles = -_SLOWEST_POLE_RAD_S * 10 ** (np.arange(real_pole_count) / _REAL_POLES_PER_DECADE)
     # A ladder's response to a held force is 1, so that the cut-off loses no pole.
-    columns = np.column_stack([-ladder / (s[:, None] - ladder), np.ones_like(s)])
-    modal = _of_pairs(s, poles, residues)
+    columns = np.column_stack([-real_poles / (s[:, None] - real_poles), np.ones_like(s)])
+    modal = _modal_response(s, poles, residues)
     weights = emphasis[:, None] / np.column_stack(
         [
-            np.abs(exact[:, :-2]) + _unbounded(s, beam, damping)[:, None],
-            np.abs(exact[:, -2]) + _SMALL * force_at_m,
-            np.abs(exact[:, -1]) + _SMALL,
+            np.abs(exact[:, :-2]) + _infinite_beam_response(s, beam, damping)[:, None],
+            np.abs(exact[:, -2]) + _SMALL_RESPONSE * force_at_m,
+            np.abs(exact[:, -1]) + _SMALL_RESPONSE,
         ]
     )
-    left = exact - modal
+    remainder = exact - modal
     fitted = np.empty((exact.shape[1], columns.shape[1]))
     for i in range(exact.shape[1]):
-        weighted, target = columns * weights[:, i, None], left[:, i] * weights[:, i]
+        weighted, target = columns * weights[:, i, None], remainder[:, i] * weights[:, i]
         fitted[i] = np.linalg.lstsq(
             np.concatenate([weighted.real, weighted.imag]),
             np.concatenate([target.real, target.imag]),
-            rcond=_RCOND,
+            rcond=_SINGULAR_VALUE_CUTOFF,
         )[0]
 
     pairs = 2 * poles.size
-    n = pairs + ladder.size
+    n = pairs + real_poles.size
     a, b = np.zeros((n, n)), np.ones(n)
-    even = np.arange(0, pairs, 2)
-    a[even, even] = a[even + 1, even + 1] = poles.real
-    a[even, even + 1] = poles.imag
-    a[even + 1, even] = -poles.imag
-    b[even + 1] = 0.0
-    real = np.arange(pairs, n)
-    a[real, real] = ladder
-    b[real] = -ladder
+    first_rows = np.arange(0, pairs, 2)
+    a[first_rows, first_rows] = a[first_rows + 1, first_rows + 1] = poles.real
+    a[first_rows, first_rows + 1] = poles.imag
+    a[first_rows + 1, first_rows] = -poles.imag
+    b[first_rows + 1] = 0.0
+    real_rows = np.arange(pairs, n)
+    a[real_rows, real_rows] = real_poles
+    b[real_rows] = -real_poles
     rows = np.empty((exact.shape[1], n))
     # The first of a pair's states is the real part of z, the second minus its imaginary part.
-    rows[:, even], rows[:, even + 1] = 2 * residues.real, 2 * residues.imag
+    rows[:, first_rows], rows[:, first_rows + 1] = 2 * residues.real, 2 * residues.imag
     rows[:, pairs:] = fitted[:, :-1]
     return ForceRealisation(a, poles.size, b, rows, fitted[:, -1])
 
 
 def check_order(damping: Damping) -> None:
-    """Raise if no force at a point can be realised with the damping.
+    """Raise RealisationError if the damping's order is too high for point forces on the beam.
 
     Parameters
     ----------
@@ -169,7 +200,7 @@ def check_order(damping: Damping) -> None:
     Raises
     ------
     RealisationError
-        If an order of it is above 1.5.
+        If an order of the damping is above 1.5.
     """
     orders = (damping.alpha if damping.zeta else 0, damping.lambda_ if damping.gamma else 0)
     if max(orders) > _HIGHEST_ORDER:
@@ -179,46 +210,48 @@ def check_order(damping: Damping) -> None:
         )
 
 
-def _modal(beam: Beam, damping: Damping, x: Real, highest_rad_s: float) -> tuple[Complex, Complex]:
-    """Return the poles of the oscillating modes, and the residues of all outputs (outputs, modes).
+def _modal_poles_and_residues(
+    beam: Beam, damping: Damping, x: Real, highest_rad_s: float
+) -> tuple[Complex, Complex]:
+    """Return the oscillating modes' poles in rad/s and the outputs' residues (outputs, modes).
 
-    `x` are the points over the length, that of the force last.
+    `x` has the output points and last the force's point, as fractions of the length.
     """
-    z = clamped_free_eigenvalues(_MOST_MODES)
+    z = clamped_free_eigenvalues(_MAX_MODES)
     poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
     magnitude = np.abs(poles)  # not a number where there is none: then False below
-    used = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING * magnitude)
-    used &= magnitude < _MODES_BEYOND * highest_rad_s
-    poles, z = poles[used], z[used]
-    numbers = np.flatnonzero(used) + 1
+    selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * magnitude)
+    selected &= magnitude < _MODES_UP_TO_FACTOR * highest_rad_s
+    poles, z = poles[selected], z[selected]
+    numbers = np.flatnonzero(selected) + 1
     shapes = np.array([mode_shape(int(number), x) for number in numbers]).reshape(-1, x.size)
     sign = (-1.0) ** (numbers - 1)
     leverage_m = 2 * beam.length_m * sign / z**2  # ∫ x phi dx / L
-    mean = mode_mean(_MOST_MODES)[used]
+    mean = mode_mean(_MAX_MODES)[selected]
 
     k_fourth = (z / beam.length_m) ** 4
     inertial = beam.density_over_stiffness * poles**2
     external = damping.gamma * poles**damping.lambda_
     internal = damping.zeta * poles**damping.alpha * k_fourth
     slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
-    pushed = shapes[:, -1] / slope
+    shape_at_force = shapes[:, -1] / slope
     per_length = beam.length_m * beam.bending_stiffness_n_m2
-    root = pushed * (inertial + external)
+    root = shape_at_force * (inertial + external)
     residues: Complex = np.vstack(
-        [shapes[:, :-1].T * pushed / per_length, leverage_m * root, mean * root]
+        [shapes[:, :-1].T * shape_at_force / per_length, leverage_m * root, mean * root]
     )
     return poles, residues
 
 
-def _of_pairs(s: Complex, poles: Complex, residues: Complex) -> Complex:
-    """Return the response of the pairs, shape (s, outputs)."""
+def _modal_response(s: Complex, poles: Complex, residues: Complex) -> Complex:
+    """Return the outputs' response of the modes' conjugate pole pairs, shape (s, outputs)."""
     upper, lower = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
     response: Complex = upper @ residues.T + lower @ residues.conj().T
     return response
 
 
-def _unbounded(s: Complex, beam: Beam, damping: Damping) -> Real:
-    """Return the size of the response of a beam without ends at the force, in m/N."""
+def _infinite_beam_response(s: Complex, beam: Beam, damping: Damping) -> Real:
+    """Return the magnitude in m/N of an infinitely long beam's displacement under the force."""
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
     load = beam.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
     load = load * beam.bending_stiffness_n_m2

@@ -44,15 +44,15 @@ class Beam:
     """
 
     length_m: Annotated[float, Gt(0)]
-    """From the motor's axis to the tip."""
+    """Length of the beam from the motor's axis to the tip."""
     density_kg_per_m: Annotated[float, Gt(0)]
-    """Mass per unit of length, rho."""
+    """Mass of the beam per unit of length, rho."""
     bending_stiffness_n_m2: Annotated[float, Gt(0)]
-    """E I."""
+    """Bending stiffness of the beam, E I."""
 
     @property
     def density_over_stiffness(self) -> float:
-        """``rho / (E I)`` in s²/m⁴, which determines the natural frequencies."""
+        """Ratio ``rho / (E I)`` in s²/m⁴, which determines the beam's natural frequencies."""
         return self.density_kg_per_m / self.bending_stiffness_n_m2
 
     @property
@@ -76,33 +76,46 @@ class Damping:
     """
 
     zeta: Annotated[float, Ge(0), Le(1)] = 0.0
-    """Internal coefficient, in s^alpha."""
+    """Coefficient of the internal damping, in s^alpha."""
     alpha: Annotated[float, Ge(0), Lt(2)] = 1.0
-    """Internal order."""
+    """Fractional order of the internal damping."""
     gamma: Annotated[float, Ge(0)] = 0.0
-    """External coefficient, in s^lambda/m⁴."""
+    """Coefficient of the external damping, in s^lambda/m⁴."""
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0
-    """External order."""
+    """Fractional order of the external damping."""
 
 
 # Transfer function
 
 PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
-"""Parameters of the derivatives of G; each derivative holds the other five constant."""
+"""Names of the parameters by which the transfer function G can be differentiated.
 
-_BLOCK = 2048
-"""Points evaluated at once: temporaries that fit into the cache and below malloc's trimming
-threshold make 8000 points twice as fast."""
+Each derivative holds the other five parameters constant."""
+
+_BLOCK_POINTS = 2048
+"""Number of frequencies evaluated at once.
+
+Temporaries that fit into the cache and below malloc's trimming threshold make 8000 points twice as
+fast."""
 
 _SERIES_LIMIT = 40.0
-_N = np.array([4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)])
-_D = np.array([(-4.0) ** k / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
-_DN = _N[1:] * np.arange(1.0, 10.0)
-_DD = _D[1:] * np.arange(1.0, 10.0)
+"""Magnitude of q below which F is computed from its power series."""
+_NUMERATOR_SERIES = np.array([4.0 * (-4.0) ** k / factorial(4 * k + 3) for k in range(10)])
+"""Power series coefficients of the numerator N(q), lowest power first."""
+_DENOMINATOR_SERIES = (
+    np.array([(-4.0) ** k / factorial(4 * k) for k in range(10)]) + np.eye(1, 10)[0]
+)
+"""Power series coefficients of the denominator D(q), lowest power first."""
+_NUMERATOR_SLOPE_SERIES = _NUMERATOR_SERIES[1:] * np.arange(1.0, 10.0)
+"""Power series coefficients of the derivative of N(q)."""
+_DENOMINATOR_SLOPE_SERIES = _DENOMINATOR_SERIES[1:] * np.arange(1.0, 10.0)
+"""Power series coefficients of the derivative of D(q)."""
 
 
 class TransferGrid:
-    """Eq. 25 on one grid of s; parts that do not depend on the parameters are computed once.
+    """Evaluates the beam's transfer function (Eq. 25) on a fixed grid of s.
+
+    Quantities that do not depend on the beam and its damping are computed once.
 
     Parameters
     ----------
@@ -124,10 +137,10 @@ class TransferGrid:
         # On the imaginary axis, where fits live, s^order is a real power times one constant phase.
         on_axis = bool(np.all((nonzero.real == 0) & (nonzero.imag > 0)))
         self._log_magnitude = np.log(nonzero.imag) if on_axis else None
-        self._parts = [slice(i, i + _BLOCK) for i in range(0, points.size, _BLOCK)]
+        self._parts = [slice(i, i + _BLOCK_POINTS) for i in range(0, points.size, _BLOCK_POINTS)]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
-        """Return the coupling torque per motor angle, G(s) in N·m/rad, in the grid's shape.
+        """Return the coupling torque per motor angle in N·m/rad at all s of the grid.
 
         Parameters
         ----------
@@ -136,16 +149,16 @@ class TransferGrid:
         """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         for part in self._parts:
-            c = 1 + damping.zeta * self._power(damping.alpha, part)
-            s_lambda = self._power(damping.lambda_, part)
-            f = _f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
+            c = 1 + damping.zeta * self._power_of_s(damping.alpha, part)
+            s_lambda = self._power_of_s(damping.lambda_, part)
+            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
             np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[part])
         return g.reshape(self.shape)
 
     def evaluate_with_gradient(
         self, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
     ) -> tuple[Complex, Complex]:
-        """Return G and its derivatives with respect to the parameters in `wrt`.
+        """Return the coupling torque per motor angle and its derivatives by parameters.
 
         Parameters
         ----------
@@ -158,7 +171,9 @@ class TransferGrid:
         Returns
         -------
         g : complex ndarray, shape of the grid
+            Coupling torque per motor angle in N·m/rad.
         gradient : complex ndarray, shape ``(len(wrt), *grid shape)``
+            Derivative of `g` with respect to each parameter of `wrt`.
 
         Raises
         ------
@@ -175,8 +190,8 @@ class TransferGrid:
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
         for part in self._parts:
-            s_alpha = self._power(damping.alpha, part)
-            s_lambda = self._power(damping.lambda_, part)
+            s_alpha = self._power_of_s(damping.alpha, part)
+            s_lambda = self._power_of_s(damping.lambda_, part)
             c = 1 + damping.zeta * s_alpha
             q = self._fourth_power_of_z(beam, damping, c, s_lambda, part)
             f, slope, remainder = _f_with_slope(q)
@@ -201,7 +216,8 @@ class TransferGrid:
                         row[:] = g[part]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
 
-    def _power(self, order: float, part: slice) -> Complex:
+    def _power_of_s(self, order: float, part: slice) -> Complex:
+        """Return ``s^order`` on a part of the grid."""
         if self._log_magnitude is None:
             power = np.exp(order * self._log_s[part])
         else:
@@ -213,6 +229,7 @@ class TransferGrid:
     def _fourth_power_of_z(
         self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, part: slice
     ) -> Complex:
+        """Return ``q = z⁴`` on a part of the grid."""
         inertial = beam.density_over_stiffness * self._s_squared[part]
         q: Complex = (inertial + damping.gamma * s_lambda) / c
         q *= -(beam.length_m**4)
@@ -220,7 +237,7 @@ class TransferGrid:
 
 
 def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
-    """Return the coupling torque per motor angle (Eq. 25 of the paper).
+    """Return the transfer function from motor angle to coupling torque (Eq. 25 of the paper).
 
     Parameters
     ----------
@@ -232,7 +249,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
     Returns
     -------
     g : complex ndarray, shape of `s`
-        G(s) in N·m/rad.
+        Coupling torque per motor angle in N·m/rad.
 
     References
     ----------
@@ -255,7 +272,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 def transfer_and_gradient(
     s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
 ) -> tuple[Complex, Complex]:
-    """Return G(s) and its derivatives with respect to parameters.
+    """Return the coupling torque per motor angle at `s`, and its derivatives by parameters.
 
     Parameters
     ----------
@@ -269,8 +286,9 @@ def transfer_and_gradient(
     Returns
     -------
     g : complex ndarray, shape of `s`
-        In N·m/rad.
+        Coupling torque per motor angle in N·m/rad.
     gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
+        Derivative of `g` with respect to each parameter of `wrt`.
 
     Raises
     ------
@@ -291,7 +309,7 @@ def transfer_and_gradient(
 
 
 def _polynomial(coefficients: Real, x: Complex) -> Complex:
-    """Evaluate a polynomial by Horner's rule, lowest power first."""
+    """Return the polynomial's value at `x`; `coefficients` start with the lowest power."""
     total = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         total *= x
@@ -300,71 +318,84 @@ def _polynomial(coefficients: Real, x: Complex) -> Complex:
 
 
 def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
-    """Return F and ``2 z² sin z sinh z / (1 + cos z cosh z)`` from decaying exponentials."""
-    below = np.flatnonzero(q.imag < 0)
+    """Return F(q) and ``2 z² sin z sinh z / (1 + cos z cosh z)`` for large q.
+
+    Only decaying exponentials are used, so nothing overflows.
+    """
+    lower_half_plane = np.flatnonzero(q.imag < 0)
     z_squared = _root_in_first_quadrant(q.real, np.abs(q.imag))
     z = _root_in_first_quadrant(z_squared.real, z_squared.imag)
     decay = np.exp(-z)
-    turn = np.exp(1j * z)
-    e = decay * turn
+    rotation = np.exp(1j * z)
+    e = decay * rotation
     a = np.multiply(decay, decay, out=decay)
-    b = np.multiply(turn, turn, out=turn)
+    b = np.multiply(rotation, rotation, out=rotation)
     sum_, ab = a + b, a * b
-    even = 1 + ab
+    even_part = 1 + ab
     f = (1j - 1) * (1 - ab) + (1j + 1) * (a - b)
     f *= z
-    reciprocal = np.reciprocal(4 * e + (even + sum_))
+    reciprocal = np.reciprocal(4 * e + (even_part + sum_))
     f *= reciprocal
-    s = (even - sum_) * 2j
+    s = (even_part - sum_) * 2j
     s *= z_squared
     s *= reciprocal
     # F and S are real functions of q: the values for Im q >= 0 give the other half.
-    f[below] = f[below].conj()
-    s[below] = s[below].conj()
+    f[lower_half_plane] = f[lower_half_plane].conj()
+    s[lower_half_plane] = s[lower_half_plane].conj()
     return f, s
 
 
 def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
-    """Return the square root for ``imag >= 0``; as accurate as numpy's and three times as fast."""
+    """Return the square root of ``real + 1j imag`` for ``imag >= 0``.
+
+    It is as accurate as numpy's and three times as fast.
+    """
     root = np.empty(real.shape, dtype=np.complex128)
     root.real, root.imag = real, imag
     larger = np.sqrt(0.5 * (np.abs(root) + np.abs(real)))
     smaller = 0.5 * imag / larger
-    right = real >= 0
-    root.real = np.where(right, larger, smaller)
-    root.imag = np.where(right, smaller, larger)
+    positive_real = real >= 0
+    root.real = np.where(positive_real, larger, smaller)
+    root.imag = np.where(positive_real, smaller, larger)
     return root
 
 
-def _f(q: Complex) -> Complex:
-    """Return F(q)."""
+def _evaluate_f(q: Complex) -> Complex:
+    """Return the function F(q) of the module's docstring."""
     f = np.empty_like(q)
-    series = np.abs(q) < _SERIES_LIMIT
-    if series.any():
-        low = q[series]
-        f[series] = low * _polynomial(_N, low) / _polynomial(_D, low)
-    beyond = ~series
-    f[beyond] = _scaled_form(q[beyond])[0]
+    is_small = np.abs(q) < _SERIES_LIMIT
+    if is_small.any():
+        small_q = q[is_small]
+        f[is_small] = (
+            small_q
+            * _polynomial(_NUMERATOR_SERIES, small_q)
+            / _polynomial(_DENOMINATOR_SERIES, small_q)
+        )
+    is_large = ~is_small
+    f[is_large] = _scaled_form(q[is_large])[0]
     return f
 
 
 def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return F, dF/dq and ``F - q dF/dq`` (which the series gives without cancellation)."""
+    """Return F(q), its derivative dF/dq, and ``F - q dF/dq``, computed without cancellation."""
     f, slope, remainder = np.empty((3, q.size), dtype=np.complex128)
-    series = np.abs(q) < _SERIES_LIMIT
-    if series.any():
-        low = q[series]
-        n, d = _polynomial(_N, low), _polynomial(_D, low)
-        wronskian = n * _polynomial(_DD, low) - _polynomial(_DN, low) * d
+    is_small = np.abs(q) < _SERIES_LIMIT
+    if is_small.any():
+        small_q = q[is_small]
+        n, d = _polynomial(_NUMERATOR_SERIES, small_q), _polynomial(_DENOMINATOR_SERIES, small_q)
+        wronskian = (
+            n * _polynomial(_DENOMINATOR_SLOPE_SERIES, small_q)
+            - _polynomial(_NUMERATOR_SLOPE_SERIES, small_q) * d
+        )
         d_squared = d * d
-        f[series] = low * n / d
-        slope[series] = (n * d - low * wronskian) / d_squared
-        remainder[series] = low * low * wronskian / d_squared
-    beyond = ~series
-    high = q[beyond]
-    f_high, s_high = _scaled_form(high)
+        f[is_small] = small_q * n / d
+        slope[is_small] = (n * d - small_q * wronskian) / d_squared
+        remainder[is_small] = small_q * small_q * wronskian / d_squared
+    is_large = ~is_small
+    large_q = q[is_large]
+    f_high, s_high = _scaled_form(large_q)
     q_slope = 0.25 * (f_high * (1 + f_high) + s_high)
-    f[beyond] = f_high
-    slope[beyond] = q_slope / high
-    remainder[beyond] = f_high - q_slope
+    f[is_large] = f_high
+    slope[is_large] = q_slope / large_q
+    remainder[is_large] = f_high - q_slope
     return f, slope, remainder

@@ -21,14 +21,18 @@ from rigd.beam._model import Beam, Damping
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
-_HOMOTOPY_STEPS = (8, 64)
-"""Steps in which damping grows: few at first, more for beams where that loses a path."""
+_HOMOTOPY_STEP_COUNTS = (8, 64)
+"""Numbers of steps in which damping grows from zero while poles are followed.
 
-CLOSE_BY = 0.05
-"""Relative distance up to which a root is the expected one: modes lie far more apart."""
+The larger number is used for beams for which the smaller one loses a pole."""
 
-_ON_THE_CUT = 1e-9
-"""Excess of an argument over pi, by rounding, for an almost real pole."""
+SAME_ROOT_TOLERANCE = 0.05
+"""Relative distance from the expected root up to which a found root is taken for the same mode.
+
+Neighbouring modes differ by much more."""
+
+_MAX_ARGUMENT_EXCESS_RAD = 1e-9
+"""Largest accepted excess of a pole's argument over pi in rad, which rounding can cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -36,15 +40,16 @@ class Mode:
     """One mode of the beam with locked hub (clamped–free)."""
 
     number: int
-    """From 1, in the order of the clamped–free eigenvalues."""
+    """Mode number from 1, in the order of the clamped–free eigenvalues."""
     poles_rad_s: tuple[complex, complex]
-    """A conjugate pair (positive frequency first), or two real poles, slow one first."""
+    """The mode's conjugate pair of poles (positive frequency first), or two real poles (slow one
+    first)."""
     frequency_hz: float
-    """Frequency of the free decay, ``|Im p| / 2 pi``: 0 if over-damped."""
+    """Frequency of the mode's free decay, ``|Im p| / 2 pi``, or 0 if it is over-damped."""
     natural_frequency_rad_s: float
-    """``sqrt(p_1 p_2)``."""
+    """Natural frequency of the mode, ``sqrt(p_1 p_2)``."""
     damping_ratio: float
-    """``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``: above 1 if over-damped."""
+    """Damping ratio of the mode, ``-(p_1 + p_2) / (2 sqrt(p_1 p_2))``; above 1 if over-damped."""
 
 
 def clamped_free_eigenvalues(n: int) -> Real:
@@ -60,22 +65,23 @@ def clamped_free_eigenvalues(n: int) -> Real:
     >>> print(clamped_free_eigenvalues(3).round(6))
     [1.875104 4.694091 7.854757]
     """
-    return _eigenvalues(n).copy()
+    return _cached_eigenvalues(n).copy()
 
 
 @cache
-def _eigenvalues(n: int) -> Real:
+def _cached_eigenvalues(n: int) -> Real:
+    """Return the first `n` clamped–free eigenvalues as a cached array that must not be changed."""
     i = np.arange(1, n + 1)
-    middle = (i - 0.5) * np.pi
+    asymptotic_root = (i - 0.5) * np.pi
     sign = np.where(i % 2 == 1, 1.0, -1.0)
     # With z = (i - 1/2) pi + d the equation is sin d = ±sech z: no growing term, small d.
     d = np.zeros(n)
     for _ in range(8):
-        decay = np.exp(-(middle + d))
+        decay = np.exp(-(asymptotic_root + d))
         sech = 2 * decay / (1 + decay * decay)
         tanh = (1 - decay * decay) / (1 + decay * decay)
         d -= (np.sin(d) - sign * sech) / (np.cos(d) + sign * sech * tanh)
-    return middle + d
+    return asymptotic_root + d
 
 
 def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
@@ -102,9 +108,10 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
 
 
 def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
-    """Return the shape of a mode (1, 2, …) at ``x / L``, with mean square 1 and 2 at the tip.
+    """Return a mode shape of the clamped–free beam, normalised to the mean square 1.
 
-    Computed without growing exponentials: high modes are as accurate as low ones.
+    Its value at the tip is 2. It is computed without growing exponentials, so high modes are as
+    accurate as low ones.
 
     Parameters
     ----------
@@ -128,9 +135,9 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
     cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
     one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
-    grown = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
+    growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
     sign = 1.0 if number % 2 == 1 else -1.0
-    shape: Real = sign * (np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + grown)
+    shape: Real = sign * (np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part)
     return shape
 
 
@@ -153,9 +160,10 @@ def mode_mean(n: int) -> Real:
 
 
 def root_shear_ratio(n: int) -> Real:
-    """Return third over second derivative of each mode shape at the axis, over -k; shape (n,).
+    """Return ``-phi'''(0) / (k phi''(0))`` of the first `n` mode shapes phi, shape (n,).
 
-    A mode of mean square 1 and wave number k has the curvature ``2 k² (-1)^(i - 1)`` there.
+    It relates the shear force at the motor's axis to the bending moment there. A mode of mean
+    square 1 and wave number k has the curvature ``phi''(0) = 2 k² (-1)^(i - 1)``.
 
     Parameters
     ----------
@@ -176,15 +184,15 @@ def root_shear_ratio(n: int) -> Real:
 
 
 def participation(beam: Beam, n: int) -> Real:
-    """Return the first `n` factors ``a_i² = 4 L³ / z_i⁴``, shape (n,), in m³.
+    """Return the participation factors of the first `n` modes in m³, shape (n,).
 
-    Times rho, a factor is the mode's part of the rigid beam's moment of inertia: the sum of all
-    factors is L³/3.
+    The factor ``a_i² = 4 L³ / z_i⁴`` times rho is the mode's part of the rigid beam's moment of
+    inertia: the sum of all factors is L³/3.
 
     Parameters
     ----------
     beam
-        Only its length counts.
+        Beam; only its length is used.
     n
         Number of modes, from the first on.
 
@@ -227,72 +235,80 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
     [[-0.013 +16.047j -0.013 -16.047j]
      [-0.506+100.563j -0.506-100.563j]]
     """
-    found = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
-    missing = np.flatnonzero(np.isnan(found[:, 0]))
-    if missing.size:
+    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
+    without_pole = np.flatnonzero(np.isnan(pole_pairs[:, 0]))
+    if without_pole.size:
         raise ArithmeticError(
-            f"Mode {missing[0] + 1} has no pole on the principal sheet with {damping}."
+            f"Mode {without_pole[0] + 1} has no pole on the principal sheet with {damping}."
         )
-    return found
+    return pole_pairs
 
 
 def poles_for_eigenvalues(
     z: Real, beam: Beam, damping: Damping, near_rad_s: Complex | None = None
 ) -> Complex:
-    """Return both roots of ``Q (z/L)⁴ + P = 0`` for each z, shape (len(z), 2), as in `poles`.
+    """Return the pole pair of each mode from its eigenvalue z, shape (len(z), 2), in rad/s.
 
-    With the roots of ``tan z = tanh z`` instead of the clamped–free eigenvalues these are the zeros
-    of G. A row is NaN if there is no root on the principal sheet.
+    They are the roots of ``Q (z/L)⁴ + P = 0``, ordered as in `poles`. With the roots of ``tan z =
+    tanh z`` instead of the clamped–free eigenvalues they are the zeros of G. A row is NaN if there
+    is no root on the principal sheet.
 
     Parameters
     ----------
     z
-        Clamped–free eigenvalues, shape (m,), or others of the beam.
+        Clamped–free eigenvalues, or roots of ``tan z = tanh z``, shape (m,).
     beam, damping
         Parameters of the exact model.
     near_rad_s
-        Expected roots in the upper half plane, shape (m,). If all are within `CLOSE_BY`, the roots
-        are found from them, ten times faster than from those of the undamped beam.
+        Expected roots in the upper half plane, shape (m,). If all are within the relative distance
+        `SAME_ROOT_TOLERANCE` of the roots, the roots are found from them, ten times faster than
+        from those of the undamped beam.
     """
     omega_squared = (z / beam.length_m) ** 4 / beam.density_over_stiffness
-    damper = damping.gamma / beam.density_over_stiffness
+    external_coefficient = damping.gamma / beam.density_over_stiffness
     internal_first_order = damping.zeta == 0 or damping.alpha == 1
     external_first_order = damping.gamma == 0 or damping.lambda_ == 1
     if internal_first_order and external_first_order:
-        return _second_order_poles(omega_squared, damper + damping.zeta * omega_squared)
+        return _second_order_poles(
+            omega_squared, external_coefficient + damping.zeta * omega_squared
+        )
     if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
         start = np.log(near_rad_s)
-        found = _newton(start, omega_squared, damper, damping.zeta, damping)
-        if bool((np.abs(found - start) < CLOSE_BY).all()):
-            upper = np.exp(found)
+        log_poles = _newton_roots(start, omega_squared, external_coefficient, damping.zeta, damping)
+        if bool((np.abs(log_poles - start) < SAME_ROOT_TOLERANCE).all()):
+            upper = np.exp(log_poles)
             return np.stack([upper, upper.conj()], axis=1)
-    for steps in _HOMOTOPY_STEPS:
-        upper = _continued_poles(omega_squared, damper, damping, steps)
-        lost = np.isnan(upper)
-        if not lost.any():
+    for steps in _HOMOTOPY_STEP_COUNTS:
+        upper = _poles_by_continuation(omega_squared, external_coefficient, damping, steps)
+        has_no_pole = np.isnan(upper)
+        if not has_no_pole.any():
             break
     else:
-        upper[lost] = _searched_poles(omega_squared[lost], damper, damping)
+        upper[has_no_pole] = _poles_by_search(
+            omega_squared[has_no_pole], external_coefficient, damping
+        )
     return np.stack([upper, upper.conj()], axis=1)
 
 
 def pole_gradient(
     pole_rad_s: complex, k4_per_m4: float, beam: Beam, damping: Damping, wrt: Sequence[str]
 ) -> Complex:
-    """Differentiate a mode's pole with respect to parameters; shape (len(wrt),).
+    """Return the derivatives of a mode's pole with respect to parameters, shape (len(wrt),).
 
-    By implicit differentiation of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha) = 0``.
+    They follow by implicit differentiation of ``rho/EI s² + gamma s^lambda + k⁴ (1 + zeta s^alpha)
+    = 0``.
 
     Parameters
     ----------
     pole_rad_s
-        The pole, as of `poles`.
+        Pole of the mode, as returned by `poles`.
     k4_per_m4
         Fourth power of the mode's wave number, ``(z / L)⁴``.
     beam, damping
         Parameters of the exact model.
     wrt
-        Names of `rigd.beam.PARAMETERS`; those without effect on a pole give 0.
+        Names of `rigd.beam.PARAMETERS`. The derivative with respect to a parameter that does not
+        affect the pole is 0.
 
     Examples
     --------
@@ -323,7 +339,7 @@ def pole_gradient(
 
 
 def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
-    """Return the first `n` modes of the beam; raises as `poles` does.
+    """Return the first `n` modes of the damped beam.
 
     Parameters
     ----------
@@ -331,6 +347,11 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
         Parameters of the exact model.
     n
         Number of modes, from the first on.
+
+    Raises
+    ------
+    ArithmeticError
+        If a mode has no pole on the principal sheet.
 
     Examples
     --------
@@ -341,10 +362,10 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     2.554 Hz, damping ratio 0.04%
     16.011 Hz, damping ratio 0.22%
     """
-    found = []
+    mode_list = []
     for i, (first, second) in enumerate(poles(beam, damping, n)):
         natural = float(np.sqrt((first * second).real))
-        found.append(
+        mode_list.append(
             Mode(
                 number=i + 1,
                 poles_rad_s=(complex(first), complex(second)),
@@ -353,7 +374,7 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
                 damping_ratio=float((-first - second).real / (2 * natural)),
             )
         )
-    return tuple(found)
+    return tuple(mode_list)
 
 
 def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
@@ -362,56 +383,64 @@ def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
     first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
     second = first.conj()
     over_damped = half * half > omega_squared
-    fast = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
-    second[over_damped] = fast[over_damped]
-    first[over_damped] = omega_squared[over_damped] / fast[over_damped]  # no cancellation
+    fast_poles = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
+    second[over_damped] = fast_poles[over_damped]
+    first[over_damped] = omega_squared[over_damped] / fast_poles[over_damped]  # no cancellation
     return np.stack([first, second], axis=1)
 
 
-def _continued_poles(omega_squared: Real, damper: float, damping: Damping, steps: int) -> Complex:
-    """Follow poles in the upper half plane from the undamped ones while damping grows.
+def _poles_by_continuation(
+    omega_squared: Real, external_coefficient: float, damping: Damping, steps: int
+) -> Complex:
+    """Return the modes' poles in the upper half plane, followed from the undamped ones.
 
-    NaN where the path was lost or has left the principal sheet.
+    Damping grows from zero in `steps` steps. A pole is NaN where the path was lost or has left the
+    principal sheet.
     """
     log_s: Complex = 0.5 * np.log(omega_squared) + 0.5j * np.pi
     for fraction in (np.arange(1, steps + 1) / steps) ** 2:
-        log_s = _newton(log_s, omega_squared, fraction * damper, fraction * damping.zeta, damping)
+        log_s = _newton_roots(
+            log_s, omega_squared, fraction * external_coefficient, fraction * damping.zeta, damping
+        )
     poles: Complex = np.exp(log_s)
     return poles
 
 
-def _searched_poles(omega_squared: Real, damper: float, damping: Damping) -> Complex:
-    """Search for poles in the upper half plane from many starts, most of them near the cut.
+def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: Damping) -> Complex:
+    """Search for the modes' poles in the upper half plane by Newton's method from many starts.
 
-    Near critical damping of almost first order a pole turns along the cut so sharply that no
-    reasonable step follows it. NaN where no start leads to a pole on the principal sheet.
+    Most starts are near the branch cut: near critical damping of almost first order a pole turns
+    along the cut so sharply that no reasonable step follows it. The result is NaN where no start
+    leads to a pole on the principal sheet.
     """
     angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
     starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
     log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
-    log_s = _newton(log_s, omega_squared[:, None], damper, damping.zeta, damping)
-    found = ~np.isnan(log_s)
-    first = np.argmax(found, axis=1)[:, None]
+    log_s = _newton_roots(
+        log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
+    )
+    converged = ~np.isnan(log_s)
+    first = np.argmax(converged, axis=1)[:, None]
     poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
     return poles
 
 
-def _newton(
+def _newton_roots(
     log_s: Complex,
     omega_squared: Real,
-    damper: float,
+    external_coefficient: float,
     zeta: float,
     damping: Damping,
 ) -> Complex:
-    """Find roots of the characteristic equation by Newton's method in ln s.
+    """Return the roots ln s of the characteristic equation that Newton's method finds in ln s.
 
-    In ln s a pole moves almost linearly, and one off the principal sheet has an argument beyond pi.
-    NaN where no root is found in the upper half of the principal sheet.
+    In ln s a pole moves almost linearly, and a pole off the principal sheet has an argument beyond
+    pi. The result is NaN where no root is found in the upper half of the principal sheet.
     """
     with np.errstate(all="ignore"):  # a diverging start overflows
         for _ in range(40):
             inertial = np.exp(2 * log_s)
-            external = damper * np.exp(damping.lambda_ * log_s)
+            external = external_coefficient * np.exp(damping.lambda_ * log_s)
             internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
             residual = inertial + external + internal + omega_squared
             slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
@@ -420,6 +449,6 @@ def _newton(
             if not (np.abs(step) > 1e-12).any():  # nor where one is NaN
                 break
         scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
-        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _ON_THE_CUT)
-        solved = np.abs(residual) < 1e-9 * scale
-        return np.where(solved & on_sheet, log_s, np.nan + 0j)
+        on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
+        is_solution = np.abs(residual) < 1e-9 * scale
+        return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

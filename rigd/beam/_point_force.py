@@ -35,12 +35,13 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
-_TERMS = 9
-"""Terms of the series: the first omitted one is below 40^9 / 36! = 7e-28."""
+"""Magnitude of q at which the power series are replaced by exponentials."""
+_SERIES_TERMS = 9
+"""Number of terms of each power series; the first omitted term is below 40^9 / 36! = 7e-28."""
 
 
 class PointForceGrid:
-    """Response to an angle of the root and to a force, on one grid of s.
+    """Evaluates the beam's responses to a root angle and to a point force on a fixed grid of s.
 
     Parameters
     ----------
@@ -59,7 +60,15 @@ class PointForceGrid:
     [0.79734219] 0.797342
     """
 
-    __slots__ = ("_b4", "_high", "_length_m", "_low", "_q_stiffness", "_shape", "_waves")
+    __slots__ = (
+        "_b4",
+        "_exponentials",
+        "_large_q_indices",
+        "_length_m",
+        "_q_stiffness",
+        "_shape",
+        "_small_q_indices",
+    )
 
     def __init__(self, s: ArrayLike, beam: Beam, damping: Damping) -> None:
         points = np.asarray(s, dtype=np.complex128)
@@ -70,12 +79,15 @@ class PointForceGrid:
         self._length_m = beam.length_m
         self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal
         self._b4: Complex = -(inertial + damping.gamma * points**damping.lambda_) / internal
-        low = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
-        self._low, self._high = np.flatnonzero(low), np.flatnonzero(~low)
-        self._waves = _Waves(self._b4[self._high], beam.length_m)
+        is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
+        self._small_q_indices, self._large_q_indices = (
+            np.flatnonzero(is_small),
+            np.flatnonzero(~is_small),
+        )
+        self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
     def per_angle(self, x_m: ArrayLike, order: int = 0) -> Complex:
-        """Return the displacement along the beam per angle of the root, or its derivative.
+        """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
         ----------
@@ -87,22 +99,26 @@ class PointForceGrid:
         Returns
         -------
         complex ndarray, shape of s, then of `x_m`
-            In m^(1 - order)/rad.
+            Displacement, or derivative, in m^(1 - order)/rad.
         """
         x = np.asarray(x_m, dtype=np.float64)
         out = np.empty((self._b4.size, x.size), dtype=np.complex128)
-        b4 = self._b4[self._low, None]
-        moment, shear = self._root_curves(b4, b4 * self._k(3), b4 * self._k(2))
-        out[self._low] = (
-            _series(b4, x.ravel(), 1, order)
-            + moment * _series(b4, x.ravel(), 2, order)
-            + shear * _series(b4, x.ravel(), 3, order)
+        b4 = self._b4[self._small_q_indices, None]
+        moment, shear = self._root_derivatives(
+            b4, b4 * self._series_at_tip(3), b4 * self._series_at_tip(2)
         )
-        out[self._high] = self._waves.turned(x.ravel(), order)
+        out[self._small_q_indices] = (
+            _power_series(b4, x.ravel(), 1, order)
+            + moment * _power_series(b4, x.ravel(), 2, order)
+            + shear * _power_series(b4, x.ravel(), 3, order)
+        )
+        out[self._large_q_indices] = self._exponentials.response_per_angle(x.ravel(), order)
         return out.reshape((*self._shape, *x.shape))
 
     def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
-        """Return the displacement along the beam per force on it, the root held, or its derivative.
+        """Return the displacement of the beam per point force, or its derivative by x.
+
+        The motor holds the root at angle zero.
 
         Parameters
         ----------
@@ -116,86 +132,110 @@ class PointForceGrid:
         Returns
         -------
         complex ndarray, shape of s, then of the distances
-            In m^(1 - order)/N.
+            Displacement, or derivative, in m^(1 - order)/N.
         """
         x, at = np.broadcast_arrays(np.asarray(x_m, np.float64), np.asarray(force_at_m, np.float64))
         shape = x.shape
         x, at = x.ravel(), at.ravel()
         out = np.empty((self._b4.size, x.size), dtype=np.complex128)
-        b4, stiffness = self._b4[self._low, None], self._q_stiffness[self._low, None]
-        beyond = self._length_m - at
-        moment, shear = self._root_curves(b4, _series(b4, beyond, 1), _series(b4, beyond, 0))
-        after = np.where(x > at, _series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
-        out[self._low] = (
-            moment * _series(b4, x, 2, order) + shear * _series(b4, x, 3, order) + after
+        b4, stiffness = (
+            self._b4[self._small_q_indices, None],
+            self._q_stiffness[self._small_q_indices, None],
+        )
+        distance_to_tip = self._length_m - at
+        moment, shear = self._root_derivatives(
+            b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
+        )
+        beyond_force = np.where(x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
+        out[self._small_q_indices] = (
+            moment * _power_series(b4, x, 2, order)
+            + shear * _power_series(b4, x, 3, order)
+            + beyond_force
         ) / stiffness
-        out[self._high] = self._waves.pushed(x, at, order) / self._q_stiffness[self._high, None]
+        out[self._large_q_indices] = (
+            self._exponentials.response_per_force_over_stiffness(x, at, order)
+            / self._q_stiffness[self._large_q_indices, None]
+        )
         return out.reshape((*self._shape, *shape))
 
     def torque_per_angle(self) -> Complex:
-        """Return the motor's torque on the beam per angle in N·m/rad, of the shape of s: Eq. 25."""
-        return -self._stiffness() * self.per_angle(0.0, 2)
+        """Return the motor's torque on the beam per angle (Eq. 25) in N·m/rad.
+
+        The shape is that of the grid.
+        """
+        return -self._bending_stiffness() * self.per_angle(0.0, 2)
 
     def shear_per_angle(self) -> Complex:
-        """Return the base shear per angle in N/rad, of the shape of s."""
-        return self._stiffness() * self.per_angle(0.0, 3)
+        """Return the shear force at the root per angle in N/rad, in the shape of the grid."""
+        return self._bending_stiffness() * self.per_angle(0.0, 3)
 
     def torque_per_force(self, force_at_m: ArrayLike) -> Complex:
-        """Return the motor's torque per force on the beam in m, shape of s, then of `force_at_m`.
+        """Return the motor's torque on the beam per point force on it, in N·m/N.
+
+        The shape is that of s, then of `force_at_m`.
 
         Parameters
         ----------
         force_at_m
-            Position of the force.
+            Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return -self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
+        return -self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 2)
 
     def shear_per_force(self, force_at_m: ArrayLike) -> Complex:
-        """Return the base shear per force on the beam, shape of s, then of `force_at_m`.
+        """Return the shear force at the root per point force on the beam, dimensionless.
+
+        The shape is that of s, then of `force_at_m`.
 
         Parameters
         ----------
         force_at_m
-            Position of the force.
+            Position of the force, as a distance from the motor's axis.
         """
         at = np.asarray(force_at_m, dtype=np.float64)
-        return self._stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
+        return self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
 
-    def _stiffness(self, axes: int = 0) -> Complex:
+    def _bending_stiffness(self, axes: int = 0) -> Complex:
+        """Return Q in N·m² in the shape of s, followed by `axes` axes of length 1."""
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
-    def _k(self, n: int) -> Complex:
-        """Return ``K_n`` at the tip at the low points, shape (low, 1)."""
-        return _series(self._b4[self._low, None], np.array([self._length_m]), n)
+    def _series_at_tip(self, n: int) -> Complex:
+        """Return the series ``K_n`` at the tip for the s with small q, shape (low, 1)."""
+        return _power_series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
 
-    def _root_curves(
+    def _root_derivatives(
         self, b4: Complex, tip_moment: Complex, tip_shear: Complex
     ) -> tuple[Complex, Complex]:
-        """Return y''(0) and y'''(0) that cancel the other terms' derivatives at the tip."""
-        k0, k1, k3 = self._k(0), self._k(1), self._k(3)
+        """Return the y''(0) and y'''(0) that make moment and shear force at the tip zero.
+
+        `tip_moment` and `tip_shear` are the derivatives y''(L) and y'''(L) of the other terms.
+        """
+        k0, k1, k3 = self._series_at_tip(0), self._series_at_tip(1), self._series_at_tip(3)
         determinant = k0 * k0 - b4 * k1 * k3
         moment: Complex = (k1 * tip_shear - k0 * tip_moment) / determinant
         shear: Complex = (b4 * k3 * tip_moment - k0 * tip_shear) / determinant
         return moment, shear
 
 
-def _series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
-    """Return ``K_n`` or its derivative at the points x (m,) for b4 (s, 1); shape (s, m)."""
+def _power_series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
+    """Return the series ``K_n`` or its derivative at the points x, shape (s, m).
+
+    `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
+    """
     n -= order
     if n < 0:
-        return b4 * _series(b4, x, n + 4)
+        return b4 * _power_series(b4, x, n + 4)
     argument = b4 * x**4
-    total = np.full_like(argument, 1 / factorial(4 * (_TERMS - 1) + n))
-    for k in range(_TERMS - 2, -1, -1):
+    total = np.full_like(argument, 1 / factorial(4 * (_SERIES_TERMS - 1) + n))
+    for k in range(_SERIES_TERMS - 2, -1, -1):
         total *= argument
         total += 1 / factorial(4 * k + n)
     return total * x**n
 
 
 @dataclass(init=False, slots=True)
-class _Waves:
-    """Solution by exponentials that never grow, at the points where |q| is large."""
+class _ExponentialSolution:
+    """Beam responses at large |q|, written as sums of exponentials that never grow."""
 
     _b: Complex  # (s, 1)
     _kappa: Complex  # (s, 1): c / b, which is j or -j
@@ -208,30 +248,33 @@ class _Waves:
         self._b = root[:, None]
         self._kappa = np.where(root.imag > 0, -1j, 1j)[:, None]  # so that Re c >= 0
         decay = np.exp(-root * length_m)
-        turn = np.exp(-root * self._kappa[:, 0] * length_m)
-        one, kappa = np.ones_like(root), self._kappa[:, 0]
+        rotation = np.exp(-root * self._kappa[:, 0] * length_m)
+        ones, kappa = np.ones_like(root), self._kappa[:, 0]
         # y(0), y'(0)/b, y''(L)/b², y'''(L)/b³ of the four functions: c² = -b².
         rows = [
-            [one, decay, one, turn],
-            [-one, decay, -kappa, kappa * turn],
-            [decay, one, -turn, -one],
-            [-decay, one, kappa * turn, -kappa],
+            [ones, decay, ones, rotation],
+            [-ones, decay, -kappa, kappa * rotation],
+            [decay, ones, -rotation, -ones],
+            [-decay, ones, kappa * rotation, -kappa],
         ]
         self._inverse = np.linalg.inv(np.moveaxis(np.array(rows), -1, 0)).astype(np.complex128)
 
-    def turned(self, x: Real, order: int) -> Complex:
-        """Return the response per angle at x (m,), shape (s, m)."""
-        return self._combined(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
+    def response_per_angle(self, x: Real, order: int) -> Complex:
+        """Return the displacement per root angle, or a derivative, at x (m,); shape (s, m)."""
+        return self._weighted_sum(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
 
-    def pushed(self, x: Real, at: Real, order: int) -> Complex:
-        """Return the response per force over Q at x (m,) for forces at `at` (m,), shape (s, m)."""
+    def response_per_force_over_stiffness(self, x: Real, at: Real, order: int) -> Complex:
+        """Return the displacement times Q per point force, or a derivative, shape (s, m).
+
+        Point i of x, shape (m,), is displaced by the force at point i of `at`.
+        """
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
-        near = -1 / (4 * b**3)  # A, of the decaying wave
-        far = -near / kappa  # B, of the other
-        to_root = near * np.exp(-b * at), far * np.exp(-c * at)
+        decaying_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
+        other_amplitude = -decaying_amplitude / kappa  # B, of the other
+        to_root = decaying_amplitude * np.exp(-b * at), other_amplitude * np.exp(-c * at)
         to_tip = (
-            near * np.exp(-b * (self._length_m - at)),
-            far * np.exp(-c * (self._length_m - at)),
+            decaying_amplitude * np.exp(-b * (self._length_m - at)),
+            other_amplitude * np.exp(-c * (self._length_m - at)),
         )
         at_ends = np.stack(
             [
@@ -243,15 +286,15 @@ class _Waves:
             axis=1,
         )
         distance = np.abs(x - at)
-        side = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
-        direct = (side * b) ** order * near * np.exp(-b * distance) + (
-            side * c
-        ) ** order * far * np.exp(-c * distance)
+        derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
+        direct = (derivative_sign * b) ** order * decaying_amplitude * np.exp(-b * distance) + (
+            derivative_sign * c
+        ) ** order * other_amplitude * np.exp(-c * distance)
         coefficients = -self._inverse @ at_ends
-        return direct + self._combined(coefficients, x, order)
+        return direct + self._weighted_sum(coefficients, x, order)
 
-    def _combined(self, coefficients: Complex, x: Real, order: int) -> Complex:
-        """Combine the four functions by coefficients (s, 4, m or 1)."""
+    def _weighted_sum(self, coefficients: Complex, x: Real, order: int) -> Complex:
+        """Return the sum of the four exponentials weighted by coefficients (s, 4, m or 1)."""
         b, c = self._b, self._kappa * self._b
         from_tip = self._length_m - x
         functions = (

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 
 from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import (
-    CLOSE_BY,
+    SAME_ROOT_TOLERANCE,
     clamped_free_eigenvalues,
     poles_for_eigenvalues,
     root_shear_ratio,
@@ -40,67 +40,88 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 _SERIES_LIMIT = 40.0
-_POWERS = (-4.0) ** np.arange(10)
-_SERIES = np.array(
+"""Magnitude of q below which power series replace the closed form, which cancels there."""
+_POWERS_OF_MINUS_FOUR = (-4.0) ** np.arange(10)
+_SERIES_COEFFICIENTS = np.array(
     [
-        [scale * _POWERS[k] / math.factorial(4 * k + last) for k in range(10)]
+        [scale * _POWERS_OF_MINUS_FOUR[k] / math.factorial(4 * k + last) for k in range(10)]
         for scale, last in ((1.0, 0), (4.0, 3), (4.0, 2), (2.0, 1))
     ]
 ).T
-_SERIES[0, 0] += 1.0
-"""Power series in q of ``1 + cos z cosh z`` and of the numerators of F, U and z² B over q."""
+_SERIES_COEFFICIENTS[0, 0] += 1.0
+"""Coefficients of power series in q, shape (powers, 4).
 
-_HOMOTOPY_STEPS = 12
+The first column is ``1 + cos z cosh z``, the others are the numerators of F, U and z² B over q."""
+
+_MAX_HOMOTOPY_STEPS = 12
+"""Largest number of steps in which the tip mass and the clamp's compliance grow from zero."""
 _CHANGE_PER_STEP = 0.02
-_NEWTON_STEPS = 60
-_CONVERGED = 1e-10
+"""Growth of tip mass and compliance in one step while poles are followed.
+
+It is relative to the mass and the compliance of the beam itself."""
+_MAX_NEWTON_STEPS = 60
+"""Largest number of Newton's iterations."""
+_NEWTON_TOLERANCE = 1e-10
 """Relative length of Newton's last step: the error is of the order of its square."""
-_CLOSELY = 1e-6
-"""The same for close starts, where convergence is quadratic from the first step on."""
-_NEARLY = 1e-4
-"""The same during the increase to the whole mass."""
-_FARTHEST = 10.0
-"""Largest movement of a pole in one step of the increase to the whole mass."""
-_ASIDE = 1e-7
-_NEXT_TO_POLE = 1e-8
-"""Relative distance from a pole: the square root of the rounding error relative to G there."""
+_CLOSE_START_TOLERANCE = 1e-6
+"""Relative length of Newton's last step from a start close to the root.
+
+Convergence is quadratic there from the first step on."""
+_INTERMEDIATE_TOLERANCE = 1e-4
+"""Relative length of Newton's last step before tip mass and compliance have their full size."""
+_MAX_ROOT_TO_START_RATIO = 10.0
+"""Largest ratio of a root to the start of Newton's method that is accepted."""
+_START_POLE_DISTANCE = 1e-7
+"""Relative distance of the first starts from the poles, where G of an undamped beam is infinite."""
+_POLE_DISTANCE = 1e-8
+"""Relative distance from a pole at which the response and its derivatives are evaluated.
+
+At the pole itself of a rigidly clamped beam they are infinite.
+
+It is the square root of the rounding error relative to G there."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LoadedResponse:
-    """G of the beam with a tip mass, and its derivatives.
+    """Coupling torque per motor angle of the beam with a tip mass, and its derivatives.
 
-    All of the shape of s; c, p and the mass vary one at a time, with fixed EI and length.
+    All arrays have the shape of s. Each derivative holds the other two of c, p and the tip mass
+    constant, and the bending stiffness and length as well.
     """
 
     response: Complex
-    """G in N·m/rad."""
+    """Coupling torque per motor angle in N·m/rad."""
     by_elastic: Complex
-    """Derivative with respect to c."""
+    """Derivative of the response with respect to the elastic factor c."""
     by_inertial: Complex
-    """Derivative with respect to p."""
+    """Derivative of the response with respect to the inertial factor p."""
     by_mass: Complex
-    """Derivative with respect to the tip's mass, in N·m/(rad kg)."""
+    """Derivative of the response with respect to the tip mass, in N·m/(rad kg)."""
 
 
 def loaded_response(
-    s_squared: Complex, elastic: Complex, inertial: Complex, beam: Beam, tip_mass_kg: float
+    s_squared: Complex,
+    elastic_factor: Complex,
+    inertial_factor: Complex,
+    beam: Beam,
+    tip_mass_kg: float,
 ) -> LoadedResponse:
-    """Evaluate G with a tip mass on a rigid clamp.
+    """Return the coupling torque per angle of a rigidly clamped beam with a tip mass.
 
     Parameters
     ----------
     s_squared : ndarray of complex
-        In rad²/s², not 0.
-    elastic, inertial : ndarray of complex
-        c and p there.
+        Square of the Laplace variable in rad²/s², not 0.
+    elastic_factor, inertial_factor : ndarray of complex
+        Elastic factor c and inertial factor p at these s.
     beam : Beam
-        Stiffness and length of the beam; its density is in p.
+        Beam with this stiffness and length. Its density is not used: p contains it.
     tip_mass_kg : float
+        Point mass at the tip.
     """
     stiffness, length = beam.bending_stiffness_n_m2, beam.length_m
-    f, u, f_slope, u_slope = _functions(-(length**4) * inertial / elastic)
-    per_mass = s_squared / (length * stiffness * inertial)
+    f, u, f_slope, u_slope = _response_functions(-(length**4) * inertial_factor / elastic_factor)
+    per_mass = s_squared / (length * stiffness * inertial_factor)
     mass_ratio = tip_mass_kg * per_mass
     inverse = 1 / (1 - mass_ratio * f)
     loaded = (f + mass_ratio * u) * inverse
@@ -108,42 +129,42 @@ def loaded_response(
     slope = (f_slope + mass_ratio * u_slope + mass_ratio * loaded * f_slope) * inverse
     per_length = -stiffness / length
     return LoadedResponse(
-        response=per_length * elastic * loaded,
+        response=per_length * elastic_factor * loaded,
         by_elastic=per_length * (loaded - slope),
-        by_inertial=per_length * elastic / inertial * (slope - mass_ratio * by_ratio),
-        by_mass=per_length * elastic * per_mass * by_ratio,
+        by_inertial=per_length * elastic_factor / inertial_factor * (slope - mass_ratio * by_ratio),
+        by_mass=per_length * elastic_factor * per_mass * by_ratio,
     )
 
 
-def _with_offsets(
-    found: LoadedResponse,
-    elastic: Complex,
-    inertial: Complex,
+def _add_stiffness_offsets(
+    uniform_response: LoadedResponse,
+    elastic_factor: Complex,
+    inertial_factor: Complex,
     beam: Beam,
     stiffness_offsets: tuple[float, ...],
 ) -> LoadedResponse:
-    """Give modes 2, 3, … of a beam on a rigid clamp their stiffness offsets."""
+    """Return the response after the stiffness offsets of modes 2, 3, … are applied to it."""
     length, stiffness = beam.length_m, beam.bending_stiffness_n_m2
-    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic)), dtype=np.complex128)
+    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic_factor)), dtype=np.complex128)
     z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
     for k4, offset in zip((z / length) ** 4, stiffness_offsets, strict=True):
         # a² EI k⁴, with the participation a² = 4 L³ / z⁴
         weight, stiffer = 4 * stiffness / length, 1 + offset
-        before = 1 / (elastic * k4 + inertial)
-        after = 1 / (elastic * k4 * stiffer + inertial)
-        total += weight * inertial**2 * elastic * offset * before * after
-        by_elastic += weight * inertial**2 * (stiffer * after**2 - before**2)
-        by_inertial += weight * elastic**2 * k4 * ((stiffer * after) ** 2 - before**2)
+        uniform = 1 / (elastic_factor * k4 + inertial_factor)
+        offset_mode = 1 / (elastic_factor * k4 * stiffer + inertial_factor)
+        total += weight * inertial_factor**2 * elastic_factor * offset * uniform * offset_mode
+        by_elastic += weight * inertial_factor**2 * (stiffer * offset_mode**2 - uniform**2)
+        by_inertial += weight * elastic_factor**2 * k4 * ((stiffer * offset_mode) ** 2 - uniform**2)
     return replace(
-        found,
-        response=found.response + total,
-        by_elastic=found.by_elastic + by_elastic,
-        by_inertial=found.by_inertial + by_inertial,
+        uniform_response,
+        response=uniform_response.response + total,
+        by_elastic=uniform_response.by_elastic + by_elastic,
+        by_inertial=uniform_response.by_inertial + by_inertial,
     )
 
 
 Slopes = dict[str, Callable[[], Complex]]
-"""Derivatives of a response by the names of parameters, each computed on demand."""
+"""Map from a parameter's name to a function that computes the response's derivative by it."""
 
 
 def differentiated_response(
@@ -154,7 +175,7 @@ def differentiated_response(
     tip_mass_kg: float,
     stiffness_offsets: tuple[float, ...] = (),
 ) -> tuple[LoadedResponse, Slopes]:
-    """Return G with a tip mass on a rigid clamp, and its derivatives by any parameter.
+    """Return the response of a rigidly clamped beam with a tip mass, and its derivatives.
 
     Parameters
     ----------
@@ -165,29 +186,33 @@ def differentiated_response(
     tip_mass_kg
         Point mass at the tip.
     stiffness_offsets
-        As in `LoadedBeam`, fixed.
+        As in `LoadedBeam`; no derivative with respect to them is returned.
 
     Returns
     -------
     response : LoadedResponse
+        Coupling torque per motor angle.
     slopes : dict of str to callable
-        By `rigd.beam.PARAMETERS` except the length, and by ``tip_mass_kg``.
+        Functions that compute the derivative with respect to a parameter, by its name in
+        `rigd.beam.PARAMETERS` or ``tip_mass_kg``.
     """
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
     inertia = beam.density_over_stiffness * s_squared
-    elastic, inertial = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
-    found = loaded_response(s_squared, elastic, inertial, beam, tip_mass_kg)
+    elastic_factor, inertial_factor = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
+    response = loaded_response(s_squared, elastic_factor, inertial_factor, beam, tip_mass_kg)
     if stiffness_offsets:
-        found = _with_offsets(found, elastic, inertial, beam, stiffness_offsets)
-    return found, {
-        "zeta": lambda: found.by_elastic * s_alpha,
-        "alpha": lambda: found.by_elastic * (damping.zeta * log_s * s_alpha),
-        "gamma": lambda: found.by_inertial * s_lambda,
-        "lambda": lambda: found.by_inertial * (damping.gamma * log_s * s_lambda),
-        "ln_density_over_stiffness": lambda: found.by_inertial * inertia,
-        "ln_stiffness": lambda: found.response - tip_mass_kg * found.by_mass,
-        "tip_mass_kg": lambda: found.by_mass,
+        response = _add_stiffness_offsets(
+            response, elastic_factor, inertial_factor, beam, stiffness_offsets
+        )
+    return response, {
+        "zeta": lambda: response.by_elastic * s_alpha,
+        "alpha": lambda: response.by_elastic * (damping.zeta * log_s * s_alpha),
+        "gamma": lambda: response.by_inertial * s_lambda,
+        "lambda": lambda: response.by_inertial * (damping.gamma * log_s * s_lambda),
+        "ln_density_over_stiffness": lambda: response.by_inertial * inertia,
+        "ln_stiffness": lambda: response.response - tip_mass_kg * response.by_mass,
+        "tip_mass_kg": lambda: response.by_mass,
     }
 
 
@@ -198,9 +223,13 @@ class LoadedBeam:
     Attributes
     ----------
     beam : Beam
+        Uniform beam without the tip mass.
     damping : Damping
+        Internal and external damping of the beam.
     tip_mass_kg : float
+        Point mass at the tip.
     root_compliance_rad_per_nm : float
+        Rotation of the clamp per torque on the beam's root.
     stiffness_offsets : tuple of float
         Relative differences of the stiffness of modes 2, 3, … from the uniform beam's. With them
         the coupling torque (`transfer`, `poles`, `zeros`) and the motion of the tip are defined,
@@ -218,14 +247,14 @@ class LoadedBeam:
             raise ValueError("A tip mass and modes of their own stiffness exclude each other.")
 
     @property
-    def plain(self) -> bool:
-        """Whether it is a uniform beam with a free tip on a rigid clamp."""
+    def is_uniform_cantilever(self) -> bool:
+        """Whether the beam is uniform, has a free tip and is clamped rigidly."""
         return not (
             self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         )
 
     def with_frequencies(self, frequency_hz: Sequence[float]) -> "LoadedBeam":
-        """Return the beam with given frequencies of some modes, by a stiffness offset for each.
+        """Return a beam whose first modes have the given frequencies, by stiffness offsets.
 
         Parameters
         ----------
@@ -238,77 +267,83 @@ class LoadedBeam:
             If one of these modes of the beam does not oscillate.
         """
         z = clamped_free_eigenvalues(len(frequency_hz))
-        wanted_rad_s = 2 * math.pi * np.array(frequency_hz)
-        found = LoadedBeam(self.beam, self.damping)
+        target_rad_s = 2 * math.pi * np.array(frequency_hz)
+        offset_beam = LoadedBeam(self.beam, self.damping)
         stiffness = np.ones(z.size)
-        for _ in range(2):  # damping moves them a little
-            own_rad_s = found.poles(z)[:, 0].imag
-            if not bool((own_rad_s > 0).all()):
+        for _ in range(2):  # damping shifts the frequencies a little
+            present_rad_s = offset_beam.poles(z)[:, 0].imag
+            if not bool((present_rad_s > 0).all()):
                 raise ValueError("A mode of the beam does not oscillate.")
-            stiffness *= (wanted_rad_s / own_rad_s) ** 2
+            stiffness *= (target_rad_s / present_rad_s) ** 2
             density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
-            found = LoadedBeam(
+            offset_beam = LoadedBeam(
                 replace(self.beam, density_kg_per_m=density_kg_per_m),
                 self.damping,
                 stiffness_offsets=tuple((stiffness[1:] / stiffness[0] - 1).tolist()),
             )
-        return found
+        return offset_beam
 
     def transfer(self, s: Complex) -> Complex:
         """Return the coupling torque per motor angle in N·m/rad, in the shape of `s` (not 0)."""
-        response = self.at(s).response
+        response = self.rigid_clamp_response(s).response
         return response / (1 + self.root_compliance_rad_per_nm * response)
 
     def transfer_and_gradient(self, s: Complex, wrt: Sequence[str]) -> tuple[Complex, Complex]:
-        """Return the transfer function and its derivatives with respect to parameters.
+        """Return the coupling torque per motor angle and its derivatives by parameters.
 
         Parameters
         ----------
         s
-            As for `transfer`.
+            Laplace variable in rad/s, not 0.
         wrt
             Names of `rigd.beam.PARAMETERS`, ``tip_mass_kg`` and ``root_compliance_rad_per_nm``.
 
         Returns
         -------
         transfer : complex ndarray, shape of `s`
+            Coupling torque per motor angle in N·m/rad.
         gradient : complex ndarray, shape ``(len(wrt), *shape of s)``
+            Its derivative with respect to each parameter.
         """
-        at, by = self._differentiated(s)
-        factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
+        at, by = self._response_and_slopes(s)
+        clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
         gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
-        return at.response * factor, gradient * factor * factor
+        return at.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
-        """Differentiate poles with respect to parameters; shape (n, len(wrt)).
+        """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).
 
-        Computed as for roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G is
-        infinite, but close to it the ratios of its derivatives are accurate.
+        The poles are treated as roots of ``1/G + kappa``. At the pole of a beam on a rigid clamp G
+        is infinite, but close to the pole the ratios of its derivatives are accurate.
 
         Parameters
         ----------
         poles_rad_s : ndarray of complex, shape (n,)
-            Poles, as of `poles`.
+            Poles, as returned by `poles`.
         wrt
-            Names as of `transfer_and_gradient`; those without effect on a pole give 0.
+            Parameter names as for `transfer_and_gradient`. The derivative with respect to a
+            parameter that does not affect the poles is 0.
         """
-        aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
-        s = poles_rad_s * (1 - aside)
-        at, by = self._differentiated(s)
-        slope = self.slope(s, at)
-        moved = np.zeros((s.size, len(wrt)), dtype=np.complex128)
-        for column, name in zip(moved.T, wrt, strict=True):
+        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
+        s = poles_rad_s * (1 - pole_distance)
+        at, by = self._response_and_slopes(s)
+        slope = self.derivative_by_s(s, at)
+        gradients = np.zeros((s.size, len(wrt)), dtype=np.complex128)
+        for gradient_column, name in zip(gradients.T, wrt, strict=True):
             if name in by:
-                column[:] = -by[name]() / slope
-        return moved
+                gradient_column[:] = -by[name]() / slope
+        return gradients
 
-    def _uniform(self) -> None:
-        """Raise if the beam is not uniform."""
+    def _require_uniform(self) -> None:
+        """Raise ValueError if the beam has stiffness offsets."""
         if any(self.stiffness_offsets):
             raise ValueError("Of modes of their own stiffness the shear is not known.")
 
-    def _differentiated(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
-        """Return `at` with the derivatives on a rigid clamp, that by its compliance at 0."""
+    def _response_and_slopes(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
+        """Return the response on a rigid clamp and functions that compute its derivatives.
+
+        The derivative with respect to the clamp's compliance is that at a compliance of 0.
+        """
         at, by = differentiated_response(
             np.log(s),
             s * s,
@@ -320,243 +355,270 @@ class LoadedBeam:
         return at, by | {"root_compliance_rad_per_nm": lambda: -at.response * at.response}
 
     def tip_slope(self, s: Complex) -> Complex:
-        """Return the slope of the tip against the root per motor angle, in the shape of `s`."""
+        """Return the tip's slope relative to the root's per motor angle, in the shape of `s`."""
         return self.tip_response(s)[1]
 
     def tip_response(self, s: Complex) -> tuple[Complex, Complex]:
-        """Return displacement (m/rad) and slope of the tip per motor angle, relative to the root.
+        """Return the tip's displacement (m/rad) and slope per motor angle, relative to the root.
 
         Parameters
         ----------
         s
-            As for `transfer`.
+            Laplace variable in rad/s, not 0.
         """
         grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
         displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
-        elastic, inertial = self.factors(s)
+        elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
         for index, offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
-            k4, turn = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
-            more = inertial * turn * elastic * k4 * offset
-            more = more / ((elastic * k4 + inertial) * (elastic * k4 * (1 + offset) + inertial))
-            displacement = displacement + 2 * more
-            slope = slope + tip_slopes[index] * more
+            k4, rotation_part = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
+            offset_term = inertial_factor * rotation_part * elastic_factor * k4 * offset
+            offset_term = offset_term / (
+                (elastic_factor * k4 + inertial_factor)
+                * (elastic_factor * k4 * (1 + offset) + inertial_factor)
+            )
+            displacement = displacement + 2 * offset_term
+            slope = slope + tip_slopes[index] * offset_term
         if self.tip_mass_kg:
-            push = self._push(s, grid)
-            displacement = displacement + grid.per_force(tip, tip) * push
-            slope = slope + grid.per_force(tip, tip, 1) * push
-        root = 1 / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
-        return displacement * root, slope * root
+            tip_force = self._tip_force_per_angle(s, grid)
+            displacement = displacement + grid.per_force(tip, tip) * tip_force
+            slope = slope + grid.per_force(tip, tip, 1) * tip_force
+        clamp_factor = 1 / (
+            1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
+        )
+        return displacement * clamp_factor, slope * clamp_factor
 
-    def _push(self, s: Complex, grid: PointForceGrid) -> Complex:
-        """Return the force on the tip, per angle of the root, that accelerates the tip mass."""
+    def _tip_force_per_angle(self, s: Complex, grid: PointForceGrid) -> Complex:
+        """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
         tip, load = self.beam.length_m, self.tip_mass_kg * s * s
-        push: Complex = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
-        return push
+        tip_force: Complex = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
+        return tip_force
 
     def shear(self, s: Complex) -> Complex:
-        """Return the motor's force on the beam per motor angle in N/rad, in the shape of `s`."""
-        self._uniform()
+        """Return the motor's transverse force on the beam per motor angle in N/rad at `s`."""
+        self._require_uniform()
         grid = PointForceGrid(s, self.beam, self.damping)
         shear = grid.shear_per_angle()
         if self.tip_mass_kg:
-            shear = shear + grid.shear_per_force(self.beam.length_m) * self._push(s, grid)
+            shear = shear + grid.shear_per_force(self.beam.length_m) * self._tip_force_per_angle(
+                s, grid
+            )
         if self.root_compliance_rad_per_nm:
-            shear = shear / (1 + self.root_compliance_rad_per_nm * self.at(s).response)
+            shear = shear / (
+                1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
+            )
         return shear
 
-    def at(self, s: Complex) -> LoadedResponse:
-        """Return the torque for a rigid clamp, with its derivatives."""
-        elastic, inertial = self.factors(s)
-        found = loaded_response(s * s, elastic, inertial, self.beam, self.tip_mass_kg)
+    def rigid_clamp_response(self, s: Complex) -> LoadedResponse:
+        """Return the response at `s` (rad/s) that the beam would have on a rigid clamp."""
+        elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
+        response = loaded_response(
+            s * s, elastic_factor, inertial_factor, self.beam, self.tip_mass_kg
+        )
         if not any(self.stiffness_offsets):
-            return found
-        return _with_offsets(found, elastic, inertial, self.beam, self.stiffness_offsets)
+            return response
+        return _add_stiffness_offsets(
+            response, elastic_factor, inertial_factor, self.beam, self.stiffness_offsets
+        )
 
     def residues(self, poles_rad_s: Complex) -> Complex:
-        """Return residues of the coupling torque per angular acceleration, ``G(s) / s²``, at poles.
+        """Return the residues of the coupling torque per angular acceleration at poles.
 
-        A mode whose pair of poles is p and its conjugate adds ``2 Re(r exp(p t))`` to the response
-        to a unit change of the angular velocity.
+        The torque per angular acceleration is ``G(s) / s²``. A mode with the pole p, its conjugate
+        and the residue r adds ``2 Re(r exp(p t))`` to the torque after a unit change of the angular
+        velocity.
 
         Parameters
         ----------
         poles_rad_s : ndarray of complex, shape (n,)
-            As of `poles`.
+            Poles, as returned by `poles`.
 
         Returns
         -------
         ndarray of complex, shape (n,)
-            In N·m s.
+            Residue at each pole, in N·m s.
         """
         # On a rigid clamp G is infinite at a pole, but close to it the ratio is accurate.
-        aside = 0.0 if self.root_compliance_rad_per_nm else _NEXT_TO_POLE
-        s = poles_rad_s * (1 - aside)
-        at = self.at(s)
-        residues: Complex = -(at.response**2) / self.slope(s, at) / s**2
+        pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
+        s = poles_rad_s * (1 - pole_distance)
+        at = self.rigid_clamp_response(s)
+        residues: Complex = -(at.response**2) / self.derivative_by_s(s, at) / s**2
         return residues
 
-    def factors(self, s: Complex) -> tuple[Complex, Complex]:
-        """Return elastic factor c and inertial factor p."""
+    def elastic_and_inertial_factors(self, s: Complex) -> tuple[Complex, Complex]:
+        """Return the elastic factor c and the inertial factor p at `s` (rad/s)."""
         log_s, damping = np.log(s), self.damping
-        elastic = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
+        elastic_factor = 1 + damping.zeta * np.exp(damping.alpha * log_s).astype(np.complex128)
         external = damping.gamma * np.exp(damping.lambda_ * log_s).astype(np.complex128)
-        return elastic, self.beam.density_over_stiffness * s * s + external
+        return elastic_factor, self.beam.density_over_stiffness * s * s + external
 
-    def slope(self, s: Complex, at: LoadedResponse) -> Complex:
-        """Differentiate `LoadedResponse.response` by s.
+    def derivative_by_s(self, s: Complex, at: LoadedResponse) -> Complex:
+        """Return the derivative of the response on a rigid clamp with respect to s.
 
         Parameters
         ----------
         s
-            As for `transfer`.
+            Laplace variable in rad/s, not 0.
         at
-            Value of `at` there.
+            Response on a rigid clamp at `s`, as returned by `rigid_clamp_response`.
         """
         log_s, damping = np.log(s), self.damping
         internal = damping.zeta * damping.alpha * np.exp(damping.alpha * log_s)
         external = damping.gamma * damping.lambda_ * np.exp(damping.lambda_ * log_s)
-        inertial = 2 * self.beam.density_over_stiffness * s * s + external
+        inertial_factor = 2 * self.beam.density_over_stiffness * s * s + external
         by_log_s: Complex = (
-            at.by_elastic * internal + at.by_inertial * inertial + 2 * self.tip_mass_kg * at.by_mass
+            at.by_elastic * internal
+            + at.by_inertial * inertial_factor
+            + 2 * self.tip_mass_kg * at.by_mass
         )
         return by_log_s / s
 
     def poles(self, z: Real, near_rad_s: Complex | None = None) -> Complex:
         """Return both poles of each mode with locked hub, shape (len(z), 2), in rad/s.
 
-        They are followed from those of the beam on a rigid clamp while mass and compliance grow.
+        The poles are followed from those of the beam on a rigid clamp without a tip mass while mass
+        and compliance grow to their values.
 
         Parameters
         ----------
         z : ndarray
             Clamped-free eigenvalues of the modes.
         near_rad_s : ndarray of complex, shape (len(z),), optional
-            As for `rigd.beam._modes.poles_for_eigenvalues`, in the order of the modes.
+            Expected poles in the upper half plane in rad/s, one per mode, from which the search
+            starts.
 
         Returns
         -------
         ndarray of complex
-            As of `rigd.beam._modes.poles_for_eigenvalues`; NaN where a path was lost.
+            Conjugate pairs (positive frequency first) or two real poles. A row is NaN if the pole
+            could not be followed.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            found = self._newton(near_rad_s, _CLOSELY, zeros=False)
-            if bool((np.abs(found / near_rad_s - 1) < CLOSE_BY).all()):
-                return np.column_stack([found, found.conj()])
-        return self._followed(z, zeros=False)
+            upper_poles = self._newton_roots(near_rad_s, _CLOSE_START_TOLERANCE, zeros=False)
+            if bool((np.abs(upper_poles / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
+                return np.column_stack([upper_poles, upper_poles.conj()])
+        return self._followed_roots(z, zeros=False)
 
     def zeros(self, z: Real) -> Complex:
-        """Return the zeros of the response, in pairs as in `poles`.
+        """Return the zeros of the coupling torque per angle in rad/s, in pairs as in `poles`.
 
         Parameters
         ----------
         z : ndarray
-            Roots of ``tan z = tanh z``: those of the uniform beam.
+            Roots of ``tan z = tanh z``, which determine the zeros of the uniform beam.
         """
-        return self._followed(z, zeros=True)
+        return self._followed_roots(z, zeros=True)
 
-    def _followed(self, z: Real, *, zeros: bool) -> Complex:
-        """Follow poles or zeros from those of the uniform beam."""
+    def _followed_roots(self, z: Real, *, zeros: bool) -> Complex:
+        """Return poles or zeros, followed from those of the uniform beam on a rigid clamp.
+
+        A row is NaN if the path was lost.
+        """
         offsets = np.array(self.stiffness_offsets)
         if not zeros and offsets.size:
-            # On a rigid clamp they are exactly those of the stiffness k⁴ (1 + d).
+            # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
             z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
-        found = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
-        rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if rigid and not (zeros and offsets.any()):
-            return found
-        known = ~np.isnan(found[:, 0])
+        roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
+        is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if is_rigid and not (zeros and offsets.any()):
+            return roots
+        has_root = ~np.isnan(roots[:, 0])
         # One of a conjugate pair suffices; without oscillation both have to be found.
-        turning = found[known][:, 0].imag != 0
-        others = found[known][~turning][:, 1]
-        here = np.concatenate([found[known][:, 0], others])
-        here *= 1 - _ASIDE  # G is infinite at an undamped pole
+        oscillating = roots[has_root][:, 0].imag != 0
+        second_real_poles = roots[has_root][~oscillating][:, 1]
+        current = np.concatenate([roots[has_root][:, 0], second_real_poles])
+        current *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
         # Relative to the beam's own values: a change that moves the poles little needs few steps.
-        change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
-        turned = self.beam.bending_stiffness_n_m2 / self.beam.length_m
-        change = max(change, self.root_compliance_rad_per_nm * turned)
+        relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
+        stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
+        relative_change = max(
+            relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
+        )
         if zeros:
-            change = max(change, float(np.abs(offsets).max(initial=0.0)))
-        steps = min(max(math.ceil(change / _CHANGE_PER_STEP), 2), _HOMOTOPY_STEPS)
-        before = here
+            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
+        steps = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
+        previous = current
         for step in range(1, steps + 1):
             fraction = step / steps
-            partly = LoadedBeam(
+            partial_beam = LoadedBeam(
                 self.beam,
                 self.damping,
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
                 tuple((fraction if zeros else 1.0) * offsets),
             )
-            last = step == steps
-            start = 2 * here - before if step > 1 else here
-            before, here = here, partly._newton(start, _CONVERGED if last else _NEARLY, zeros=zeros)
-        first = here[: turning.size]
+            is_last_step = step == steps
+            start = 2 * current - previous if step > 1 else current
+            previous, current = (
+                current,
+                partial_beam._newton_roots(
+                    start,
+                    _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
+                    zeros=zeros,
+                ),
+            )
+        first = current[: oscillating.size]
         second = first.conj()
-        second[~turning] = here[turning.size :]
-        found[known] = np.column_stack([first, second])
-        return found
+        second[~oscillating] = current[oscillating.size :]
+        roots[has_root] = np.column_stack([first, second])
+        return roots
 
-    def _newton(self, s: Complex, converged: float, *, zeros: bool) -> Complex:
-        """Find roots of ``1/G + kappa``, or of G, from close starts; NaN where none is found.
+    def _newton_roots(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
+        """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
 
-        Parameters
-        ----------
-        s
-            Starts.
-        converged
-            Relative length of the last step.
-        zeros
-            Whether roots of G are searched for.
+        `s` has the starts and `tolerance` is the relative length of the last step. The result is
+        NaN where no root is found near its start.
         """
         start = s
         with np.errstate(all="ignore"):
-            for _ in range(_NEWTON_STEPS):
-                at = self.at(s)
-                step = at.response / self.slope(s, at)
+            for _ in range(_MAX_NEWTON_STEPS):
+                at = self.rigid_clamp_response(s)
+                step = at.response / self.derivative_by_s(s, at)
                 step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
                 s = s + step
-                if not np.nanmax(np.abs(step / s), initial=0.0) > converged:
+                if not np.nanmax(np.abs(step / s), initial=0.0) > tolerance:
                     break
-            # Far away every step is a short one.
-            found = (np.abs(step) < max(converged, 1e-9) * np.abs(s)) & (
-                np.abs(s) < _FARTHEST * np.abs(start)
+            # Far from any root every step is short, too.
+            converged = (np.abs(step) < max(tolerance, 1e-9) * np.abs(s)) & (
+                np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start)
             )
-            return np.where(found, s, np.nan + 0j)
+            return np.where(converged, s, np.nan + 0j)
 
 
-def _functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """Return F, U, q F' and q U'."""
+def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
+    """Return the functions F and U of the module's docstring at `q`, and q F' and q U'."""
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
     series = np.abs(q) < _SERIES_LIMIT
     if series.any():
-        low = q[series]
-        divisor, *numerators = np.polynomial.polynomial.polyval(low, _SERIES)
+        small_q = q[series]
+        divisor, *numerators = np.polynomial.polynomial.polyval(small_q, _SERIES_COEFFICIENTS)
         for out, numerator in zip((f, u, b), numerators, strict=True):
-            out[series] = low * numerator / divisor
+            out[series] = small_q * numerator / divisor
     if not series.all():
-        for out, values in zip((f, u, b), _scaled(q[~series]), strict=True):
+        for out, values in zip((f, u, b), _scaled_functions(q[~series]), strict=True):
             out[~series] = values
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 
-def _scaled(q: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return F, U and z² B from decaying exponentials only."""
-    # Real functions of q: their values above the real axis, mirrored, are those below.
-    below = q.imag < 0
-    z = np.sqrt(np.sqrt(np.where(below, q.conj(), q)))
-    decay, turn = np.exp(-z), np.exp(1j * z)
-    a, b = decay * decay, turn * turn
-    reciprocal = 1 / (4 * decay * turn + (1 + a) * (1 + b))
+def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
+    """Return F, U and z² B at large `q`, computed from decaying exponentials only."""
+    # F, U and B are real functions of q: values below the real axis mirror those above it.
+    lower_half_plane = q.imag < 0
+    z = np.sqrt(np.sqrt(np.where(lower_half_plane, q.conj(), q)))
+    decay, rotation = np.exp(-z), np.exp(1j * z)
+    a, b = decay * decay, rotation * rotation
+    reciprocal = 1 / (4 * decay * rotation + (1 + a) * (1 + b))
     sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
-    found = (
+    functions = (
         z * (sine - cosine) * reciprocal,
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
-    first, second, third = (np.where(below, values.conj(), values) for values in found)
+    first, second, third = (
+        np.where(lower_half_plane, values.conj(), values) for values in functions
+    )
     return first, second, third

@@ -28,26 +28,41 @@ from rigd.beam._tip_mass import LoadedBeam
 from rigd.errors import UserError
 
 ERROR_BAND_HZ = (0.05, 100.0)
-"""Band in which a realisation states its error: the paper's chirp and an octave above."""
+"""Frequency band in Hz over which `Realisation.relative_error` is the largest error.
+
+It is the band of the paper's chirp and an octave above."""
 
 MAX_GROWTH_PER_S = 1e-2
-"""Limit of the growth of a frictionless motor with the beam attached. Zero would exclude the
-undamped beam, whose poles lie on the imaginary axis except for rounding and the fit's error."""
+"""Largest accepted growth rate (1/s) of a frictionless motor with the realised beam attached.
 
-_MODES_UP_TO_HZ = 1200.0
-_MOST_MODES = 300
-_HEAVY_DAMPING = 0.8
-"""Damping ratio from which a pair beyond the band is left out: with the real poles next to it, it
-would only allow huge residues that cancel in the band."""
-_CUT_POLES = -(10.0 ** (np.arange(-6, 14) / 3.0))
+Zero would exclude the undamped beam, whose poles lie on the imaginary axis except for rounding and
+the fit's error."""
+
+_HIGHEST_MODE_HZ = 1200.0
+"""Frequency in Hz up to which a realisation includes the beam's modes."""
+_MAX_MODES = 300
+"""Largest number of modes that a realisation may have; more indicate wrong units of the beam."""
+_HEAVY_DAMPING_RATIO = 0.8
+"""Damping ratio from which a pole pair above the fitted band is omitted.
+
+With the real poles next to it, it would only allow huge residues that cancel in the band."""
+_BRANCH_CUT_POLES_RAD_S = -(10.0 ** (np.arange(-6, 14) / 3.0))
+"""Real poles in rad/s that approximate the branch cut of the fractional orders, three a decade."""
 _FIT_BAND_HZ = (0.02, 500.0)
-_TAIL_HZ = (1e-4, 1080.0)
+"""Frequency band in Hz in which the fit of the residues has the weight 1."""
+_TAIL_BAND_HZ = (1e-4, 1080.0)
+"""Lowest and highest frequency in Hz of the fit's grid outside `_FIT_BAND_HZ`."""
 _TAIL_WEIGHT = 1e-3
-_CLOSEST = 3e-7
+"""Weight of the fit outside `_FIT_BAND_HZ`; it makes unstable realisations unlikely."""
+_MIN_RELATIVE_DISTANCE = 3e-7
+"""Smallest distance of a fitted frequency from a pole or zero, relative to the frequency."""
 _MAX_OUTPUT_ERROR = 3e-3
-_RCOND = 1e-10
-"""Excludes combinations of columns that would gain the last digit in the band with huge residues
-that cancel there and nowhere else."""
+"""Largest accepted relative error (rms) of an additional output of a realisation."""
+_SINGULAR_VALUE_CUTOFF = 1e-10
+"""Relative singular value below which the least-squares fit drops a combination of poles.
+
+Such combinations would gain the last digit in the band with huge residues that cancel there and
+nowhere else."""
 
 
 Real = NDArray[np.float64]
@@ -55,39 +70,42 @@ Complex = NDArray[np.complexfloating]
 
 
 class RealisationError(UserError, ValueError):
-    """The damping cannot be realised with the requested error, or not stably."""
+    """The damped beam has no stable state space with the requested error."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Realisation:
-    """State space ``x' = a x + b θ''``, ``Γ = c x + D θ'' + V θ' + K θ`` for G = Γ/θ.
+    """State space of the beam: motor angle θ as input, coupling torque Γ as output.
+
+    It reads ``x' = a x + b θ''``, ``Γ = c x + D θ'' + V θ' + K θ``.
 
     `a` is block diagonal: 2 × 2 blocks for the complex pairs, then the real poles.
     """
 
     a: Real
-    """(n, n) in 1/s."""
+    """State matrix, shape (n, n), in 1/s."""
     b: Real
-    """(n,), dimensionless."""
+    """Input vector of the angular acceleration, shape (n,), dimensionless."""
     c: Real
-    """(n,) in N·m."""
+    """Output vector of the torque, shape (n,), in N·m."""
     direct_inertia_kg_m2: float
-    """D, not negative."""
+    """Torque per angular acceleration that bypasses the states (D), not negative."""
     direct_viscosity_nm_s_per_rad: float
-    """V, not negative."""
+    """Torque per angular velocity that bypasses the states (V), not negative."""
     direct_stiffness_nm_per_rad: float
-    """K, not negative."""
+    """Torque per angle that bypasses the states (K), not negative."""
     relative_error: float
-    """Largest ``|realised - exact| / |exact|`` between 0.05 and 100 Hz."""
+    """Largest ``|realised - exact| / |exact|`` of the transfer function from 0.05 to 100 Hz."""
     poles_rad_s: Complex
-    """(m,): the pole in the upper half plane of each conjugate pair, then the real ones."""
+    """Poles, shape (m,): of each conjugate pair the one with positive imaginary part, then the
+    real poles."""
     modes: NDArray[np.intp]
-    """(m,): mode of each pole, the first is 0; -1: a pole of the branch cut."""
+    """Index of each pole's mode, shape (m,), from 0; -1 for a pole of the branch cut."""
 
     def transfer(self, s: ArrayLike) -> Complex:
-        """Return G(s) of the realisation, in N·m/rad, in the shape of `s` (rad/s)."""
+        """Return the realisation's coupling torque per motor angle at `s` (rad/s), in N·m/rad."""
         points = np.asarray(s, dtype=np.complex128)
-        columns = _basis(points.ravel(), self.poles_rad_s)
+        columns = _basis_functions(points.ravel(), self.poles_rad_s)
         direct = (
             self.direct_inertia_kg_m2,
             self.direct_viscosity_nm_s_per_rad,
@@ -99,19 +117,19 @@ class Realisation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateOutput:
-    """Another response to the root's angle, as an output of a realisation's states.
+    """Response of the beam to the motor angle, written as an output of a realisation's states.
 
-    It is ``c x + D θ'' + V θ' + K θ``, as the torque of a `Realisation`.
+    It is ``c x + D θ'' + V θ' + K θ``, with the states x of a `Realisation`.
     """
 
     c: Real
-    """(n,), in the response's unit."""
+    """Output vector, shape (n,), in the response's unit."""
     per_acceleration: float
-    """D."""
+    """Coefficient D of the angular acceleration."""
     per_velocity: float
-    """V."""
+    """Coefficient V of the angular velocity."""
     per_angle: float
-    """K."""
+    """Coefficient K of the angle."""
 
 
 def state_output(
@@ -121,19 +139,24 @@ def state_output(
     inertial: bool,
     small: float = 0.0,
 ) -> StateOutput:
-    """Fit a response of the beam, such as its base shear, as an output of its realisation.
+    """Fit another response of the beam, such as its base shear, to the states of a realisation.
 
     Parameters
     ----------
     realisation
-        The beam's.
+        State space of the same beam.
     response
-        Response to the angle of the root, from s (rad/s) to an array of its shape. It must have the
-        poles of the torque.
+        Function that returns the response per motor angle at an array of s (rad/s), in the shape
+        of s. It must have the poles of the coupling torque.
     inertial
-        Whether it may have a part proportional to the angular acceleration (D).
+        Whether the response may have a term proportional to the angular acceleration (D).
     small
         Size of the response below which its error is relative to this size.
+
+    Returns
+    -------
+    StateOutput
+        Output vector and direct terms.
 
     Raises
     ------
@@ -142,26 +165,28 @@ def state_output(
     """
     poles = realisation.poles_rad_s
     omega, weight = _fit_grid(poles[poles.imag > 0])
-    apart = _apart(omega, poles, np.zeros(0, dtype=np.complex128))
-    s = (1j * omega[apart]).astype(np.complex128)
-    weight = weight[apart]
+    far = _far_from_landmarks(omega, poles, np.zeros(0, dtype=np.complex128))
+    s = (1j * omega[far]).astype(np.complex128)
+    weight = weight[far]
     exact = response(s)
-    columns = _basis(s, poles)
-    used = np.arange(columns.shape[1])
+    columns = _basis_functions(s, poles)
+    fitted_columns = np.arange(columns.shape[1])
     if not inertial:
-        used = np.delete(used, -3)
+        fitted_columns = np.delete(fitted_columns, -3)
     size = np.abs(exact) + small
-    matrix = columns[:, used] * (weight / size)[:, None]
+    matrix = columns[:, fitted_columns] * (weight / size)[:, None]
     rows = np.concatenate([matrix.real, matrix.imag])
     scale = np.linalg.norm(rows, axis=0)
     weighted = exact * weight / size
     target = np.concatenate([weighted.real, weighted.imag])
     coefficients = np.zeros(columns.shape[1])
-    coefficients[used] = np.linalg.lstsq(rows / scale, target, rcond=_RCOND)[0] / scale
-    # The mean, not the largest error, since a response has zeros of its own.
-    in_band = weight == 1
-    left = ((columns @ coefficients - exact) / size)[in_band]
-    error = float(np.sqrt(np.mean(np.abs(left) ** 2)))
+    coefficients[fitted_columns] = (
+        np.linalg.lstsq(rows / scale, target, rcond=_SINGULAR_VALUE_CUTOFF)[0] / scale
+    )
+    # The rms, not the largest error, since a response has zeros of its own.
+    within_band = weight == 1
+    residual = ((columns @ coefficients - exact) / size)[within_band]
+    error = float(np.sqrt(np.mean(np.abs(residual) ** 2)))
     if not error <= _MAX_OUTPUT_ERROR:
         raise RealisationError(
             f"A response of the beam is realised with a relative error of {error:.1e} (rms); "
@@ -171,8 +196,11 @@ def state_output(
     return StateOutput(coefficients[:-3], inertia, viscosity, stiffness)
 
 
-def _basis(s: Complex, poles: Complex) -> Complex:
-    """Return the columns whose combination with ``c, D, V, K`` is G: shape (len(s), n + 3)."""
+def _basis_functions(s: Complex, poles: Complex) -> Complex:
+    """Return the functions of s whose sum, weighted by ``c, D, V, K``, is G.
+
+    Shape (len(s), n + 3).
+    """
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
     s2 = (s * s)[:, None]
     columns = np.empty((s.size, 2 * upper.size + real.size + 3), dtype=np.complex128)
@@ -197,7 +225,7 @@ def realise(
     stiffness_offsets: tuple[float, ...] = (),
     modes_of: Beam | None = None,
 ) -> Realisation:
-    """Return a state space of the beam that runs in real time.
+    """Fit a finite-dimensional state space to the exact model of the beam.
 
     Parameters
     ----------
@@ -236,16 +264,18 @@ def realise(
     """
     _check_passive(damping)
     loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets)
-    poles, modes = _poles(loaded, beam if modes_of is None else modes_of)
-    zeros = _zeros(loaded)
-    landmarks = np.concatenate([poles[poles.imag > 0], zeros])
+    poles, modes = _realised_poles(loaded, beam if modes_of is None else modes_of)
+    zeros = _zeros_in_band(loaded)
+    poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
 
-    omega, weight = _fit_grid(landmarks)
-    apart = _apart(omega, poles, zeros)
-    s = 1j * omega[apart]
-    exact = _exact(loaded, s)
-    scale = weight[apart] / exact
-    coefficients = _fit(_basis(s, poles) * scale[:, None], weight[apart].astype(np.complex128))
+    omega, weight = _fit_grid(poles_and_zeros)
+    far = _far_from_landmarks(omega, poles, zeros)
+    s = 1j * omega[far]
+    exact = _exact_transfer(loaded, s)
+    scale = weight[far] / exact
+    coefficients = _fit_coefficients(
+        _basis_functions(s, poles) * scale[:, None], weight[far].astype(np.complex128)
+    )
 
     error = _relative_error(loaded, poles, zeros, coefficients)
     if not error <= max_relative_error:
@@ -254,7 +284,7 @@ def realise(
             f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was "
             "requested."
         )
-    realisation = _state_space(poles, modes, coefficients, error)
+    realisation = _build_realisation(poles, modes, coefficients, error)
     growth = _growth_on_frictionless_motor(realisation, beam)
     if growth > MAX_GROWTH_PER_S:
         raise RealisationError(
@@ -265,6 +295,7 @@ def realise(
 
 
 def _check_passive(damping: Damping) -> None:
+    """Raise if a coefficient or order of the damping lets the beam create energy."""
     values = (damping.zeta, damping.gamma, damping.alpha, damping.lambda_)
     if not all(value >= 0 for value in values) or not max(damping.alpha, damping.lambda_) < 2:
         raise RealisationError(
@@ -273,152 +304,172 @@ def _check_passive(damping: Damping) -> None:
         )
 
 
-def _exact(loaded: LoadedBeam, s: Complex) -> Complex:
-    """Return the transfer function of the exact beam, in the shape of s."""
-    if loaded.plain:
+def _exact_transfer(loaded: LoadedBeam, s: Complex) -> Complex:
+    """Return the exact coupling torque per motor angle in N·m/rad, in the shape of `s`."""
+    if loaded.is_uniform_cantilever:
         return TransferGrid(s).evaluate(loaded.beam, loaded.damping)
     return loaded.transfer(np.asarray(s, dtype=np.complex128))
 
 
-def _poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
-    """Return poles up to 1.2 kHz, upper half plane first, then real ones; and their modes."""
-    reach = (2 * np.pi * _MODES_UP_TO_HZ) ** 2 * modes_of.density_over_stiffness
+def _realised_poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
+    """Return the realisation's poles in rad/s and the index of each pole's mode.
+
+    The poles up to 1.2 kHz are ordered as in `Realisation.poles_rad_s`; `modes_of` is the beam
+    that determines which modes are included.
+    """
+    highest_k_fourth = (2 * np.pi * _HIGHEST_MODE_HZ) ** 2 * modes_of.density_over_stiffness
     # Damping may lower the highest modes, so a few more are computed than the undamped count.
-    count = int(1.25 * reach**0.25 * modes_of.length_m / np.pi) + 3
-    if count > _MOST_MODES:
+    count = int(1.25 * highest_k_fourth**0.25 * modes_of.length_m / np.pi) + 3
+    if count > _MAX_MODES:
         raise RealisationError(
-            f"{modes_of} has some {count} modes below {_MODES_UP_TO_HZ:g} Hz, more than the "
-            f"{_MOST_MODES} that are realised; check the units of its length, density and "
+            f"{modes_of} has some {count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
+            f"{_MAX_MODES} that are realised; check the units of its length, density and "
             "stiffness."
         )
     eigenvalues = clamped_free_eigenvalues(count)
     pairs = loaded.poles(eigenvalues)
     if modes_of == loaded.beam:
-        chosen = _realised(pairs)
+        selected = _select_poles(pairs)
     else:
-        chosen = _realised(replace(loaded, beam=modes_of).poles(eigenvalues))
+        selected = _select_poles(replace(loaded, beam=modes_of).poles(eigenvalues))
     oscillating = pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
-    if np.isnan(pairs[chosen]).any() or (oscillating & (chosen.sum(axis=1) == 1)).any():
+    if np.isnan(pairs[selected]).any() or (oscillating & (selected.sum(axis=1) == 1)).any():
         raise RealisationError(
             f"{loaded.beam} with {loaded.damping} does not have the modes of {modes_of}."
         )
-    upper = np.flatnonzero(oscillating & chosen[:, 0])
-    over_damped = chosen & ~oscillating[:, None]
-    cut = np.full(_CUT_POLES.size, -1)
+    upper = np.flatnonzero(oscillating & selected[:, 0])
+    over_damped = selected & ~oscillating[:, None]
+    cut = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
     return (
-        np.concatenate([pairs[upper, 0], pairs[over_damped], _CUT_POLES]),
+        np.concatenate([pairs[upper, 0], pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]),
         np.concatenate([upper, np.nonzero(over_damped)[0], cut]),
     )
 
 
-def _realised(pairs: Complex) -> NDArray[np.bool_]:
-    """Return which poles of the modes are realised, in the shape of `pairs`."""
+def _select_poles(pairs: Complex) -> NDArray[np.bool_]:
+    """Return a mask of the modal poles that the state space includes, in the shape of `pairs`."""
     oscillating = pairs[:, 0].imag > 0
-    numbers = np.flatnonzero(oscillating)
-    upper = pairs[numbers, 0]
-    in_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
-    light = in_band | (-upper.real < _HEAVY_DAMPING * np.abs(upper))
-    numbers, upper = numbers[light], upper[light]
-    beyond = np.flatnonzero(upper.imag > 2 * np.pi * _MODES_UP_TO_HZ)
-    numbers = numbers[: beyond[0] + 1] if beyond.size else numbers
-    chosen = ~oscillating[:, None] & (np.abs(pairs) < 2 * np.pi * _MODES_UP_TO_HZ)
-    chosen[numbers] = True
-    return chosen
+    mode_indices = np.flatnonzero(oscillating)
+    upper = pairs[mode_indices, 0]
+    within_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
+    lightly_damped = within_band | (-upper.real < _HEAVY_DAMPING_RATIO * np.abs(upper))
+    mode_indices, upper = mode_indices[lightly_damped], upper[lightly_damped]
+    above_band = np.flatnonzero(upper.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
+    mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
+    selected = ~oscillating[:, None] & (np.abs(pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
+    selected[mode_indices] = True
+    return selected
 
 
-def _zeros(loaded: LoadedBeam) -> Complex:
-    """Return the zeros of G up to the end of the fit's band: the pinned–free beam's modes."""
+def _zeros_in_band(loaded: LoadedBeam) -> Complex:
+    """Return the zeros of G in rad/s up to 500 Hz, which are poles of the pinned–free beam."""
     beam = loaded.beam
-    reach = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
-    count = int(reach**0.25 * beam.length_m / np.pi) + 1
+    highest_k_fourth = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
+    count = int(highest_k_fourth**0.25 * beam.length_m / np.pi) + 1
     z = np.pi * np.arange(1.25, count + 1)  # of tan z = tanh z, within 4e-4
     zeros = loaded.zeros(z)[:, 0]
     upper: Complex = zeros[zeros.imag > 0]
     return upper
 
 
-def _fit_grid(landmarks: Complex) -> tuple[Real, Real]:
-    """Return angular frequencies and weights: the band, dense at poles and zeros, and the tails."""
-    low, high = _FIT_BAND_HZ
-    band = np.concatenate([np.geomspace(low, high, 200), _clusters(landmarks, 10)])
-    band = band[(band >= low) & (band <= high)]
+def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
+    """Return the angular frequencies (rad/s) of the fit and their weights.
+
+    The grid covers the fit's band, where it is dense near `poles_and_zeros`, and both tails.
+    """
+    lowest_hz, highest_hz = _FIT_BAND_HZ
+    band = np.concatenate(
+        [np.geomspace(lowest_hz, highest_hz, 200), _grid_around(poles_and_zeros, 10)]
+    )
+    band = band[(band >= lowest_hz) & (band <= highest_hz)]
     tails = np.concatenate(
-        [np.geomspace(_TAIL_HZ[0], low, 25), np.geomspace(high, _TAIL_HZ[1], 25)]
+        [
+            np.geomspace(_TAIL_BAND_HZ[0], lowest_hz, 25),
+            np.geomspace(highest_hz, _TAIL_BAND_HZ[1], 25),
+        ]
     )
     frequency = np.concatenate([band, tails])
     weight = np.concatenate([np.ones(band.size), np.full(tails.size, _TAIL_WEIGHT)])
     return 2 * np.pi * frequency, weight
 
 
-def _clusters(landmarks: Complex, points: int) -> Real:
-    """Return frequencies (Hz) over three half-widths on either side of each pole or zero."""
-    half_width = np.maximum(-landmarks.real, 1e-4 * landmarks.imag)
+def _grid_around(poles_and_zeros: Complex, points: int) -> Real:
+    """Return a grid of frequencies (Hz) within three half-widths of each pole or zero."""
+    half_width = np.maximum(-poles_and_zeros.real, 1e-4 * poles_and_zeros.imag)
     offsets = np.linspace(-3, 3, points)
-    frequency: Real = (landmarks.imag[:, None] + half_width[:, None] * offsets).ravel() / (
+    frequency: Real = (poles_and_zeros.imag[:, None] + half_width[:, None] * offsets).ravel() / (
         2 * np.pi
     )
     return frequency
 
 
-def _fit(columns: Complex, target: Complex) -> Real:
-    """Solve real least squares with non-negative last three unknowns (D, V, K)."""
+def _fit_coefficients(columns: Complex, target: Complex) -> Real:
+    """Return the real least-squares solution whose last three unknowns (D, V, K) are not negative.
+
+    The equations ``columns @ solution = target`` are complex.
+    """
     matrix = np.concatenate([columns.real, columns.imag])
     scale = np.linalg.norm(matrix, axis=0)
     q, r = np.linalg.qr(matrix / scale)
     rotated = q.T @ np.concatenate([target.real, target.imag])
-    free = np.arange(matrix.shape[1])
+    free_columns = np.arange(matrix.shape[1])
     while True:
         solution = np.zeros(matrix.shape[1])
-        solution[free] = np.linalg.lstsq(r[:, free], rotated, rcond=_RCOND)[0]
+        solution[free_columns] = np.linalg.lstsq(
+            r[:, free_columns], rotated, rcond=_SINGULAR_VALUE_CUTOFF
+        )[0]
         direct = solution[-3:]
         if (direct >= 0).all():
             scaled: Real = solution / scale
             return scaled
-        free = free[free != matrix.shape[1] - 3 + np.argmin(direct)]
+        free_columns = free_columns[free_columns != matrix.shape[1] - 3 + np.argmin(direct)]
 
 
 def _relative_error(
     loaded: LoadedBeam, poles: Complex, zeros: Complex, coefficients: Real
 ) -> float:
-    """Return the largest relative error over a grid several times as dense as the fit's."""
-    low, high = ERROR_BAND_HZ
-    landmarks = np.concatenate([poles[poles.imag > 0], zeros])
-    frequency = np.concatenate([np.geomspace(low, high, 1200), _clusters(landmarks, 34)])
-    omega = 2 * np.pi * frequency[(frequency >= low) & (frequency <= high)]
-    s = 1j * omega[_apart(omega, poles, zeros)]
-    exact = _exact(loaded, s)
-    return float(np.max(np.abs(_basis(s, poles) @ coefficients / exact - 1)))
+    """Return the realisation's largest relative error on a grid denser than that of the fit."""
+    lowest_hz, highest_hz = ERROR_BAND_HZ
+    poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
+    frequency = np.concatenate(
+        [np.geomspace(lowest_hz, highest_hz, 1200), _grid_around(poles_and_zeros, 34)]
+    )
+    omega = 2 * np.pi * frequency[(frequency >= lowest_hz) & (frequency <= highest_hz)]
+    s = 1j * omega[_far_from_landmarks(omega, poles, zeros)]
+    exact = _exact_transfer(loaded, s)
+    return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact - 1)))
 
 
-def _apart(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
-    """Return where ω is not too close to a pole or zero for a relative error to have a meaning."""
-    landmarks = np.concatenate([poles, zeros])
-    distance = np.abs(1j * omega[:, None] - landmarks).min(axis=1)
-    apart: NDArray[np.bool_] = distance > _CLOSEST * omega
-    return apart
+def _far_from_landmarks(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
+    """Return a mask of the frequencies far enough from poles and zeros for a relative error."""
+    poles_and_zeros = np.concatenate([poles, zeros])
+    distance = np.abs(1j * omega[:, None] - poles_and_zeros).min(axis=1)
+    far: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+    return far
 
 
-def _state_space(
+def _build_realisation(
     poles: Complex, modes: NDArray[np.intp], coefficients: Real, error: float
 ) -> Realisation:
+    """Build the realisation from its poles and the fitted coefficients ``c, D, V, K``."""
     upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
     n = 2 * upper.size + real.size
     a = np.zeros((n, n))
-    even = np.arange(0, 2 * upper.size, 2)
-    a[even, even] = a[even + 1, even + 1] = upper.real
-    a[even, even + 1] = upper.imag
-    a[even + 1, even] = -upper.imag
-    rest = np.arange(2 * upper.size, n)
-    a[rest, rest] = real
+    upper_rows = np.arange(0, 2 * upper.size, 2)
+    a[upper_rows, upper_rows] = a[upper_rows + 1, upper_rows + 1] = upper.real
+    a[upper_rows, upper_rows + 1] = upper.imag
+    a[upper_rows + 1, upper_rows] = -upper.imag
+    real_rows = np.arange(2 * upper.size, n)
+    a[real_rows, real_rows] = real
     b = np.ones(n)
-    b[even + 1] = 0.0
+    b[upper_rows + 1] = 0.0
     inertia, viscosity, stiffness = (float(value) for value in coefficients[-3:])
     return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles, modes)
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
-    """Return the growth rate of the realisation on a frictionless motor as heavy as the beam.
+    """Return the growth rate (1/s) of the realised beam on a frictionless motor of equal inertia.
 
     Without friction and with little inertia of its own such a motor is the most critical case for
     stability.
@@ -432,44 +483,55 @@ def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CoupledModel:
-    """``x' = a x + b τ`` of a motor that rigidly turns a beam; τ is the torque on the shaft in N·m.
+    """State space ``x' = a x + b τ`` of a motor and the beam on its shaft.
 
-    The state is angle (rad), angular velocity (rad/s), then the states of the beam. τ is the
-    motor's torque minus any friction that the model does not contain.
+    The state is angle (rad), angular velocity (rad/s), then the states of the beam. τ is the torque
+    on the shaft in N·m: the motor's torque minus any friction that the model does not contain. An
+    output row times the state, plus a factor times τ where the model states one, is the output.
     """
 
     a: Real
-    """(n, n)."""
+    """State matrix, shape (n, n)."""
     b: Real
-    """(n,)."""
+    """Input vector of the torque on the shaft, shape (n,)."""
     angle: Real
-    """(n,) row: angle in rad."""
+    """Output row of the angle in rad, shape (n,)."""
     velocity: Real
-    """(n,) row: angular velocity in rad/s."""
+    """Output row of the angular velocity in rad/s, shape (n,)."""
     acceleration: Real
-    """(n,) row: angular acceleration in rad/s², to which τ adds `acceleration_per_torque`."""
+    """Output row of the angular acceleration in rad/s², shape (n,).
+
+    The torque on the shaft adds `acceleration_per_torque` times τ."""
     acceleration_per_torque: float
-    """In rad/(s² N·m)."""
+    """Angular acceleration per torque on the shaft, in rad/(s² N·m)."""
     beam_torque: Real
-    """(n,) row: Γ, the torque on the beam, in N·m; τ adds `beam_torque_per_torque`."""
+    """Output row of the torque Γ on the beam in N·m, shape (n,).
+
+    The torque on the shaft adds `beam_torque_per_torque` times τ."""
     beam_torque_per_torque: float
-    """Fraction of τ that reaches the beam at once."""
+    """Fraction of the shaft's torque that acts on the beam without delay."""
     sensor_torque: Real
-    """(n,) row: torque of a sensor between motor and clamp, ``Γ + J_tool θ''``, in N·m."""
+    """Output row of the torque at a sensor between motor and clamp in N·m, shape (n,).
+
+    It is ``Γ + J_tool θ''``; the torque on the shaft adds `sensor_torque_per_torque` times τ."""
     sensor_torque_per_torque: float
-    """Fraction of τ that passes the sensor at once."""
+    """Fraction of the shaft's torque that acts on the sensor without delay."""
     sensed_torque: Real | None = None
-    """(n,) row: torque after the sensor's filter, in N·m; None: it has none."""
+    """Output row of the torque after the sensor's filter in N·m, shape (n,); None without filter.
+    """
     shear: Real = field(default_factory=lambda: np.zeros(0))
-    """(n,) row: force of the motor on the beam, in N; τ adds `shear_per_torque`."""
+    """Output row of the motor's force on the beam in N, shape (n,).
+
+    The torque on the shaft adds `shear_per_torque` times τ."""
     shear_per_torque: float = 0.0
-    """In 1/m."""
+    """Force on the beam per torque on the shaft that acts without delay, in 1/m."""
     sensed_shear: Real | None = None
-    """(n,) row: shear after the sensor's filter, in N; None: it has none."""
+    """Output row of the shear force after the sensor's filter in N, shape (n,); None without
+    filter."""
 
 
 def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledModel:
-    """Return the model with low-pass filters of the sensor's torque and shear.
+    """Add low-pass filters of the sensor's torque and shear force to a model.
 
     The filters' states come last.
 
@@ -483,9 +545,9 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
         1, or 2 (Butterworth).
     """
     n, omega = model.b.size, 2 * math.pi * corner_hz
-    more = 2 * order
-    a = np.zeros((n + more, n + more))
-    b = np.zeros(n + more)
+    extra_states = 2 * order
+    a = np.zeros((n + extra_states, n + extra_states))
+    b = np.zeros(n + extra_states)
     a[:n, :n], b[:n] = model.a, model.b
     filtered = (
         (n, model.sensor_torque, model.sensor_torque_per_torque),
@@ -500,19 +562,19 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
         if order == 2:
             a[first, last] = omega
             a[last, last] = -math.sqrt(2) * omega
-    none = np.zeros(more)
+    no_output = np.zeros(extra_states)
     return replace(
         model,
         a=a,
         b=b,
-        angle=np.append(model.angle, none),
-        velocity=np.append(model.velocity, none),
-        acceleration=np.append(model.acceleration, none),
-        beam_torque=np.append(model.beam_torque, none),
-        sensor_torque=np.append(model.sensor_torque, none),
-        sensed_torque=np.eye(1, n + more, n)[0],
-        shear=np.append(model.shear, none),
-        sensed_shear=np.eye(1, n + more, n + order)[0],
+        angle=np.append(model.angle, no_output),
+        velocity=np.append(model.velocity, no_output),
+        acceleration=np.append(model.acceleration, no_output),
+        beam_torque=np.append(model.beam_torque, no_output),
+        sensor_torque=np.append(model.sensor_torque, no_output),
+        sensed_torque=np.eye(1, n + extra_states, n)[0],
+        shear=np.append(model.shear, no_output),
+        sensed_shear=np.eye(1, n + extra_states, n + order)[0],
     )
 
 
@@ -524,12 +586,12 @@ def couple(
     tool_inertia_kg_m2: float = 0.0,
     shear: StateOutput | None = None,
 ) -> CoupledModel:
-    """Attach the beam, with the tool inertia in front of it, to a motor.
+    """Return the state space of a motor with the beam and the tool inertia on its shaft.
 
     Parameters
     ----------
     realisation
-        The beam; None for the motor (and the clamp) alone.
+        State space of the beam, or None for the motor and the clamp alone.
     motor_inertia_kg_m2
         Inertia of motor and gear at the output shaft.
     viscous_nm_s_per_rad
@@ -537,11 +599,11 @@ def couple(
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     shear
-        Base shear of the beam; None leaves it out.
+        Base shear of the beam as an output of `realisation`, or None to omit the shear force.
     """
     beam_states = 0 if realisation is None else realisation.b.size
     n = 2 + beam_states
-    rigid_torque = np.zeros(n)  # Γ but for its part that is proportional to θ''
+    rigid_torque = np.zeros(n)  # Γ without the term D θ''
     direct_inertia = 0.0
     a = np.zeros((n, n))
     angle, velocity = np.eye(2, n)
@@ -583,14 +645,16 @@ def couple(
 
 
 def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
-    """Return phi and gamma of ``x(t + duration) = phi x(t) + gamma τ``, exact for a held τ.
+    """Return the matrices of the exact discrete-time model for a constant torque.
+
+    ``x(t + duration_s) = phi x(t) + gamma τ`` for a torque τ that is constant meanwhile.
 
     Parameters
     ----------
     model
         Motor and beam.
     duration_s
-        Time for which τ is held.
+        Time for which the torque is constant.
 
     Returns
     -------
@@ -610,28 +674,30 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     extended = np.zeros((n + 1, n + 1))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n] = model.b * duration_s
-    exponential = _expm(extended)
+    exponential = _matrix_exponential(extended)
     return exponential[:n, :n], exponential[:n, n]
 
 
 def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
-    """Return the state after inputs of 1 held over a duration, shape (n, inputs).
+    """Return the state that each constant unit input causes after a duration, shape (n, inputs).
 
     Parameters
     ----------
     model
+        State space that is at rest in the beginning.
     inputs
-        Effect of each on the state's derivative, shape (n, inputs).
+        Effect of each input on the state's derivative, shape (n, inputs).
     duration_s
+        Time for which the inputs are constant.
     """
     n, m = inputs.shape
     extended = np.zeros((n + m, n + m))
     extended[:n, :n] = model.a * duration_s
     extended[:n, n:] = inputs * duration_s
-    return _expm(extended)[:n, n:]
+    return _matrix_exponential(extended)[:n, n:]
 
 
-def _expm(matrix: Real) -> Real:
+def _matrix_exponential(matrix: Real) -> Real:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
@@ -644,13 +710,13 @@ def _expm(matrix: Real) -> Real:
     x4 = x2 @ x2
     powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
     coefficient = np.cumprod([1.0] + [(13 - k) / ((26 - k) * (k + 1)) for k in range(13)])
-    even, odd = (
+    upper_rows, odd = (
         np.tensordot(coefficient[parity:8:2], powers, 1)
         + powers[3] @ np.tensordot(coefficient[8 + parity :: 2], powers[1:], 1)
         for parity in (0, 1)
     )
     odd = x @ odd
-    result: Real = np.linalg.solve(even - odd, even + odd)
+    result: Real = np.linalg.solve(upper_rows - odd, upper_rows + odd)
     for _ in range(squarings):
         result = result @ result
     return result

@@ -19,7 +19,7 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
 
 SMALL_SLOPE_RAD = 0.14
-"""Slope of the tip against the root up to which the linear model holds.
+"""Largest slope of the tip relative to the root, in rad, for which the linear model holds.
 
 No part of a clamped beam slopes more than its tip. In the first mode this is a deflection of 10 %
 of the length, in the second of 3 %. The error of the linear model grows with the square: the tip
@@ -27,24 +27,29 @@ approaches the axis by up to a third of it in lengths, here 0.6 %, and curvature
 from the linear ones by fractions of that size, the accuracy of a careful session.
 """
 
-_PADDED = 1.125
-_DECAY = 7.0
-_BLOCK = 1 << 15
-"""Frequencies evaluated at once: an hour at 1 kHz would take a gigabyte."""
+_EXTENSION_FACTOR = 1.125
+"""Length of the extended record relative to the record."""
+_DECAY_EXPONENT = 7.0
+"""Exponent of the decay of the weighting by which the record is multiplied before its FFT.
+
+The weighting suppresses the wrap-around."""
+_BLOCK_POINTS = 1 << 15
+"""Number of frequencies evaluated at once: those of an hour at 1 kHz would take a gigabyte."""
 
 
 def linear_model_error(slope_rad: float) -> float:
-    """Return a bound of the linear model's relative error, from the largest slope of the tip.
+    """Return an upper bound of the linear model's relative error for a slope of the tip.
 
     Parameters
     ----------
     slope_rad
-        Largest slope of the tip against the root.
+        Largest slope of the tip relative to the root.
 
     Returns
     -------
     float
-        A third of the slope squared: see `SMALL_SLOPE_RAD`. From 1 on the model is useless.
+        A third of the slope squared: see `SMALL_SLOPE_RAD`. The model is useless if it is 1 or
+        more.
 
     Examples
     --------
@@ -57,14 +62,14 @@ def linear_model_error(slope_rad: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class TipMotion:
-    """Largest motion of the free end."""
+    """Largest deflection, slope and speed of the beam's tip during a motion."""
 
     deflection_m: float
-    """Relative to the tangent at the root."""
+    """Largest distance of the tip from the tangent at the root."""
     slope_rad: float
-    """Relative to the same line."""
+    """Largest slope of the tip relative to the tangent at the root."""
     speed_m_s: float
-    """Through still air, including the rotation of the root."""
+    """Largest speed of the tip in still air, including the rotation of the root."""
 
 
 def tip_motion(
@@ -76,7 +81,7 @@ def tip_motion(
     tip_mass_kg: float = 0.0,
     root_compliance_rad_per_nm: float = 0.0,
 ) -> TipMotion:
-    """Predict the largest motion of the tip.
+    """Predict the tip's largest deflection, slope and speed from a record of the motor angle.
 
     Parameters
     ----------
@@ -85,7 +90,7 @@ def tip_motion(
     angle_rad
         Motor angle from rest, shape (n,).
     rate_hz
-        Samples a second.
+        Sampling rate of the angle.
     tip_mass_kg, root_compliance_rad_per_nm
         Point mass at the tip, and rotation of the clamp per torque.
 
@@ -101,54 +106,58 @@ def tip_motion(
     14.2 mm, 0.0201 rad
     """
     n = angle_rad.size
-    padded = _quick_length(int(np.ceil(_PADDED * n)))
+    padded = _fast_fft_length(int(np.ceil(_EXTENSION_FACTOR * n)))
     # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY * rate_hz / padded
+    sigma = _DECAY_EXPONENT * rate_hz / padded
     s = np.asarray(2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
     s += sigma
     # The angle stays at its final value: a jump back would ring at the last samples.
     angle = np.full(padded, angle_rad[-1] - angle_rad[0])
     np.subtract(angle_rad, angle_rad[0], out=angle[:n])
-    for start in range(0, padded, _BLOCK):
-        ticks = np.arange(start, min(start + _BLOCK, padded))
-        angle[start : start + _BLOCK] *= np.exp(-sigma * ticks / rate_hz)
-    deflected = np.fft.rfft(angle)
+    for start in range(0, padded, _BLOCK_POINTS):
+        ticks = np.arange(start, min(start + _BLOCK_POINTS, padded))
+        angle[start : start + _BLOCK_POINTS] *= np.exp(-sigma * ticks / rate_hz)
+    deflection = np.fft.rfft(angle)
     del angle
-    sloped, speeding = np.empty((2, s.size), dtype=np.complex128)
+    tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
     loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
     # Block by block and without copies: these arrays have the record's length.
-    for start in range(0, s.size, _BLOCK):
-        some = slice(start, start + _BLOCK)
-        turned = deflected[some].copy()
-        root: Complex = turned  # turns like the motor, except for a compliant clamp
-        if loaded.plain:
-            displaced, slope = tip_response(beam, damping, s[some])
-            displaced -= beam.length_m
+    for start in range(0, s.size, _BLOCK_POINTS):
+        block_slice = slice(start, start + _BLOCK_POINTS)
+        angle_spectrum = deflection[block_slice].copy()
+        root_angle: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
+        if loaded.is_uniform_cantilever:
+            tip_displacement, slope = tip_response(beam, damping, s[block_slice])
+            tip_displacement -= beam.length_m
             slope -= 1
         else:
-            displaced, slope = loaded.tip_response(s[some])
-            root = turned * (1 - root_compliance_rad_per_nm * loaded.transfer(s[some]))
-        deflected[some] = displaced * turned
-        sloped[some] = slope * turned
-        speeding[some] = s[some] * (deflected[some] + beam.length_m * root)
+            tip_displacement, slope = loaded.tip_response(s[block_slice])
+            root_angle = angle_spectrum * (
+                1 - root_compliance_rad_per_nm * loaded.transfer(s[block_slice])
+            )
+        deflection[block_slice] = tip_displacement * angle_spectrum
+        tip_slope[block_slice] = slope * angle_spectrum
+        tip_speed[block_slice] = s[block_slice] * (
+            deflection[block_slice] + beam.length_m * root_angle
+        )
     del s
 
     def largest(spectrum: Complex) -> float:
         motion = np.fft.irfft(spectrum, padded)[:n]
         peaks = []
-        for start in range(0, n, _BLOCK):
-            block = motion[start : start + _BLOCK]
+        for start in range(0, n, _BLOCK_POINTS):
+            block = motion[start : start + _BLOCK_POINTS]
             growth = np.exp(sigma * np.arange(start, start + block.size) / rate_hz)
             peaks.append(float(np.max(np.abs(block * growth))))
         return float(np.max(peaks))  # NaN stays NaN
 
     return TipMotion(
-        deflection_m=largest(deflected), slope_rad=largest(sloped), speed_m_s=largest(speeding)
+        deflection_m=largest(deflection), slope_rad=largest(tip_slope), speed_m_s=largest(tip_speed)
     )
 
 
 def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
-    """Return the transfer functions from the angle to the tip's displacement and slope.
+    """Return the tip's displacement and slope per motor angle.
 
     Parameters
     ----------
@@ -160,9 +169,9 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     Returns
     -------
     displacement
-        In m/rad, of the shape of `s`.
+        Displacement of the tip per angle in m/rad, in the shape of `s`.
     slope
-        Slope at the tip over the angle, dimensionless, same shape.
+        Slope of the tip per angle, dimensionless, in the shape of `s`.
     """
     external = damping.gamma * s**damping.lambda_
     internal = 1 + damping.zeta * s**damping.alpha
@@ -170,17 +179,17 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     z = beam.length_m * np.sqrt(np.sqrt(fourth))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
     sign = np.where(z.imag < 0, -1.0, 1.0)
-    turn, fade = np.exp(1j * sign * z), np.exp(-z)
-    a, b = fade * fade, turn * turn
-    reciprocal = 1 / (4 * turn * fade + (1 + b) * (1 + a))
-    sines = 2 * turn * (1 - a) + 2j * sign * fade * (1 - b)
-    cosines = 2 * turn * (1 + a) + 2 * fade * (1 + b)
+    rotation, decay = np.exp(1j * sign * z), np.exp(-z)
+    a, b = decay * decay, rotation * rotation
+    reciprocal = 1 / (4 * rotation * decay + (1 + b) * (1 + a))
+    sines = 2 * rotation * (1 - a) + 2j * sign * decay * (1 - b)
+    cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
     displacement: Complex = beam.length_m * sines * reciprocal / z
     slope: Complex = cosines * reciprocal
     return displacement, slope
 
 
-def _quick_length(least: int) -> int:
-    """Return a length with a fast transform, at most an eighth above the least one."""
-    unit = 1 << max(0, least.bit_length() - 4)
-    return -(-least // unit) * unit
+def _fast_fft_length(min_length: int) -> int:
+    """Return a length of at least `min_length`, at most an eighth more, whose FFT is fast."""
+    unit = 1 << max(0, min_length.bit_length() - 4)
+    return -(-min_length // unit) * unit

@@ -1,4 +1,4 @@
-"""Reference of the loop: cyclictest of rt-tests, the lowest latency on this computer."""
+"""Reference measurement with cyclictest of rt-tests, the lowest latency on this computer."""
 
 import os
 import re
@@ -13,50 +13,57 @@ from rigd.engine.realtime import WAKE_UP_US
 from rigd.errors import FailureError
 
 NAME = "cyclictest"
-_LARGEST_US = 50_000
-_MARGIN_S = 20.0
-_BIN = re.compile(r"^(\d+)\s+(\d+)\s*$", re.MULTILINE)
-_OVERFLOWS = re.compile(r"^# Histogram Overflows:\s*(\d+)", re.MULTILINE)
-_LARGEST = re.compile(r"^# Max Latencies:\s*(\d+)", re.MULTILINE)
+"""Name of the program, and of its measurement in reports."""
+_HISTOGRAM_US = 50_000
+"""Largest delay of the histogram in µs."""
+_TIMEOUT_MARGIN_S = 20.0
+"""Seconds after the end of the measurement in which the program must end."""
+_BIN_LINE = re.compile(r"^(\d+)\s+(\d+)\s*$", re.MULTILINE)
+"""Pattern of a bin in the program's output: delay in µs and count."""
+_OVERFLOW_LINE = re.compile(r"^# Histogram Overflows:\s*(\d+)", re.MULTILINE)
+"""Pattern of the number of delays beyond the histogram."""
+_LARGEST_DELAY_LINE = re.compile(r"^# Max Latencies:\s*(\d+)", re.MULTILINE)
+"""Pattern of the largest delay in µs."""
 
 
 class CyclictestError(FailureError):
     """cyclictest could not be run, or its output is unexpected; the message states the reason."""
 
 
-def installed() -> bool:
-    """Whether cyclictest is installed."""
+def is_installed() -> bool:
+    """Return whether cyclictest is installed."""
     return shutil.which(NAME) is not None
 
 
 def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> LoopMeasurement:
-    """Run cyclictest on the core of the loop, with its policy, priority and interval.
+    """Measure the wake-up latency with cyclictest under the conditions of the loop.
 
-    `priority` is that of SCHED_FIFO; 0 means the ordinary policy.
+    The program runs on the core `cpu` with the SCHED_FIFO priority `priority`; 0 means ordinary
+    scheduling.
     """
     command = [
         *(NAME, "--quiet", "--threads=1", f"--affinity={cpu}", "--mlockall"),
         *(f"--priority={priority}", f"--policy={'fifo' if priority else 'other'}"),
         *(f"--interval={round(1e6 / rate_hz)}", f"--loops={round(rate_hz * seconds)}"),
-        *(f"--histogram={_LARGEST_US}", f"--latency={WAKE_UP_US}"),
+        *(f"--histogram={_HISTOGRAM_US}", f"--latency={WAKE_UP_US}"),
     ]
     try:
-        done = subprocess.run(
+        completed = subprocess.run(
             command,
             capture_output=True,
             text=True,
             check=True,
-            timeout=seconds + _MARGIN_S,
+            timeout=seconds + _TIMEOUT_MARGIN_S,
             env=os.environ | {"LC_ALL": "C"},
         )
     except (OSError, subprocess.SubprocessError) as error:
         message = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
         raise CyclictestError(message[-1] if message else "it failed without a message") from error
-    return measured(done.stdout, rate_hz)
+    return parse_measurement(completed.stdout, rate_hz)
 
 
-def measured(output: str, rate_hz: float) -> LoopMeasurement:
-    """Return the measurement from the output of ``cyclictest --histogram`` with one thread.
+def parse_measurement(output: str, rate_hz: float) -> LoopMeasurement:
+    """Parse the output of ``cyclictest --histogram`` with one thread, and return its measurement.
 
     A wake-up one period or more late counts as missed ticks, because cyclictest also continues with
     the next deadline in the future. Delays beyond the histogram count as the largest delay.
@@ -71,8 +78,9 @@ def measured(output: str, rate_hz: float) -> LoopMeasurement:
 
 
 def _delays(output: str) -> Iterator[float]:
-    for delay_us, count in _BIN.findall(output):
+    """Yield all delays in µs of the histogram in the program's output."""
+    for delay_us, count in _BIN_LINE.findall(output):
         yield from [float(delay_us)] * int(count)
-    overflows, largest = _OVERFLOWS.search(output), _LARGEST.search(output)
+    overflows, largest = _OVERFLOW_LINE.search(output), _LARGEST_DELAY_LINE.search(output)
     if overflows is not None and largest is not None:
         yield from [float(largest[1])] * int(overflows[1])

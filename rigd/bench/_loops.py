@@ -1,4 +1,4 @@
-"""Loops to measure: sessions of the real processes on a simulated rig."""
+"""Measurement of the loop in sessions of the real processes on a simulated rig."""
 
 import os
 import subprocess
@@ -12,7 +12,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rigd.bench.measure import LoopMeasurement, UsageMeter, measurement
+from rigd.bench.measure import LoopMeasurement, UsageMeter, record_measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
 from rigd.engine.messages import Finished, SessionJob
@@ -28,22 +28,27 @@ from rigd.runtime import StopRequest
 from rigd.session import read_session
 from rigd.session.layout import decode_samples
 
-_POLL_S = 0.1
-AROUND_S = 3.5
-"""Duration of a measurement in addition to its record."""
-_BLOCK = 10_000
-_TARE_S = 0.2
+_POLL_TIMEOUT_S = 0.1
+"""Longest wait in seconds for a message of the control process."""
+OVERHEAD_S = 3.5
+"""Duration of a measurement in seconds in addition to its record."""
+_BLOCK_RECORDS = 10_000
+"""Largest number of records that are read at once."""
+_SHORT_TARE_S = 0.2
+"""Duration in seconds of the tare, and of the return, in a measured session."""
 _NO_LIMIT = 1_000_000_000
+"""Limit of a number of ticks that no session reaches."""
 
 OnPoll = Callable[[], None]
+"""Type of a function that is called about ten times a second during a measurement."""
 
 
 class LoopError(FailureError):
-    """The loop could not be measured; the message states the reason."""
+    """A session in which the loop was to be measured failed; the message states the reason."""
 
 
-def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
-    """Return a profile without hardware, with the rate and spin time to measure.
+def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
+    """Return a profile of a simulated rig with the rate and the spin time to be measured.
 
     Everything is simulated in the control process. Late ticks are measured and do not end the
     session. Only the real-time settings of the given profile are used.
@@ -76,19 +81,19 @@ def rig_for(profile: Profile, rate_hz: float, spin_us: float) -> Profile:
         ),
         session=replace(
             profile.session,
-            tare_s=_TARE_S,
+            tare_s=_SHORT_TARE_S,
             rest_velocity_rad_s=inf,
             rest_torque_nm=inf,
             tare_drift_nm=inf,
-            return_s=_TARE_S,
+            return_s=_SHORT_TARE_S,
         ),
         realtime=replace(profile.realtime, spin_us=spin_us),
     )
 
 
 @contextmanager
-def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
-    """Start the processes of a rig; leaving the context ends them."""
+def connected_rig(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
+    """Start and connect the processes of a rig; they end when the context is left."""
     try:
         with ProcessGroup(live=live) as group, ExitStack() as connection:
             rig = Rig(profile, group=group)
@@ -102,9 +107,12 @@ def connected(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, Pr
 
 
 def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> LoopMeasurement:
-    """Measure the loop alone, with only a reader that empties the ring; raise LoopError."""
-    rate_hz, excitation = profile.rig.rate_hz, _excitation(profile, seconds)
-    with connected(profile) as (_, group):
+    """Measure the loop without a recorder, or raise LoopError.
+
+    This process only reads the samples from the ring buffer.
+    """
+    rate_hz, excitation = profile.rig.rate_hz, _hold_excitation(profile, seconds)
+    with connected_rig(profile) as (_, group):
         channels, shared_state = group.channels, group.channels.shared_state
         meter = UsageMeter(group.control.pid)
         shared_state[StateField.STOP] = Stop.NO
@@ -114,16 +122,16 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> L
         blocks = []
         finished = None
         while not isinstance(finished, Finished):
-            finished = group.control.poll(_POLL_S)
+            finished = group.control.poll(_POLL_TIMEOUT_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
             meter.sample(Phase(shared_state[StateField.PHASE]))
-            while block := channels.samples.take(_BLOCK):
+            while block := channels.samples.take(_BLOCK_RECORDS):
                 blocks.append(block)
             channels.controls.discard()
             channels.timings.discard()
             on_poll()
-    _require(finished.outcome, finished.reason)
-    return measurement(
+    _require_complete(finished.outcome, finished.reason)
+    return record_measurement(
         name,
         rate_hz,
         np.concatenate([decode_samples(block) for block in blocks]),
@@ -136,11 +144,14 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> L
 def run_session(
     name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
 ) -> LoopMeasurement:
-    """Measure a whole session, as ``rigd run``, with a temporary file; raise LoopError."""
-    excitation = _excitation(profile, seconds)
+    """Measure a complete session like that of ``rigd run``, or raise LoopError.
+
+    The session file is temporary.
+    """
+    excitation = _hold_excitation(profile, seconds)
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        connected(profile, live=live) as (rig, group),
+        connected_rig(profile, live=live) as (rig, group),
     ):
         order = Order(profile, excitation, Path(folder) / "bench.mcap")
         meter = UsageMeter(group.control.pid)
@@ -148,15 +159,15 @@ def run_session(
         if live:
             rig.show(order, stop)
 
-        def watch(progress: SessionProgress, _: object) -> None:
+        def on_progress(progress: SessionProgress, _: object) -> None:
             meter.sample(progress.phase)
             on_poll()
 
-        result = rig.run(order, stop, watch)
-        _require(result.outcome, result.reason)
+        result = rig.run(order, stop, on_progress)
+        _require_complete(result.outcome, result.reason)
         assert result.path is not None
         samples = read_session(result.path).samples
-    return measurement(
+    return record_measurement(
         name,
         profile.rig.rate_hz,
         samples,
@@ -168,19 +179,21 @@ def run_session(
 
 @contextmanager
 def busy_program(cores: set[int]) -> Iterator[int]:
-    """Run a busy program on some cores; yield its process id."""
-    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as stranger:
+    """Run a program that uses the given cores fully while the context lasts; yield its pid."""
+    with subprocess.Popen([sys.executable, "-c", "while True: pass"]) as busy_process:
         try:
-            os.sched_setaffinity(stranger.pid, cores)
-            yield stranger.pid
+            os.sched_setaffinity(busy_process.pid, cores)
+            yield busy_process.pid
         finally:
-            stranger.kill()
+            busy_process.kill()
 
 
-def _excitation(profile: Profile, seconds: float) -> Excitation:
+def _hold_excitation(profile: Profile, seconds: float) -> Excitation:
+    """Return a reference that holds the angle for some seconds."""
     return hold(rate_hz=profile.rig.rate_hz, duration_s=seconds, rest_s=0.0)
 
 
-def _require(outcome: str, reason: str) -> None:
+def _require_complete(outcome: str, reason: str) -> None:
+    """Raise LoopError unless the session is complete."""
     if outcome != "complete":
         raise LoopError(reason)

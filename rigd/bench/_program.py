@@ -1,4 +1,4 @@
-"""Series of measurements: their order, and the remaining time."""
+"""Series of latency measurements for ``rigd bench``, and their results."""
 
 import os
 import subprocess
@@ -8,102 +8,115 @@ from dataclasses import dataclass, field
 
 from rigd.bench import _cyclictest as cyclictest
 from rigd.bench import _loops as loops
-from rigd.bench.measure import HELD, LoopMeasurement, figures, pooled
+from rigd.bench.measure import HELD_FRACTION, LoopMeasurement, percentiles, pool_measurements
 from rigd.checks.machine import settings_granted
 from rigd.engine.realtime import REFUSED
 from rigd.profile import Profile
 
 ROUNDS = 3
-"""Alternating rounds of loop and cyclictest, because the load of the computer varies."""
-ALONE = "loop alone"
-RECORDED = "with recorder"
-SHOWN = "with recorder and live view"
-LOADED = "… and load on other cores"
+"""Number of alternating measurements of loop and cyclictest.
+
+They alternate because the load of the computer varies."""
+LOOP_ALONE = "loop alone"
+"""Name of the measurement without a recorder."""
+WITH_RECORDER = "with recorder"
+"""Name of the measurement of a session with a recorder."""
+WITH_LIVE_VIEW = "with recorder and live view"
+"""Name of the measurement of a session with recorder and live view."""
+WITH_LOAD = "… and load on other cores"
+"""Name of the measurement of a session with live view and a busy program on other cores."""
 HIGHEST_HZ = 16_000.0
+"""Highest rate of the search in Hz."""
 LOWEST_HZ = 100.0
+"""Lowest rate of the search in Hz."""
 
 OnProgress = Callable[[str, float], None]
-"""Receives the name of the present measurement and the approximate remaining time in s."""
+"""Type of a function that receives the present measurement's name and the remaining time in s."""
 
 
 @dataclass(slots=True)
 class Results:
-    """Results of all measurements."""
+    """Results of all measurements of ``rigd bench``."""
 
     profile: str
     """Name of the profile."""
     rate_hz: float
-    """Requested rate."""
+    """Requested rate of the loop."""
     seconds: float
-    """Length of each measurement."""
+    """Duration of each measurement."""
     spin_us: float
-    """Last part of each wait, spent polling the clock."""
+    """Time at the end of each wait in which the loop polls the clock instead of sleeping."""
     granted: dict[str, str]
-    """Value granted by the system for each real-time setting."""
+    """Value that the system granted for each real-time setting."""
     load_average: tuple[float, float, float]
     """Load average of this computer before the measurements."""
     rounds: list[tuple[LoopMeasurement, LoopMeasurement | None]] = field(default_factory=list)
-    """The loop alone, each followed by cyclictest."""
+    """Measurements of the loop alone, each with the following one of cyclictest."""
     sessions: list[LoopMeasurement] = field(default_factory=list)
-    """Sessions with the recorder and increasing load."""
+    """Measurements of sessions with the recorder and increasing load."""
     search: list[LoopMeasurement] = field(default_factory=list)
-    """Sessions at other rates, and the best one at this rate."""
+    """Measurements at other rates, preceded by the best one at the requested rate."""
     no_peer: str = ""
-    """Why there is no cyclictest."""
+    """Reason why there is no measurement with cyclictest, or an empty string."""
 
     @property
     def alone(self) -> LoopMeasurement:
-        """Pooled rounds of the loop."""
-        return pooled(ALONE, [ours for ours, _ in self.rounds])
+        """Measurements of the loop alone, pooled over the rounds."""
+        return pool_measurements(LOOP_ALONE, [loop for loop, _ in self.rounds])
 
     @property
     def peer(self) -> LoopMeasurement | None:
-        """Pooled rounds of cyclictest."""
-        theirs = [their for _, their in self.rounds if their is not None]
-        return pooled(cyclictest.NAME, theirs) if theirs else None
+        """Measurements with cyclictest, pooled over the rounds, or None if there are none."""
+        peers = [peer for _, peer in self.rounds if peer is not None]
+        return pool_measurements(cyclictest.NAME, peers) if peers else None
 
     @property
     def highest_rate_hz(self) -> float | None:
-        """Highest measured rate that held."""
-        held = [one.rate_hz for one in self.search if one.held >= HELD]
-        return max(held, default=None)
+        """Highest measured rate in Hz at which nearly all ticks ran in time, or None."""
+        held_rates = [
+            measured.rate_hz for measured in self.search if measured.held >= HELD_FRACTION
+        ]
+        return max(held_rates, default=None)
 
     @property
     def highest_rate_between_stalls_hz(self) -> float | None:
-        """Highest measured rate that held without the ticks during stalls."""
-        held = [one.rate_hz for one in self.search if _holds(one)]
-        return max(held, default=None)
+        """Highest rate in Hz at which nearly all ticks outside of stalls ran in time, or None."""
+        held_rates = [measured.rate_hz for measured in self.search if _holds(measured)]
+        return max(held_rates, default=None)
 
     def ratios(self) -> tuple[float, float] | None:
-        """Return the ratio of loop to cyclictest latency, p50 and p99: medians over the rounds."""
+        """Return the ratios of the loop's to cyclictest's wake-up latency, p50 and p99.
+
+        They are medians over the rounds, or None without cyclictest.
+        """
         pairs = [
-            (figures(ours.lateness_us), figures(their.lateness_us))
-            for ours, their in self.rounds
-            if their is not None
+            (percentiles(loop.lateness_us), percentiles(peer.lateness_us))
+            for loop, peer in self.rounds
+            if peer is not None
         ]
         if not pairs:
             return None
         return (
-            _median([ours.p50 / max(their.p50, 1.0) for ours, their in pairs]),
-            _median([ours.p99 / max(their.p99, 1.0) for ours, their in pairs]),
+            _median([loop.p50 / max(peer.p50, 1.0) for loop, peer in pairs]),
+            _median([loop.p99 / max(peer.p99, 1.0) for loop, peer in pairs]),
         )
 
 
 class Bench:
-    """Series of measurements for one profile.
+    """Runs the series of latency measurements with the real-time settings of a profile.
 
     Parameters
     ----------
     profile
-        Profile with the real-time settings. Its hardware is not used.
+        Profile with the real-time settings; its hardware is not used.
     rate_hz
         Rate of the loop.
     seconds
         Duration of each measurement.
     spin_us
-        Last part of each wait, spent polling the clock.
+        Time at the end of each wait in which the loop polls the clock instead of sleeping.
     on_progress
-        Receives the progress about ten times a second.
+        Function that receives the progress about ten times a second.
     """
 
     def __init__(
@@ -120,12 +133,12 @@ class Bench:
         self._seconds = seconds
         self._spin_us = spin_us
         self._on_progress = on_progress
-        self._left_s = (2 * ROUNDS + 5) * (seconds + loops.AROUND_S)
-        self._what = ""
-        self._ends_s = 0.0
+        self._remaining_s = (2 * ROUNDS + 5) * (seconds + loops.OVERHEAD_S)
+        self._present_name = ""
+        self._present_end_s = 0.0
 
     def run(self) -> Results:
-        """Run all measurements.
+        """Run all measurements, and return their results.
 
         Raises
         ------
@@ -137,7 +150,7 @@ class Bench:
             self._rate_hz,
             self._seconds,
             self._spin_us,
-            self._granted(),
+            self._granted_settings(),
             os.getloadavg(),
         )
         self.alternate(results)
@@ -146,66 +159,70 @@ class Bench:
         return results
 
     def alternate(self, results: Results) -> None:
-        """Measure the loop alone and cyclictest, in turn."""
+        """Measure the loop alone and cyclictest in turn, and add the results."""
         for _ in range(ROUNDS):
-            ours = self._alone()
-            results.rounds.append((ours, self._peer(results)))
+            loop = self._measure_loop_alone()
+            results.rounds.append((loop, self._measure_cyclictest(results)))
 
     def run_sessions(self, results: Results) -> None:
-        """Measure whole sessions, with increasing load in addition to the loop."""
-        results.sessions.append(self.session(RECORDED))
-        results.sessions.append(self.session(SHOWN, live=True))
+        """Measure complete sessions with increasing additional load, and add the results."""
+        results.sessions.append(self.session(WITH_RECORDER))
+        results.sessions.append(self.session(WITH_LIVE_VIEW, live=True))
         with loops.busy_program(cores_without_loop(results.granted)):
-            results.sessions.append(self.session(LOADED, live=True))
+            results.sessions.append(self.session(WITH_LOAD, live=True))
 
     def search(self, results: Results) -> None:
-        """Search the highest rate that holds, in factors of 2 upwards or downwards.
+        """Search for the highest rate that the loop holds, in factors of 2, and add the results.
 
         Stalls are ignored, because they affect every rate. The best of several attempts counts,
         because other programs only degrade the result.
         """
-        results.search.append(max(results.sessions, key=_merit))
-        up = _holds(results.search[0])
+        results.search.append(max(results.sessions, key=_sort_key))
+        upwards = _holds(results.search[0])
         rate_hz = self._rate_hz
         while True:
-            rate_hz = rate_hz * 2.0 if up else rate_hz / 2.0
+            rate_hz = rate_hz * 2.0 if upwards else rate_hz / 2.0
             if not LOWEST_HZ <= rate_hz <= HIGHEST_HZ:
                 return
-            tried = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
-            if tried.held < HELD:
-                tried = max(tried, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_merit)
-            results.search.append(tried)
-            if _holds(tried) is not up:
+            attempt = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
+            if attempt.held < HELD_FRACTION:
+                attempt = max(
+                    attempt, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
+                )
+            results.search.append(attempt)
+            if _holds(attempt) is not upwards:
                 return
 
     def session(
         self, name: str, *, rate_hz: float | None = None, live: bool = False
     ) -> LoopMeasurement:
-        """Measure a whole session, by default at the rate of the bench.
+        """Measure a complete session.
 
         Parameters
         ----------
         name
-            Name in the results.
+            Name of the measurement.
         rate_hz
-            Rate of the loop, by default the bench's.
+            Rate of the loop, or None for that of the series.
         live
-            Run with the live view.
+            Whether the session is shown in a live view.
         """
         rate_hz = rate_hz or self._rate_hz
-        self._begin(name)
-        profile = loops.rig_for(self._profile, rate_hz, self._spin_us)
+        self._register_start(name)
+        profile = loops.simulated_profile(self._profile, rate_hz, self._spin_us)
         return loops.run_session(name, profile, self._seconds, self._show_progress, live=live)
 
-    def _alone(self) -> LoopMeasurement:
-        self._begin(ALONE)
-        profile = loops.rig_for(self._profile, self._rate_hz, self._spin_us)
-        return loops.run_alone(ALONE, profile, self._seconds, self._show_progress)
+    def _measure_loop_alone(self) -> LoopMeasurement:
+        """Measure the loop without a recorder."""
+        self._register_start(LOOP_ALONE)
+        profile = loops.simulated_profile(self._profile, self._rate_hz, self._spin_us)
+        return loops.run_alone(LOOP_ALONE, profile, self._seconds, self._show_progress)
 
-    def _peer(self, results: Results) -> LoopMeasurement | None:
-        self._begin(cyclictest.NAME)
+    def _measure_cyclictest(self, results: Results) -> LoopMeasurement | None:
+        """Measure with cyclictest, or return None and state the reason in the results."""
+        self._register_start(cyclictest.NAME)
         self._show_progress()
-        if not cyclictest.installed():
+        if not cyclictest.is_installed():
             results.no_peer = "not installed (package rt-tests)"
             return None
         scheduled = not results.granted.get("scheduling", REFUSED).startswith(REFUSED)
@@ -213,50 +230,64 @@ class Bench:
             return cyclictest.run(
                 self._rate_hz,
                 self._seconds,
-                cpu=core_of(results.granted),
+                cpu=loop_core(results.granted),
                 priority=self._profile.realtime.priority if scheduled else 0,
             )
         except cyclictest.CyclictestError as error:
             results.no_peer = str(error)
             return None
 
-    def _granted(self) -> dict[str, str]:
+    def _granted_settings(self) -> dict[str, str]:
+        """Return the real-time settings that the system grants, or raise LoopError."""
         try:
             return settings_granted(self._profile.realtime)
         except (OSError, subprocess.SubprocessError, ValueError) as error:
             raise loops.LoopError(f"The real-time settings cannot be tried ({error}).") from error
 
-    def _begin(self, what: str) -> None:
-        self._what = what
-        duration_s = self._seconds + loops.AROUND_S
-        self._left_s = max(0.0, self._left_s - duration_s)
-        self._ends_s = time.monotonic() + duration_s
+    def _register_start(self, name: str) -> None:
+        """Register the start of a measurement for the progress."""
+        self._present_name = name
+        duration_s = self._seconds + loops.OVERHEAD_S
+        self._remaining_s = max(0.0, self._remaining_s - duration_s)
+        self._present_end_s = time.monotonic() + duration_s
 
     def _show_progress(self) -> None:
-        self._on_progress(self._what, self._left_s + max(0.0, self._ends_s - time.monotonic()))
+        """Report the present measurement and the remaining time of the series."""
+        self._on_progress(
+            self._present_name, self._remaining_s + max(0.0, self._present_end_s - time.monotonic())
+        )
 
 
-def core_of(granted: dict[str, str]) -> int:
-    """Return the core of the loop."""
+def loop_core(granted: dict[str, str]) -> int:
+    """Return the number of the processor core on which the loop runs.
+
+    `granted` has the granted real-time settings by name.
+    """
     text = granted["cpu"]
     return max(os.sched_getaffinity(0)) if text.startswith(REFUSED) else int(text.split(",")[0])
 
 
 def cores_without_loop(granted: dict[str, str]) -> set[int]:
-    """Return the cores without the loop; all cores if there is only one."""
+    """Return the processor cores on which the loop does not run, or all cores if there is only one.
+
+    `granted` has the granted real-time settings by name.
+    """
     allowed = os.sched_getaffinity(0)
-    return allowed - {core_of(granted)} or allowed
+    return allowed - {loop_core(granted)} or allowed
 
 
-def _merit(one: LoopMeasurement) -> tuple[bool, float]:
-    return one.held >= HELD, one.held_between_stalls
+def _sort_key(measured: LoopMeasurement) -> tuple[bool, float]:
+    """Return the sort key that is largest for the best measurement at a rate."""
+    return measured.held >= HELD_FRACTION, measured.held_between_stalls
 
 
-def _holds(one: LoopMeasurement) -> bool:
-    return one.held_between_stalls >= HELD
+def _holds(measured: LoopMeasurement) -> bool:
+    """Return whether nearly all ticks outside of stalls ran within their periods."""
+    return measured.held_between_stalls >= HELD_FRACTION
 
 
 def _median(values: list[float]) -> float:
+    """Return the median of at least one value."""
     ordered = sorted(values)
     half = len(ordered) // 2
     return ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2

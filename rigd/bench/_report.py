@@ -8,19 +8,25 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.bench._program import Results
-from rigd.bench.measure import HELD, STALL_US, LoopMeasurement, figures
+from rigd.bench.measure import HELD_FRACTION, STALL_US, LoopMeasurement, percentiles
 from rigd.engine.realtime import REFUSED
 
-_NAME = 28
+_NAME_WIDTH = 28
+"""Width of the column with the measurements' names, in characters."""
 
 
 def report_lines(results: Results) -> Iterator[str]:
-    """Yield the lines of the report.
+    """Yield the lines of the report on all measurements.
 
     Parameters
     ----------
     results
         Results with at least one round, one session, and a search.
+
+    Yields
+    ------
+    str
+        Line of text.
     """
     spin = f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
     yield (
@@ -34,12 +40,12 @@ def report_lines(results: Results) -> Iterator[str]:
     )
     yield f"Load of this computer before: {results.load_average[0]:.2f}."
     yield ""
-    yield from _table(_rows(results))
+    yield from _latency_table(_measurements(results))
     yield ""
     yield from _peer_lines(results)
     yield ""
     yield "Wake-up latency:"
-    columns = [(one.name, one.lateness_us) for one in _rows(results)[:2]]
+    columns = [(each.name, each.lateness_us) for each in _measurements(results)[:2]]
     yield from histogram_lines(columns)
     yield ""
     yield "Rates, with recorder:"
@@ -49,27 +55,30 @@ def report_lines(results: Results) -> Iterator[str]:
 
 
 def verdict(results: Results) -> str:
-    """Return a sentence on the rate that this computer can hold, and its limitation."""
-    highest_hz, between_hz = results.highest_rate_hz, results.highest_rate_between_stalls_hz
-    enough = f"{100 * HELD:g} % of the ticks or more"
+    """Return sentences on the rate that this computer can hold, and on what limits it."""
+    highest_hz, between_stalls_hz = (
+        results.highest_rate_hz,
+        results.highest_rate_between_stalls_hz,
+    )
+    criterion = f"{100 * HELD_FRACTION:g} % of the ticks or more"
     if highest_hz is not None:
-        text = f"This computer holds {highest_hz:g} Hz: {enough}."
+        text = f"This computer holds {highest_hz:g} Hz: {criterion}."
     else:
-        best = max(results.search, key=lambda one: one.held)
+        best_measurement = max(results.search, key=lambda each: each.held)
         text = (
-            f"This computer holds none of these rates: {best.rate_hz:g} Hz came nearest, with "
-            f"{100 * best.held:.2f} % of the ticks."
+            f"This computer holds none of these rates: {best_measurement.rate_hz:g} Hz came "
+            f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
         )
-    if between_hz is not None and between_hz != highest_hz:
+    if between_stalls_hz is not None and between_stalls_hz != highest_hz:
         text += (
             f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
-            f"hold {between_hz:g} Hz."
+            f"hold {between_stalls_hz:g} Hz."
         )
     refused = [name for name, text in results.granted.items() if text.startswith(REFUSED)]
     if refused:
         text += f" Not granted: {', '.join(refused).replace('_', ' ')}; rigd check says how."
     peer = results.peer
-    if peer is not None and peer.held < HELD:
+    if peer is not None and peer.held < HELD_FRACTION:
         text += (
             f" cyclictest alone would have missed {100 * (1 - peer.held):.2f} % at "
             f"{peer.rate_hz:g} Hz: this is due to the computer itself."
@@ -78,7 +87,7 @@ def verdict(results: Results) -> str:
 
 
 def as_json(results: Results) -> dict[str, object]:
-    """Return the results for a JSON document."""
+    """Return the results as a JSON document."""
     ratios = results.ratios()
     return {
         "profile": results.profile,
@@ -88,63 +97,67 @@ def as_json(results: Results) -> dict[str, object]:
         "realtime": results.granted,
         "load_average": list(results.load_average),
         "rounds": [
-            {"loop": _as_dict(ours), "cyclictest": None if their is None else _as_dict(their)}
-            for ours, their in results.rounds
+            {"loop": _as_dict(loop), "cyclictest": None if peer is None else _as_dict(peer)}
+            for loop, peer in results.rounds
         ],
         "ratio_to_cyclictest": None if ratios is None else {"p50": ratios[0], "p99": ratios[1]},
         "no_cyclictest": results.no_peer,
-        "sessions": [_as_dict(one) for one in results.sessions],
-        "rates": [_as_dict(one) for one in results.search],
+        "sessions": [_as_dict(each) for each in results.sessions],
+        "rates": [_as_dict(each) for each in results.search],
         "highest_rate_hz": results.highest_rate_hz,
         "highest_rate_between_stalls_hz": results.highest_rate_between_stalls_hz,
         "verdict": verdict(results),
     }
 
 
-def _rows(results: Results) -> list[LoopMeasurement]:
+def _measurements(results: Results) -> list[LoopMeasurement]:
+    """Return the measurements in the order of the report's table."""
     peer = results.peer
     return [results.alone, *([] if peer is None else [peer]), *results.sessions]
 
 
-def _table(rows: list[LoopMeasurement]) -> Iterator[str]:
+def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
+    """Yield the lines of the table of latencies."""
     yield (
-        f"{'':{_NAME}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
+        f"{'':{_NAME_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
         f"{'CPU':>5}  faults"
     )
     yield (
-        f"{'':{_NAME}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
+        f"{'':{_NAME_WIDTH}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
         f"{'p50':>8}{'p99':>8}   {'%':>7}  {'%':>5}"
     )
-    for one in rows:
-        late = figures(one.lateness_us)
-        numbers = (late.p50, late.p90, late.p99, late.p999, late.largest)
-        text = f"{one.name:{_NAME}}" + "".join(f"{number:8.0f}" for number in numbers)
-        if one.work_us.size:
-            work = figures(one.work_us)
-            text += f"   {work.p50:8.0f}{work.p99:8.0f}"
+    for each in rows:
+        latency = percentiles(each.lateness_us)
+        numbers = (latency.p50, latency.p90, latency.p99, latency.p999, latency.largest)
+        text = f"{each.name:{_NAME_WIDTH}}" + "".join(f"{number:8.0f}" for number in numbers)
+        if each.work_us.size:
+            execution = percentiles(each.work_us)
+            text += f"   {execution.p50:8.0f}{execution.p99:8.0f}"
         else:
             text += " " * 19
-        text += f"   {100 * (1 - one.held):7.3f}"
-        if one.cpu_percent is not None and one.page_faults is not None:
-            text += f"  {one.cpu_percent:5.1f}  {one.page_faults:6d}"
+        text += f"   {100 * (1 - each.held):7.3f}"
+        if each.cpu_percent is not None and each.page_faults is not None:
+            text += f"  {each.cpu_percent:5.1f}  {each.page_faults:6d}"
         yield text
 
 
 def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
+    """Yield the lines of the table of rates."""
     yield (
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
-    for one in sorted(search, key=lambda one: one.rate_hz):
-        cpu = "" if one.cpu_percent is None else f"{one.cpu_percent:8.1f}"
+    for each in sorted(search, key=lambda each: each.rate_hz):
+        cpu = "" if each.cpu_percent is None else f"{each.cpu_percent:8.1f}"
         yield (
-            f"{one.rate_hz:7.0f} Hz{100 * one.held:9.3f}{100 * one.held_between_stalls:12.3f}"
-            f"{one.stalls:8d}{figures(one.lateness_us).p99:14.0f}"
-            f"{figures(one.work_us).p99:14.0f}{cpu}"
+            f"{each.rate_hz:7.0f} Hz{100 * each.held:9.3f}{100 * each.held_between_stalls:12.3f}"
+            f"{each.stalls:8d}{percentiles(each.lateness_us).p99:14.0f}"
+            f"{percentiles(each.work_us).p99:14.0f}{cpu}"
         )
 
 
 def _peer_lines(results: Results) -> Iterator[str]:
+    """Yield the line that compares the loop with cyclictest."""
     ratios = results.ratios()
     if ratios is None:
         yield f"No cyclictest to compare with: {results.no_peer}."
@@ -155,75 +168,92 @@ def _peer_lines(results: Results) -> Iterator[str]:
     )
 
 
-def _as_dict(one: LoopMeasurement) -> dict[str, object]:
+def _as_dict(each: LoopMeasurement) -> dict[str, object]:
+    """Return a measurement as a JSON object."""
     return {
-        "name": one.name,
-        "rate_hz": one.rate_hz,
-        "scheduled": one.scheduled,
-        "missed": one.missed,
-        "held": one.held,
-        "held_between_stalls": one.held_between_stalls,
-        "stalls": one.stalls,
-        "lateness_us": _figures(one.lateness_us),
-        "work_us": _figures(one.work_us) if one.work_us.size else None,
-        "cpu_percent": one.cpu_percent,
-        "page_faults": one.page_faults,
+        "name": each.name,
+        "rate_hz": each.rate_hz,
+        "scheduled": each.scheduled,
+        "missed": each.missed,
+        "held": each.held,
+        "held_between_stalls": each.held_between_stalls,
+        "stalls": each.stalls,
+        "lateness_us": _percentiles_object(each.lateness_us),
+        "work_us": _percentiles_object(each.work_us) if each.work_us.size else None,
+        "cpu_percent": each.cpu_percent,
+        "page_faults": each.page_faults,
         "histogram_us": dict(
-            zip((f"{edge:g}" for edge in edges_us()), counts_of(one.lateness_us), strict=True)
+            zip((f"{edge:g}" for edge in edges_us()), counts_of(each.lateness_us), strict=True)
         ),
     }
 
 
-def _figures(values: npt.NDArray[np.float64]) -> dict[str, float]:
-    return asdict(figures(values))
+def _percentiles_object(values: npt.NDArray[np.float64]) -> dict[str, float]:
+    """Return the percentiles of some values as a JSON object."""
+    return asdict(percentiles(values))
 
 
 # Histogram
 
 _FIRST_US, _LAST_US = 1.0, 100_000.0
-_STEPS = (1.0, 2.0, 5.0)
-_LABEL = 18
-_WIDTH = 20
-_FULL = "█"
+"""Lowest edge above 0 and highest edge of the histogram's bins, in µs."""
+_DECADE_STEPS = (1.0, 2.0, 5.0)
+"""Edges of the histogram's bins within a decade, relative to the beginning of the decade."""
+_LABEL_WIDTH = 18
+"""Width of the bins' labels in characters."""
+_BAR_WIDTH = 20
+"""Width of the longest bar in characters."""
+_BAR_CHARACTER = "█"
+"""Character of which bars consist."""
 
 
 def edges_us() -> list[float]:
-    """Return the edges of the bins: 0, 1, 2, 5, 10, … µs; the last bin is open."""
+    """Return the lower edges of the histogram's bins in µs.
+
+    They are 0, 1, 2, 5, 10, …, 100 000; the last bin has no upper edge.
+    """
     decades = round(log10(_LAST_US / _FIRST_US))
-    return [0.0, *(s * 10.0**d for d in range(decades) for s in _STEPS), _LAST_US]
+    return [0.0, *(s * 10.0**d for d in range(decades) for s in _DECADE_STEPS), _LAST_US]
 
 
 def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
-    """Return the number of delays in each bin."""
-    found = np.searchsorted(edges_us(), delays_us, side="right") - 1
-    counts: list[int] = np.bincount(found, minlength=len(edges_us())).tolist()
+    """Return the number of delays in each bin of the histogram."""
+    bin_indices = np.searchsorted(edges_us(), delays_us, side="right") - 1
+    counts: list[int] = np.bincount(bin_indices, minlength=len(edges_us())).tolist()
     return counts
 
 
 def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
-    """Return the lines of histograms of several series of delays in µs, side by side.
+    """Return the lines of text with the histograms of several series of delays, side by side.
 
-    The length of a bar is the logarithm of its count, so that rare delays are visible.
+    `columns` has a name and the delays in µs of each series. The length of a bar is proportional to
+    the logarithm of its count, so that rare delays are visible.
     """
-    counted = [counts_of(delays_us) for _, delays_us in columns]
-    used = [index for index in range(len(edges_us())) if any(counts[index] for counts in counted)]
-    if not used:
+    bin_counts = [counts_of(delays_us) for _, delays_us in columns]
+    used_bins = [
+        index for index in range(len(edges_us())) if any(counts[index] for counts in bin_counts)
+    ]
+    if not used_bins:
         return []
-    longest = max(max(counts) for counts in counted)
-    header = " " * (_LABEL + 3) + "".join(f"{name:<{_WIDTH + 9}}" for name, _ in columns)
+    longest = max(max(counts) for counts in bin_counts)
+    header = " " * (_LABEL_WIDTH + 3) + "".join(f"{name:<{_BAR_WIDTH + 9}}" for name, _ in columns)
     lines = [header.rstrip()]
-    for index in range(used[0], used[-1] + 1):
-        bars = (f"{_bar(counts[index], longest)}{counts[index]:>7}  " for counts in counted)
-        lines.append(f"{_label(index):>{_LABEL}}   {''.join(bars)}".rstrip())
+    for index in range(used_bins[0], used_bins[-1] + 1):
+        bars = (
+            f"{_histogram_bar(counts[index], longest)}{counts[index]:>7}  " for counts in bin_counts
+        )
+        lines.append(f"{_bin_label(index):>{_LABEL_WIDTH}}   {''.join(bars)}".rstrip())
     return lines
 
 
-def _bar(count: int, longest: int) -> str:
-    length = round((_WIDTH - 1) * log10(1 + count) / log10(1 + longest))
-    return f"{_FULL * max(length, int(count > 0)):<{_WIDTH}}"
+def _histogram_bar(count: int, longest: int) -> str:
+    """Return the bar of a bin; `longest` is the count of the longest bar."""
+    length = round((_BAR_WIDTH - 1) * log10(1 + count) / log10(1 + longest))
+    return f"{_BAR_CHARACTER * max(length, int(count > 0)):<{_BAR_WIDTH}}"
 
 
-def _label(index: int) -> str:
+def _bin_label(index: int) -> str:
+    """Return the label of a bin with its edges."""
     edges = edges_us()
     if index + 1 == len(edges):
         return f"{edges[index]:.0f} µs and more"

@@ -1,4 +1,4 @@
-"""One measurement of the loop: latency percentiles and processor time."""
+"""Results of a measurement of the loop: latency percentiles and processor time."""
 
 import time
 from dataclasses import dataclass
@@ -9,25 +9,26 @@ import numpy.typing as npt
 
 from rigd.engine.shared_state import Phase
 
-HELD = 0.999
-"""Fraction of ticks that must run within their periods for a rate to hold."""
+HELD_FRACTION = 0.999
+"""Smallest fraction of ticks that must run within their periods so that the loop holds a rate."""
 STALL_US = 2000.0
-"""Latency above which neither the loop nor the rate is the cause, but firmware or the host of a
-virtual machine."""
+"""Wake-up latency in µs from which a delay counts as a stall.
+
+Firmware or the host of a virtual machine causes such delays, not the loop or its rate."""
 
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Processor time and page faults since the start of a process."""
+    """Processor time and page faults of a process since its start."""
 
     cpu_s: float
-    """Processor time, s."""
+    """Processor time that the process has used."""
     page_faults: int
-    """Page faults, including those that wait for a disk."""
+    """Number of page faults, including those that wait for a disk."""
 
 
-def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
-    """Return the usage of a process with one thread so far.
+def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
+    """Return the processor time and page faults of a process with one thread since its start.
 
     The statistics of the scheduler count nanoseconds. The usual ones sample the running process at
     each scheduler tick, and can miss a loop that is synchronous with these ticks.
@@ -35,28 +36,28 @@ def usage_of(pid: int, proc: Path = Path("/proc")) -> Usage:
     Parameters
     ----------
     pid
-        Number of the process.
+        Process id.
     proc
-        Process table of the kernel.
+        Folder with the kernel's process table.
 
     Raises
     ------
     OSError
         If the process has ended.
     """
-    # The name, in brackets, may contain any character.
+    # The process's name, in brackets, may contain any character.
     fields = (proc / str(pid) / "stat").read_text().rpartition(")")[2].split()
     cpu_ns = int((proc / str(pid) / "schedstat").read_text().split()[0])
     return Usage(cpu_ns * 1e-9, int(fields[7]) + int(fields[9]))
 
 
 class UsageMeter:
-    """Meter of the usage of the control process during a running record.
+    """Measures the processor time and page faults of the control process during a record.
 
     Parameters
     ----------
     pid
-        Process identifier.
+        Process id of the control process.
     """
 
     def __init__(self, pid: int) -> None:
@@ -64,17 +65,17 @@ class UsageMeter:
         self._readings: list[tuple[float, Usage]] = []
 
     def sample(self, phase: Phase) -> None:
-        """Read the usage if the record is running."""
+        """Read the processor time and page faults so far, if the session's record is running."""
         if phase == Phase.RUNNING:
             try:
-                usage = usage_of(self._pid)
+                usage = process_usage(self._pid)
             except OSError:
                 return  # this kernel has no such statistics
             self._readings = [*self._readings[:1], (time.monotonic(), usage)]
 
     @property
     def cpu_percent(self) -> float | None:
-        """Load of a core in percent; None with fewer than two readings."""
+        """Load of a processor core by the process in percent, or None before two readings."""
         if len(self._readings) < 2:
             return None
         (begin_s, first), (end_s, last) = self._readings
@@ -82,48 +83,48 @@ class UsageMeter:
 
     @property
     def page_faults(self) -> int | None:
-        """Page faults between the first and the last reading; None with fewer than two."""
+        """Number of page faults from first to last reading, or None before two readings."""
         if len(self._readings) < 2:
             return None
         return self._readings[1][1].page_faults - self._readings[0][1].page_faults
 
 
 @dataclass(frozen=True, slots=True)
-class Figures:
-    """Percentiles, in µs."""
+class LatencyPercentiles:
+    """Percentiles of a series of delays in µs."""
 
     p50: float
-    """Median."""
+    """Median of the delays in µs."""
     p90: float
-    """90th percentile."""
+    """90th percentile of the delays in µs."""
     p99: float
-    """99th percentile."""
+    """99th percentile of the delays in µs."""
     p999: float
-    """99.9th percentile."""
+    """99.9th percentile of the delays in µs."""
     largest: float
-    """Maximum."""
+    """Largest delay in µs."""
 
 
 @dataclass(frozen=True, slots=True)
 class LoopMeasurement:
-    """LoopMeasurement of one loop for some seconds."""
+    """Wake-up latencies, execution times and missed ticks of a loop, measured for some seconds."""
 
     name: str
-    """Name of the measurement, with the load."""
+    """Name of the measurement, which states the load."""
     rate_hz: float
     """Rate of the loop."""
     lateness_us: npt.NDArray[np.float64]
-    """Wake-up latency of every tick that was run, (n,)."""
+    """Wake-up latency of every tick that was run, shape (n,)."""
     work_us: npt.NDArray[np.float64]
-    """Execution time from the wake-up to the end of the work, (n,); empty without work."""
+    """Execution time of every tick, shape (n,), or an empty array if the loop did no work."""
     scheduled: int
-    """Ticks that were due."""
+    """Number of scheduled ticks."""
     missed: int
-    """Ticks that were skipped."""
+    """Number of missed ticks."""
     cpu_percent: float | None = None
-    """Load of one core by the process of the loop."""
+    """Load of one core by the loop's process in percent, or None if it was not measured."""
     page_faults: int | None = None
-    """Page faults of the loop's process; None: not counted."""
+    """Number of page faults of the loop's process, or None if they were not counted."""
 
     @property
     def held(self) -> float:
@@ -132,29 +133,29 @@ class LoopMeasurement:
 
     @property
     def held_between_stalls(self) -> float:
-        """The same fraction without the ticks during stalls."""
+        """Fraction of scheduled ticks outside of stalls that were run within their periods."""
         stalls_us = self.lateness_us[self.lateness_us >= STALL_US]
-        passed = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
-        return 1.0 - (self.missed - passed) / (self.scheduled - passed)
+        stalled_ticks = min(self.missed, int(np.floor(stalls_us * (self.rate_hz * 1e-6)).sum()))
+        return 1.0 - (self.missed - stalled_ticks) / (self.scheduled - stalled_ticks)
 
     @property
     def stalls(self) -> int:
-        """Number of stalls."""
+        """Number of wake-up latencies of at least `STALL_US`."""
         return int(np.count_nonzero(self.lateness_us >= STALL_US))
 
 
-def figures(values_us: npt.NDArray[np.float64]) -> Figures:
-    """Return the percentiles of at least one value.
+def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
+    """Return the percentiles of one or more delays in µs.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.bench.measure import figures
-    >>> found = figures(np.arange(101.0))
+    >>> from rigd.bench.measure import percentiles
+    >>> found = percentiles(np.arange(101.0))
     >>> found.p50, found.p99, found.largest
     (50.0, 99.0, 100.0)
     """
-    return Figures(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
+    return LatencyPercentiles(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
 
 
 def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
@@ -166,17 +167,17 @@ def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np
     Parameters
     ----------
     samples
-        Recorded samples, without lost ones.
+        Recorded samples, without those that the recorder lost.
     rate_hz
-        Ticks a second.
+        Loop rate in ticks per second.
     """
     ticks: npt.NDArray[np.int64] = samples["tick"].astype(np.int64)
     missed = np.diff(ticks, prepend=-1) - 1
-    late_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
-    return late_us
+    latency_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
+    return latency_us
 
 
-def measurement(
+def record_measurement(
     name: str,
     rate_hz: float,
     samples: npt.NDArray[np.void],
@@ -185,18 +186,18 @@ def measurement(
     cpu_percent: float | None,
     page_faults: int | None,
 ) -> LoopMeasurement:
-    """Return the measurement from the samples of a record.
+    """Return the measurement of a loop from the samples of its record.
 
     Parameters
     ----------
     name
         Name of the measurement.
     rate_hz
-        Ticks a second.
+        Loop rate in ticks per second.
     samples
         Samples of the record; ticks without a sample were missed.
     scheduled
-        Ticks of the record.
+        Number of scheduled ticks.
     cpu_percent, page_faults
         Processor load and page faults of the control process.
     """
@@ -212,8 +213,8 @@ def measurement(
     )
 
 
-def pooled(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
-    """Return the pooled measurement of several measurements of the same loop.
+def pool_measurements(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
+    """Combine several measurements of the same loop into one.
 
     Parameters
     ----------
@@ -222,7 +223,7 @@ def pooled(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
     parts
         Measurements at one rate, at least one.
     """
-    costs = [part.cpu_percent for part in parts if part.cpu_percent is not None]
+    cpu_loads = [part.cpu_percent for part in parts if part.cpu_percent is not None]
     faults = [part.page_faults for part in parts if part.page_faults is not None]
     return LoopMeasurement(
         name,
@@ -231,6 +232,6 @@ def pooled(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
         np.concatenate([part.work_us for part in parts]),
         sum(part.scheduled for part in parts),
         sum(part.missed for part in parts),
-        sum(costs) / len(costs) if costs else None,
+        sum(cpu_loads) / len(cpu_loads) if cpu_loads else None,
         sum(faults) if faults else None,
     )

@@ -1,4 +1,7 @@
-"""The whole check of a rig, in the order in which one thing rules out the next."""
+"""Complete check of a rig: on paper, this computer, then the devices.
+
+The order matters: a failure on paper can rule out that devices are connected.
+"""
 
 from collections.abc import Iterator, Mapping
 from typing import Any
@@ -15,10 +18,11 @@ from rigd.runner.planning import RigPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[CheckRow]:
-    """Check the rig of a profile without a torque: on paper, this computer, then the devices.
+    """Run all checks of a rig that need no torque, and return their rows.
 
-    If identifiers collide or the bus load is too high, nothing is connected, because devices might
-    obey frames for others; nor if a value of the profile is unknown.
+    The devices are not connected if identifiers collide or the bus load is too high, because
+    devices might obey frames for others. They are not connected either if a value of the profile is
+    unknown.
     """
     rows = _rows_without_devices(profile)
     if any(row.verdict is CheckResult.FAIL for row in wiring_rows(profile.rig)):
@@ -33,14 +37,20 @@ def check_rig(profile: Profile) -> list[CheckRow]:
 def check_without_devices(
     profile: Profile, calibration: Mapping[str, Any] | None
 ) -> list[CheckRow]:
-    """Check the rig of a profile while a daemon uses its devices, which are not polled.
+    """Run the checks that need no devices, for a rig whose devices a daemon uses.
 
     Parameters
     ----------
     profile
         Rig to check.
     calibration
-        Calibration that the sensor reported when the daemon connected it; None: not connected.
+        Calibration that the sensor reported when the daemon connected it, or None if it is not
+        connected.
+
+    Returns
+    -------
+    list of CheckRow
+        Rows of the checks on paper, of this computer, and of the calibration.
     """
     rows = _rows_without_devices(profile)
     if calibration is None:
@@ -50,6 +60,7 @@ def check_without_devices(
 
 
 def _rows_without_devices(profile: Profile) -> list[CheckRow]:
+    """Return the rows of all checks of a profile and this computer that need no devices."""
     return [
         *paper_rows(profile),
         *default_session_rows(profile),
@@ -59,9 +70,9 @@ def _rows_without_devices(profile: Profile) -> list[CheckRow]:
 
 
 def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Check whether `rigd run chirp` without options stays within the limits of the profile.
+    """Yield the row on whether `rigd run chirp` without options stays within the profile's limits.
 
-    Advice, since another session may: a hold moves nothing.
+    It is at most a warning, since other sessions may stay within the limits: a hold moves nothing.
     """
     try:
         chirp = excitation_for(profile, "chirp", {})

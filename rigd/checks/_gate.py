@@ -1,7 +1,7 @@
-"""Checks on paper, in one table: `rigd check` shows their rows, and every session asks for them.
+"""Table of the checks on paper, which `rigd check` shows and every session requires.
 
-What fails here refuses a session, wherever it is started, unless the operator accepts that row by
-its name. A new check is a function that yields rows, and an entry of `PAPER_CHECKS`.
+If one of them fails, no session is started, unless the operator accepts the failed row by its name.
+A new check is a function that yields rows, and an entry of `PAPER_CHECKS`.
 """
 
 from collections.abc import Callable, Iterator, Sequence
@@ -16,14 +16,14 @@ from rigd.profile import Profile
 
 
 class CheckFailedError(FailureError):
-    """The checks on paper fail; the message names the rows, and how to accept them.
+    """Checks on paper have failed; the message names the rows, and how to accept them.
 
     Parameters
     ----------
     message
-        A sentence or two for each row, for the operator.
+        One or two sentences for each failed row, for the operator.
     wrong_use
-        No session can be run with this profile, whatever the operator accepts.
+        Whether no session can be run with this profile, whatever the operator accepts.
     """
 
     def __init__(self, message: str, *, wrong_use: bool = False) -> None:
@@ -32,7 +32,7 @@ class CheckFailedError(FailureError):
 
 
 class UnknownRowError(UserError):
-    """A row is to be accepted that no check on paper has; the message lists those there are."""
+    """The operator accepts a row that no check on paper has; the message lists the valid names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,85 +40,89 @@ class PaperCheck:
     """One check that needs no device."""
 
     rows: Callable[[Profile], Iterator[CheckRow]]
-    """Function that makes its rows; those that can fail have a name."""
+    """Function that yields the rows of the check; rows that can fail have a name."""
     names: tuple[str, ...] = ()
-    """Names of the rows that can fail; none: it gives advice only and refuses no session."""
+    """Names of the rows that can fail, or none if the check only gives advice."""
     not_acceptable: str = ""
-    """Why a failure cannot be accepted for a session; empty if it can."""
+    """Reason why a failure cannot be accepted for a session, or "" if it can be accepted."""
     needs_values: bool = True
-    """It computes with values of the profile, so that it is left out while any is unknown."""
+    """Whether the check computes with values of the profile.
+
+    It is then omitted while any value is unknown."""
 
 
 PAPER_CHECKS: Final = (
-    PaperCheck(paper.drive_file_rows, (paper.EDS,), needs_values=False),
+    PaperCheck(paper.drive_file_rows, (paper.EDS_ROW,), needs_values=False),
     PaperCheck(paper.profile_rows, needs_values=False),
     PaperCheck(paper.record_rows, needs_values=False),
-    PaperCheck(paper.plumb_rows, needs_values=False),
+    PaperCheck(paper.axis_tilt_rows, needs_values=False),
     PaperCheck(
         paper.unknown_rows,
-        (paper.UNKNOWN_VALUES,),
+        (paper.UNKNOWN_VALUES_ROW,),
         not_acceptable="nothing can be computed without it",
         needs_values=False,
     ),
     PaperCheck(
         lambda profile: paper.wiring_rows(profile.rig),
-        (paper.CAN_IDENTIFIERS, paper.CAN_LOAD, paper.SERIAL_LOAD),
+        (paper.CAN_IDENTIFIERS_ROW, paper.CAN_LOAD_ROW, paper.SERIAL_LOAD_ROW),
         not_acceptable="devices could receive what is not meant for them, or too late",
         needs_values=False,
     ),
     PaperCheck(
         paper.stability_rows,
-        (paper.STABILITY,),
+        (paper.STABILITY_ROW,),
         not_acceptable="the shaft could not be held",
     ),
     PaperCheck(paper.margin_rows),
     PaperCheck(
         paper.travel_rows,
         (
-            paper.TRAVEL_LOOP_FAILS,
-            paper.TRAVEL_NO_ANGLE,
-            paper.TRAVEL_ENCODER_FAILS,
-            paper.TRAVEL_MISSED_TICKS,
+            paper.TRAVEL_LOOP_FAILS_ROW,
+            paper.TRAVEL_NO_ANGLE_ROW,
+            paper.TRAVEL_ENCODER_FAILS_ROW,
+            paper.TRAVEL_MISSED_TICKS_ROW,
         ),
     ),
 )
-"""All checks on paper, in the order of their rows. Those of one group follow each other."""
+"""All checks on paper, in the order of their rows; checks of the same group are adjacent."""
 
 ACCEPTABLE: Final = tuple(
     name for check in PAPER_CHECKS for name in check.names if not check.not_acceptable
 )
-"""Names of the rows whose failure the operator can accept."""
-_OWNERS: Final = {name: check for check in PAPER_CHECKS for name in check.names}
+"""Names of the rows whose failure the operator can accept for a session."""
+_CHECK_BY_ROW_NAME: Final = {name: check for check in PAPER_CHECKS for name in check.names}
+"""Map from the name of a row that can fail to its check."""
 
 
 def paper_rows(profile: Profile) -> list[CheckRow]:
-    """Return the rows of all checks that need no device.
+    """Return the rows of all checks on paper, which need no device.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     """
-    return [row for check in PAPER_CHECKS for row in _rows(check, profile)]
+    return [row for check in PAPER_CHECKS for row in _rows_of_check(check, profile)]
 
 
-def _rows(check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
+def _rows_of_check(check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
+    """Yield the rows of a check, or none if it needs a value of the profile that is unknown."""
     if not (check.needs_values and unknown_values(profile.rig)):
         yield from check.rows(profile)
 
 
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
-    """A row that failed on paper, and what becomes of a session."""
+    """A failed row of the checks on paper, and whether a session can be run nevertheless."""
 
     name: str
-    """Name of the row."""
+    """Name of the failed row."""
     text: str
-    """What was found, and the remedy."""
+    """Finding and remedy, for the operator."""
     acceptable: bool
-    """Whether the operator can accept it for a session."""
+    """Whether the operator can accept the failure for a session."""
     accepted: bool
-    """Whether the operator has."""
+    """Whether the operator has accepted the failure for this session."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,35 +130,35 @@ class Clearance:
     """Result of the checks on paper for a session."""
 
     failed: tuple[FailedCheck, ...] = ()
-    """Rows that failed, accepted or not."""
+    """All failed rows, accepted or not."""
     warnings: tuple[str, ...] = ()
-    """Sentences about what was accepted without need."""
+    """Sentences on rows that the operator accepted although they did not fail."""
 
     @property
     def refusals(self) -> tuple[str, ...]:
-        """Why no session may be run: a sentence or two for each row that is not accepted."""
-        return tuple(_refusal(each) for each in self.failed if not each.accepted)
+        """Messages that refuse the session, one for each failed row that is not accepted."""
+        return tuple(_refusal_message(each) for each in self.failed if not each.accepted)
 
     @property
     def accepted(self) -> tuple[FailedCheck, ...]:
-        """Rows that failed and are accepted."""
+        """Failed rows that the operator has accepted for the session."""
         return tuple(each for each in self.failed if each.accepted)
 
     def require(self) -> None:
-        """Raise unless all failed rows are accepted.
+        """Raise CheckFailedError unless all failed rows are accepted.
 
         Raises
         ------
         CheckFailedError
-            Naming each row that failed and is not accepted.
+            If a failed row is not accepted; the message names each of them.
         """
         if self.refusals:
-            final = not all(each.acceptable for each in self.failed)
-            raise CheckFailedError("\n".join(self.refusals), wrong_use=final)
+            never_acceptable = not all(each.acceptable for each in self.failed)
+            raise CheckFailedError("\n".join(self.refusals), wrong_use=never_acceptable)
 
 
 def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
-    """Run the checks that need no device for a session.
+    """Run the checks on paper for a session, and return which rows failed or are accepted.
 
     Parameters
     ----------
@@ -163,31 +167,42 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
     accept
         Names of rows that may fail in this session.
 
+    Returns
+    -------
+    Clearance
+        Failed rows, and warnings.
+
     Raises
     ------
     UnknownRowError
         If no row has such a name, or its failure cannot be accepted.
     """
-    for name in accept:
-        _check_name(name)
+    for row_name in accept:
+        _check_name(row_name)
     failed: dict[str, FailedCheck] = {}
     for check in PAPER_CHECKS:
-        for row in _rows(check, profile) if check.names else ():
+        for row in _rows_of_check(check, profile) if check.names else ():
             if row.verdict is not CheckResult.FAIL:
                 continue
-            name, text = row.name, _text(row)
-            if name in failed:  # several rows of one name: an EDS file that lacks two objects
-                text = f"{failed[name].text}\n{text}"
-            failed[name] = FailedCheck(name, text, not check.not_acceptable, name in accept)
-    needless = [name for name in dict.fromkeys(accept) if name not in failed]
+            row_name, text = row.name, _failure_text(row)
+            if row_name in failed:  # several rows of one name: an EDS file that lacks two objects
+                text = f"{failed[row_name].text}\n{text}"
+            failed[row_name] = FailedCheck(
+                row_name, text, not check.not_acceptable, row_name in accept
+            )
+    accepted_needlessly = [row_name for row_name in dict.fromkeys(accept) if row_name not in failed]
     return Clearance(
         tuple(failed.values()),
-        tuple(f"--accept {name}: it did not fail; nothing was accepted." for name in needless),
+        tuple(
+            f"--accept {row_name}: it did not fail; nothing was accepted."
+            for row_name in accepted_needlessly
+        ),
     )
 
 
 def _check_name(name: str) -> None:
-    check = _OWNERS.get(name)
+    """Raise UnknownRowError unless the operator can accept a row of this name."""
+    check = _CHECK_BY_ROW_NAME.get(name)
     if check is None:
         raise UnknownRowError(
             f"--accept {name[:60]}: no row of rigd check has that name; those that can be accepted "
@@ -199,11 +214,13 @@ def _check_name(name: str) -> None:
         )
 
 
-def _text(row: CheckRow) -> str:
-    wanted = f" (wanted: {row.wanted})" if row.wanted else ""
-    return f"{row.group}, {row.what}: {row.found.rstrip('.')}{wanted}. {row.detail}".strip()
+def _failure_text(row: CheckRow) -> str:
+    """Return the finding of a failed row and its remedy as text for the operator."""
+    requirement = f" (wanted: {row.wanted})" if row.wanted else ""
+    return f"{row.group}, {row.what}: {row.found.rstrip('.')}{requirement}. {row.detail}".strip()
 
 
-def _refusal(failed: FailedCheck) -> str:
+def _refusal_message(failed: FailedCheck) -> str:
+    """Return the message that refuses a session because of a failed row."""
     remedy = f" To accept it for one session: --accept {failed.name}." if failed.acceptable else ""
     return f"rigd check fails ({failed.name}): {failed.text}{remedy}"

@@ -13,7 +13,7 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rigd.checks.rows import CheckResult, CheckRow, grade, name_of, value_of
+from rigd.checks.rows import CheckResult, CheckRow, format_value, grade, key_label
 from rigd.devices import ActuationTarget, actuation_target, open_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
@@ -24,12 +24,13 @@ from rigd.engine.timing import RealClock
 from rigd.profile import Profile
 from rigd.safety.probing_move import MEASURED
 
-_SCALES = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
-"""What a drive need not state of its position, and the objects."""
-_IN_HEX = ("vendor_id", "product_code", "supported_modes")
+_SCALE_OBJECTS = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
+"""Map from a position scale that a drive need not state to the CiA 402 objects that state it."""
+_HEXADECIMAL_KEYS = ("vendor_id", "product_code", "supported_modes")
+"""Keys of a drive's identity that are shown as hexadecimal numbers."""
 
 
-_WATCHDOG_DETAIL = {
+_WATCHDOG_ADVICE = {  # Advice on watchdogs that were not proven on the drive
     Watchdog.OWN: (
         "Watchdog: its timeout is as stated in the profile (cia402.own_watchdog_s) and cannot be "
         "read back. Test it at low torque: kill rigd and time how long the torque stays on."
@@ -46,22 +47,28 @@ _WATCHDOG_DETAIL = {
 
 @runtime_checkable
 class InspectableDrive(Protocol):
-    """A drive with an identity; simulated ones in this process have none."""
+    """Drive that can report its identity; drives simulated in this process cannot."""
 
     def identity(self) -> Mapping[str, object]:
-        """Return the identity reported at connecting; the keys end in their units."""
+        """Return what the drive reported about itself when it was connected.
+
+        The keys end in their units.
+        """
 
 
 @runtime_checkable
 class InspectedDrive(Protocol):
-    """A drive whose objects were checked when it was connected."""
+    """Drive whose CiA 402 objects were checked when it was connected."""
 
     def capabilities(self) -> DriveCapabilities | None:
-        """Return the capabilities found at connecting."""
+        """Return the capabilities found at connection, or None if none were checked."""
 
 
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
-    """Show identity and rated torque; what contradicts the profile was refused on connecting."""
+    """Yield the rows on the drive's identity, rated torque and safeguards.
+
+    They are never failed: a drive that contradicts the profile cannot be connected.
+    """
     settings = rig.cia402
     wanted = {
         "rated_torque_nm": f"{rig.motor.rated_torque_nm:.4g} N·m",
@@ -73,46 +80,46 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRo
         wanted["vendor_id"] = f"{settings.vendor_id:#x}" if settings.vendor_id else "any"
         wanted["product_code"] = f"{settings.product_code:#x}" if settings.product_code else "any"
     for key, value in drive.identity().items():
-        if key in _IN_HEX and isinstance(value, int):
+        if key in _HEXADECIMAL_KEYS and isinstance(value, int):
             found = f"{value:#x}"
         else:
-            found = "not stated by the drive" if value in (None, "") else value_of(key, value)
+            found = "not stated by the drive" if value in (None, "") else format_value(key, value)
         verdict = CheckResult.OK
-        if key in _SCALES and value is None:
-            found = f"unknown: the drive does not state it (object {_SCALES[key]})"
+        if key in _SCALE_OBJECTS and value is None:
+            found = f"unknown: the drive does not state it (object {_SCALE_OBJECTS[key]})"
             verdict = CheckResult.SKIPPED
-        yield CheckRow("drive", name_of(key), found, wanted.get(key, ""), verdict)
+        yield CheckRow("drive", key_label(key), found, wanted.get(key, ""), verdict)
     capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
     if capabilities is not None:
         yield from _safeguard_rows(capabilities)
 
 
 def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
-    """Show the watchdog, the replacements of missing objects, and what was accepted."""
+    """Yield the rows on the drive's watchdog, missing objects, and objects that were set."""
     watchdog, after_s = capabilities.watchdog, capabilities.watchdog_s
-    unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
+    is_unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield CheckRow(
         "drive",
         "watchdog",
         f"{watchdog.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
-        CheckResult.WARNING if unproven else CheckResult.OK,
-        _WATCHDOG_DETAIL.get(watchdog, ""),
+        CheckResult.WARNING if is_unproven else CheckResult.OK,
+        _WATCHDOG_ADVICE.get(watchdog, ""),
     )
     accepted = capabilities.accepted
     for row in capabilities.lacks:
-        missing = row.accept in accepted
+        is_accepted = row.accept in accepted
         substitute = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
         if row.accept == WATCHDOG:
             substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
-        by_name = f'accepted by cia402.accept_without "{row.accept}"' if missing else ""
+        acceptance = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
         yield CheckRow(
             "drive",
             f"object {row.address} ({row.name})",
-            "; ".join(("absent or not usable", *filter(None, (by_name, substitute)))),
+            "; ".join(("absent or not usable", *filter(None, (acceptance, substitute)))),
             "",
-            CheckResult.WARNING if missing else CheckResult.OK,
-            f"{row.name}: {row.sentence}" if missing else "",
+            CheckResult.WARNING if is_accepted else CheckResult.OK,
+            f"{row.name}: {row.sentence}" if is_accepted else "",
         )
     for text in capabilities.assigned:
         yield CheckRow("drive", "object set", text, "read back", CheckResult.OK)
@@ -120,90 +127,124 @@ def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
 
 # Sensor
 
-MEASURED_S = 1.0
-_ROUNDING = 1.001
-# Relative error of a stream's rate: more than clocks differ by; too much for the filter's weights.
-_RATE_OFF, _RATE_WRONG = 0.01, 0.05
+RATE_MEASUREMENT_S = 1.0
+"""Duration in seconds of the measurement of the sensor's rate."""
+_RANGE_TOLERANCE_FACTOR = 1.001
+"""Largest ratio of the profile's to the sensor's range that counts as equal."""
+_RATE_ERROR_WARNING, _RATE_ERROR_FAILURE = 0.01, 0.05
+"""Relative errors of the sensor's record rate that give a warning and a failure.
 
-_UNSTATED = "not stated by the sensor"
-_RANGES = ("range_n_nm", "range")
-_SHOWN = ("sensor", "device", "serial_number", "part_number", "calibration")
-_ALWAYS_SHOWN = ("firmware", "calibration_date")
-_STATUS = "status"
-_ASSUMED = "assumed"
+The first is more than clocks differ by; the second is too much for the filter's weights."""
+
+_NOT_REPORTED = "not stated by the sensor"
+"""Text for a value that the sensor does not report."""
+_RANGE_KEYS = ("range_n_nm", "range")
+"""Keys of a calibration that hold the sensor's measuring range."""
+_KEYS_SHOWN_IF_REPORTED = ("sensor", "device", "serial_number", "part_number", "calibration")
+"""Keys of a calibration that have a row if the sensor reports them."""
+_KEYS_ALWAYS_SHOWN = ("firmware", "calibration_date")
+"""Keys of a calibration that always have a row."""
+_STATUS_KEY = "status"
+"""Key of a calibration that holds the sensor's status."""
+_ASSUMED_KEY = "assumed"
+"""Key of a calibration that names the values that the sensor did not report."""
 
 
 @runtime_checkable
 class MeasurableSensor(Protocol):
-    """A sensor whose rate can be measured; simulated ones in this process have none."""
+    """Sensor whose rate of readings can be measured; sensors simulated in this process cannot."""
 
     def measure(self, duration_s: float) -> Mapping[str, float]:
-        """Measure polls or stream for a while; the keys of the result end in their units."""
+        """Read the sensor for a time, and return its measured rate, delays and error counts.
+
+        The keys end in their units.
+        """
 
 
 def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[CheckRow]:
-    """Return the rows of identity and calibration, and compare ranges with the profile's.
+    """Yield the rows on the sensor's identity, calibration and measuring range.
 
     Parameters
     ----------
     found
-        Calibration as the sensor reports it.
+        Calibration that the sensor reports.
     rig
-        Parameters of the profile.
+        Parameters of the profile, with which serial number and range are compared.
     """
-    for key in _SHOWN:
+    for key in _KEYS_SHOWN_IF_REPORTED:
         if key in found:
             yield CheckRow(
-                "sensor", name_of(key), _value(key, found), _wanted(key, rig), CheckResult.OK
+                "sensor",
+                key_label(key),
+                _format_calibration_value(key, found),
+                _required_calibration_value(key, rig),
+                CheckResult.OK,
             )
-    for key in _ALWAYS_SHOWN:
-        yield CheckRow("sensor", name_of(key), _value(key, found), "", CheckResult.OK)
+    for key in _KEYS_ALWAYS_SHOWN:
+        yield CheckRow(
+            "sensor", key_label(key), _format_calibration_value(key, found), "", CheckResult.OK
+        )
     yield _range_row(found, rig.sensor.range)
-    if found.get(_ASSUMED):
+    if found.get(_ASSUMED_KEY):
         yield CheckRow(
             "sensor",
             "counts and units",
             "assumed, below",
             "reported by the sensor",
             CheckResult.WARNING,
-            f"Sensor: assumed are {found[_ASSUMED]}; compare with its calibration certificate.",
+            f"Sensor: assumed are {found[_ASSUMED_KEY]}; compare with its calibration certificate.",
         )
-    status = found.get(_STATUS)
+    status = found.get(_STATUS_KEY)
     if status is not None:
         yield CheckRow(
             "sensor",
             "status",
-            value_of(_STATUS, status),
+            format_value(_STATUS_KEY, status),
             "none",
             grade(fail=False, warn=bool(status)),
         )
-    more = [
-        f"{name_of(key)} {value_of(key, value)}"
+    other_values = [
+        f"{key_label(key)} {format_value(key, value)}"
         for key, value in found.items()
-        if key not in (*_SHOWN, *_ALWAYS_SHOWN, *_RANGES, _STATUS, _ASSUMED, "matrix")
+        if key
+        not in (
+            *_KEYS_SHOWN_IF_REPORTED,
+            *_KEYS_ALWAYS_SHOWN,
+            *_RANGE_KEYS,
+            _STATUS_KEY,
+            _ASSUMED_KEY,
+            "matrix",
+        )
         and value != ""
     ]
-    if more:
-        detail = f"Sensor: {'; '.join(more)}."
-        yield CheckRow("sensor", "more", f"{len(more)} values, below", "", CheckResult.OK, detail)
+    if other_values:
+        detail = f"Sensor: {'; '.join(other_values)}."
+        yield CheckRow(
+            "sensor", "more", f"{len(other_values)} values, below", "", CheckResult.OK, detail
+        )
 
 
 def _measured_rows(
     measured: Mapping[str, float], rig: RigParameters, cause: str = ""
 ) -> Iterator[CheckRow]:
-    """Return the rows on rate and turn-round; `cause` is the sensor's reason for gaps."""
+    """Yield the rows on the sensor's measured rate and response times.
+
+    `cause` is the reason for gaps that the sensor reports.
+    """
     for key, value in measured.items():
         wanted, verdict = _assess_diagnostic(key, value, rig)
         detail = cause if key == "longest_gap_s" and verdict is not CheckResult.OK else ""
-        yield CheckRow("sensor", name_of(key), value_of(key, value), wanted, verdict, detail)
+        yield CheckRow("sensor", key_label(key), format_value(key, value), wanted, verdict, detail)
 
 
-def _value(key: str, found: Mapping[str, object]) -> str:
+def _format_calibration_value(key: str, found: Mapping[str, object]) -> str:
+    """Format the value of a key of the calibration with its unit."""
     value = found.get(key)
-    return _UNSTATED if value in (None, "") else value_of(key, value)
+    return _NOT_REPORTED if value in (None, "") else format_value(key, value)
 
 
-def _wanted(key: str, rig: RigParameters) -> str:
+def _required_calibration_value(key: str, rig: RigParameters) -> str:
+    """Return the value of a key of the calibration that the profile requires, or ""."""
     if key != "serial_number":
         return ""
     expected = rig.ati_can.serial_number if rig.ati_can else ""
@@ -211,73 +252,80 @@ def _wanted(key: str, rig: RigParameters) -> str:
 
 
 def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> CheckRow:
-    limits = "profile: " + value_of("range_n_nm", wanted)
-    key = next((key for key in _RANGES if key in found), "")
-    rated = found.get(key)
-    if not isinstance(rated, list | tuple):
-        # Over CAN there is no request for it.
-        return CheckRow("sensor", "range", _UNSTATED, limits, CheckResult.OK)
-    beyond = any(ours > _ROUNDING * float(its) for ours, its in zip(wanted, rated, strict=True))
-    return CheckRow("sensor", "range", value_of("range_n_nm", rated), limits, grade(fail=beyond))
+    """Return the row that compares the sensor's measuring range with that of the profile."""
+    limits = "profile: " + format_value("range_n_nm", wanted)
+    key = next((key for key in _RANGE_KEYS if key in found), "")
+    reported_range = found.get(key)
+    if not isinstance(reported_range, list | tuple):
+        # Over CAN the range cannot be requested.
+        return CheckRow("sensor", "range", _NOT_REPORTED, limits, CheckResult.OK)
+    exceeds_range = any(
+        profile_value > _RANGE_TOLERANCE_FACTOR * float(sensor_value)
+        for profile_value, sensor_value in zip(wanted, reported_range, strict=True)
+    )
+    return CheckRow(
+        "sensor",
+        "range",
+        format_value("range_n_nm", reported_range),
+        limits,
+        grade(fail=exceeds_range),
+    )
 
 
 def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, CheckResult]:
-    """Return the expected value of a diagnostic, and the verdict."""
+    """Return the required value of a measured diagnostic as text, and the check's result."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
     same_tick = acquisition is not None and acquisition.mode == "same_tick"
-    patience_s = acquisition.deadline_us * 1e-6 if acquisition and same_tick else period_s
-    patience = f"at most {patience_s * 1e3:.4g} ms"
+    deadline_s = acquisition.deadline_us * 1e-6 if acquisition and same_tick else period_s
+    deadline_text = f"at most {deadline_s * 1e3:.4g} ms"
     if key == "polls_hz":
         return f"at least {rig.rate_hz:g} Hz", grade(fail=not value >= rig.rate_hz)
     if key == "records_hz" and rig.ati_serial is not None:
-        stated = rig.ati_serial.stream_hz
-        off = abs(value / stated - 1.0)
-        return f"{stated:g} Hz", grade(fail=not off <= _RATE_WRONG, warn=off > _RATE_OFF)
+        stated_hz = rig.ati_serial.stream_hz
+        relative_error = abs(value / stated_hz - 1.0)
+        return f"{stated_hz:g} Hz", grade(
+            fail=not relative_error <= _RATE_ERROR_FAILURE,
+            warn=relative_error > _RATE_ERROR_WARNING,
+        )
     if key == "turnaround_median_s":
-        return patience, grade(fail=not value <= patience_s)
+        return deadline_text, grade(fail=not value <= deadline_s)
     if key == "turnaround_p99_s":
-        return patience, grade(fail=False, warn=not value <= patience_s)
+        return deadline_text, grade(fail=False, warn=not value <= deadline_s)
     if key == "longest_gap_s":
         return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=value > period_s)
-    # Everything else is a count of what should not happen.
+    # All other diagnostics are counts of errors.
     return "0", grade(fail=False, warn=value > 0)
 
 
 # Exchange of a tick
 
-TICKS = 500
-_FEW_MISSING = 0.02
-_MANY_MISSING = 0.2
-_GROUP = "exchange"
+EXCHANGE_TICKS = 500
+"""Number of ticks in which the exchange with the devices is checked."""
+_MISSING_FRACTION_WARNING = 0.02
+"""Fraction of ticks without a reply above which there is a warning."""
+_MISSING_FRACTION_FAILURE = 0.2
+"""Fraction of ticks without a reply above which the check fails."""
+_EXCHANGE_GROUP = "exchange"
+"""Group of the rows on the exchange with the devices."""
 
 
 def _exchange_rows(
-    profile: Profile, devices: Devices, moves: ActuationTarget
+    profile: Profile, devices: Devices, target: ActuationTarget
 ) -> Iterator[CheckRow]:
-    """Run some ticks without a torque, and check latency and losses of the replies.
+    """Run `EXCHANGE_TICKS` ticks without torque, and yield rows on delayed and missing replies.
 
-    Parameters
-    ----------
-    profile
-        Profile whose limits count.
-    devices
-        Devices that are connected, not enabled.
-    moves
-        What moves. In lock-step the simulated rig waits for this computer: times mean nothing.
-
-    Raises
-    ------
-    DeviceError
-        If a device reports an error, or its line is gone.
+    The devices are connected but not enabled. If a simulated rig in lock-step moves, it waits for
+    this computer, so that delays are meaningless. Raises DeviceError if a device reports an error
+    or its line is lost.
     """
     drive, sensor = devices.drive, devices.sensor
     period_ns = round(1e9 / profile.rig.rate_hz)
-    waited_ms, angles_rad = np.zeros(TICKS), np.zeros(TICKS)
+    delays_ms, angles_rad = np.zeros(EXCHANGE_TICKS), np.zeros(EXCHANGE_TICKS)
     missing_angles = missing_wrenches = saturated = 0
     clock = RealClock()
     due_ns = clock.now_ns()
-    for tick in range(TICKS):
+    for tick in range(EXCHANGE_TICKS):
         due_ns = max(due_ns + period_ns, clock.now_ns())
         clock.wait_until(due_ns)
         begin_ns = time.monotonic_ns()
@@ -285,34 +333,41 @@ def _exchange_rows(
         sensor.request(due_ns)
         angles_rad[tick] = drive.read_angle()
         sensor.read_wrench()
-        waited_ms[tick] = (time.monotonic_ns() - begin_ns) * 1e-6
+        delays_ms[tick] = (time.monotonic_ns() - begin_ns) * 1e-6
         missing_angles += drive.angle_stale
         missing_wrenches += sensor.wrench_stale
         saturated += sensor.wrench_saturated
 
-    yield _reply_row(profile, waited_ms, moves)
-    for what, missing in (
+    yield _reply_row(profile, delays_ms, target)
+    for what, missing_count in (
         ("angles missing", missing_angles),
         ("wrenches missing", missing_wrenches),
     ):
-        verdict = grade(fail=missing > _MANY_MISSING * TICKS, warn=missing > _FEW_MISSING * TICKS)
+        verdict = grade(
+            fail=missing_count > _MISSING_FRACTION_FAILURE * EXCHANGE_TICKS,
+            warn=missing_count > _MISSING_FRACTION_WARNING * EXCHANGE_TICKS,
+        )
         yield CheckRow(
-            _GROUP,
+            _EXCHANGE_GROUP,
             what,
-            f"{missing} of {TICKS} ticks",
-            f"at most {100 * _FEW_MISSING:.0f} %",
+            f"{missing_count} of {EXCHANGE_TICKS} ticks",
+            f"at most {100 * _MISSING_FRACTION_WARNING:.0f} %",
             verdict,
         )
     yield CheckRow(
-        _GROUP, "sensor saturated", f"{saturated} of {TICKS} ticks", "0", grade(fail=saturated > 0)
+        _EXCHANGE_GROUP,
+        "sensor saturated",
+        f"{saturated} of {EXCHANGE_TICKS} ticks",
+        "0",
+        grade(fail=saturated > 0),
     )
     moved_rad = float(np.ptp(angles_rad))
     allowed_rad = max(
-        profile.session.rest_velocity_rad_s * TICKS / profile.rig.rate_hz,
+        profile.session.rest_velocity_rad_s * EXCHANGE_TICKS / profile.rig.rate_hz,
         2.0 * profile.rig.encoder.resolution_rad,
     )
     yield CheckRow(
-        _GROUP,
+        _EXCHANGE_GROUP,
         "shaft moved",
         f"{moved_rad:.2g} rad",
         f"at most {allowed_rad:.2g} rad",
@@ -320,40 +375,41 @@ def _exchange_rows(
     )
 
 
-def _reply_row(profile: Profile, waited_ms: np.ndarray, moves: ActuationTarget) -> CheckRow:
+def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget) -> CheckRow:
+    """Return the row that compares the delays of the devices' replies with the deadline."""
     acquisition = profile.rig.acquisition
-    median, late = np.percentile(waited_ms, [50, 99]).tolist()
-    found = f"p50 {median:.2f} ms, p99 {late:.2f} ms"
+    median_ms, p99_ms = np.percentile(delays_ms, [50, 99]).tolist()
+    found = f"p50 {median_ms:.2f} ms, p99 {p99_ms:.2f} ms"
     what = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
         return CheckRow(
-            _GROUP, what, "replies of the previous tick are used", "", CheckResult.SKIPPED
+            _EXCHANGE_GROUP, what, "replies of the previous tick are used", "", CheckResult.SKIPPED
         )
-    if moves is ActuationTarget.LOCK_STEP:
-        return CheckRow(_GROUP, what, found, "any time (lock-step)", CheckResult.OK)
+    if target is ActuationTarget.LOCK_STEP:
+        return CheckRow(_EXCHANGE_GROUP, what, found, "any time (lock-step)", CheckResult.OK)
     limit_ms = acquisition.deadline_us * 1e-3
-    verdict = grade(fail=median >= limit_ms, warn=late >= limit_ms)
-    return CheckRow(_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
+    verdict = grade(fail=median_ms >= limit_ms, warn=p99_ms >= limit_ms)
+    return CheckRow(_EXCHANGE_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
 
 
 # Probing move
 
 
-def _probing_rows(profile: Profile, moves: ActuationTarget) -> Iterator[CheckRow]:
-    """Return the row on scales and signs: known, or verified before the first session."""
-    if moves is ActuationTarget.SIMULATED:
+def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRow]:
+    """Yield the row on whether scales and signs are known or need a probing move."""
+    if target is ActuationTarget.SIMULATED:
         return
-    missing = [key for key in MEASURED if profile.sources.get(key) != "measured"]
-    if not missing:
+    not_measured = [key for key in MEASURED if profile.sources.get(key) != "measured"]
+    if not not_measured:
         found, verdict = "motor and encoder are measured", CheckResult.OK
     else:
         found = "scales and signs: verified by the probing move before the first session"
         verdict = CheckResult.SKIPPED
     detail = (
-        f"Probing move: sessions begin with it because {', '.join(missing)} "
-        f"{'is' if len(missing) == 1 else 'are'} not measured; rigd probe makes it by itself "
+        f"Probing move: sessions begin with it because {', '.join(not_measured)} "
+        f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe makes it by itself "
         "(docs/safety.md)."
-        if missing
+        if not_measured
         else ""
     )
     yield CheckRow("drive", "probing move", found, "", verdict, detail)
@@ -363,66 +419,76 @@ def _probing_rows(profile: Profile, moves: ActuationTarget) -> Iterator[CheckRow
 
 
 def inspect_devices(profile: Profile) -> list[CheckRow]:
-    """Connect to the devices of a profile, read them, run some ticks, and release them.
+    """Connect to the devices of a profile, check them without torque, and return the rows.
 
-    No torque: the drive is never enabled. Whatever happens, both devices are closed.
+    The drive is never enabled. Both devices are closed in the end, also after an error.
     """
     rig = profile.rig
-    moves = actuation_target(rig)
-    rows = list(_link_rows(rig, moves))
+    target = actuation_target(rig)
+    rows = list(_link_rows(rig, target))
     try:
         devices = open_devices(rig)
         with ExitStack() as closing:
             closing.callback(devices.sensor.close)
             closing.callback(devices.drive.close)
-            _ask(profile, devices, moves, rows)
+            _check_devices(profile, devices, target, rows)
     except (DeviceError, OSError) as error:
         rows.append(CheckRow("devices", "open and close", str(error), "", CheckResult.FAIL))
     return rows
 
 
-def _ask(profile: Profile, devices: Devices, moves: ActuationTarget, rows: list[CheckRow]) -> None:
+def _check_devices(
+    profile: Profile, devices: Devices, target: ActuationTarget, rows: list[CheckRow]
+) -> None:
+    """Connect drive and sensor, and append the rows of their checks to `rows`."""
     rig, drive, sensor = profile.rig, devices.drive, devices.sensor
 
-    def about_drive() -> Iterator[CheckRow]:
+    def drive_rows() -> Iterator[CheckRow]:
         drive.connect()
-        yield CheckRow("drive", "connection", _answer(moves), "an answer, no fault", CheckResult.OK)
+        yield CheckRow(
+            "drive", "connection", _connection_text(target), "an answer, no fault", CheckResult.OK
+        )
         if isinstance(drive, InspectableDrive):
             yield from _drive_rows(drive, rig)
-        yield from _probing_rows(profile, moves)
+        yield from _probing_rows(profile, target)
 
-    def about_sensor() -> Iterator[CheckRow]:
+    def sensor_rows() -> Iterator[CheckRow]:
         sensor.connect()
         yield CheckRow(
-            "sensor", "connection", _answer(moves), "an answer, no error", CheckResult.OK
+            "sensor", "connection", _connection_text(target), "an answer, no error", CheckResult.OK
         )
         yield from calibration_rows(sensor.calibration(), rig)
 
-    def rate() -> Iterator[CheckRow]:
-        if not isinstance(sensor, MeasurableSensor) or moves.any_clock:
+    def rate_rows() -> Iterator[CheckRow]:
+        if not isinstance(sensor, MeasurableSensor) or target.any_clock:
             yield CheckRow(
-                "sensor", "rate", f"not measured: {moves.value}", "", CheckResult.SKIPPED
+                "sensor", "rate", f"not measured: {target.value}", "", CheckResult.SKIPPED
             )
         else:
-            measured = sensor.measure(MEASURED_S)
+            measured = sensor.measure(RATE_MEASUREMENT_S)
             yield from _measured_rows(measured, rig, sensor.health().cause)
 
-    # The drive last: once it is operational it expects a SYNC every period.
-    sensor_answers = _try("sensor", about_sensor(), rows) and _try("sensor", rate(), rows)
-    drive_answers = _try("drive", about_drive(), rows)
-    if moves is ActuationTarget.SIMULATED:
+    # The drive is connected last, since an operational drive expects a SYNC every period.
+    sensor_ok = _collect_rows("sensor", sensor_rows(), rows) and _collect_rows(
+        "sensor", rate_rows(), rows
+    )
+    drive_ok = _collect_rows("drive", drive_rows(), rows)
+    if target is ActuationTarget.SIMULATED:
         rows.append(
             CheckRow("exchange", "ticks", "simulated in this process", "", CheckResult.SKIPPED)
         )
-    elif drive_answers and sensor_answers:
-        _try("exchange", _exchange_rows(profile, devices, moves), rows)
+    elif drive_ok and sensor_ok:
+        _collect_rows("exchange", _exchange_rows(profile, devices, target), rows)
     else:
         why = "not without drive and sensor"
         rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
 
 
-def _try(group: str, found: Iterable[CheckRow], rows: list[CheckRow]) -> bool:
-    """Collect rows up to the first error, which becomes a row; return whether there was none."""
+def _collect_rows(group: str, found: Iterable[CheckRow], rows: list[CheckRow]) -> bool:
+    """Append the rows of a check to `rows`, and return whether the check raised no error.
+
+    An error of a device becomes a failed row.
+    """
     try:
         rows.extend(found)
     except (DeviceError, OSError) as error:
@@ -431,17 +497,19 @@ def _try(group: str, found: Iterable[CheckRow], rows: list[CheckRow]) -> bool:
     return True
 
 
-def _answer(moves: ActuationTarget) -> str:
-    return "simulated in this process" if moves is ActuationTarget.SIMULATED else "it answers"
+def _connection_text(target: ActuationTarget) -> str:
+    """Return the text for a connected device."""
+    return "simulated in this process" if target is ActuationTarget.SIMULATED else "it answers"
 
 
-def _link_rows(rig: RigParameters, moves: ActuationTarget) -> Iterator[CheckRow]:
+def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow]:
+    """Yield the rows on the target that will move and on its bus and serial line."""
     simulator = find_simulator(rig.name)
     if simulator is not None:
-        where = f"{moves.value} (process {simulator.pid})"
-        yield CheckRow("link", "what moves", where, "", CheckResult.OK)
+        target_text = f"{target.value} (process {simulator.pid})"
+        yield CheckRow("link", "what moves", target_text, "", CheckResult.OK)
         return
-    yield CheckRow("link", "what moves", moves.value, "", CheckResult.OK)
+    yield CheckRow("link", "what moves", target.value, "", CheckResult.OK)
     if rig.can is not None:
         bus = f"{rig.can.channel} ({rig.can.interface})"
         yield CheckRow("link", "CAN", bus, "", CheckResult.OK)

@@ -1,7 +1,8 @@
-"""Checks of this computer for a loop in real time: rights and settings. Advice, never a refusal.
+"""Checks of this computer's rights and settings for a loop in real time.
 
-What the system would grant a session's loop is tried in a process that ends at once. ``rigd bench``
-measures what the settings come to; ``docs/real_time.md`` says how to change them.
+They give advice and refuse no session. A short-lived process determines the real-time settings that
+the system grants. ``rigd bench`` measures the effect of the settings; ``docs/real_time.md``
+explains how to change them.
 """
 
 import ctypes
@@ -20,8 +21,9 @@ from rigd.runtime import OWN_PYTHON
 
 # Rights
 
-_PATIENCE_S = 20.0
-_TRY = """
+_GRANT_TIMEOUT_S = 20.0
+"""Longest time in seconds for the process that tries the real-time settings."""
+_GRANT_PROGRAM = """
 import json, sys
 from rigd.engine.realtime import Precedence, apply_realtime
 priority, below, cpu = map(int, sys.argv[1:])
@@ -30,15 +32,17 @@ supervision = other.take()
 other.release()
 print(json.dumps([apply_realtime(priority=priority, cpu=cpu), supervision]))
 """
-_ROWS = {"supervision": "supervisor and recorder"}
-_WANTED = {
+"""Program that requests the real-time settings and prints those granted as JSON."""
+_ROW_LABELS = {"supervision": "supervisor and recorder"}
+"""Labels of settings whose name is not a label."""
+_REQUIRED_SETTINGS = {  # Required setting, for settings that were not granted
     "memory": "locked, without a limit",
     "scheduling": "SCHED_FIFO {priority}",
     "supervision": "SCHED_RR {supervision_priority}",
     "cpu": "realtime.cpu: a core of this computer",
     "idle_states": "/dev/cpu_dma_latency is writable",
 }
-_IDLE_STATES_REMEDY = (
+_IDLE_STATES_ADVICE = (  # Advice if the depth of the processor's idle states cannot be limited
     "Idle states: a sleeping core takes long to wake up. Let the group rigd bound that with this "
     "line in /etc/udev/rules.d/90-rigd.rules, then udevadm trigger: "
     'KERNEL=="cpu_dma_latency", GROUP="rigd", MODE="0660"'
@@ -46,31 +50,34 @@ _IDLE_STATES_REMEDY = (
 
 
 def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
-    """Return the settings granted to the control process, tried in a process of its own.
+    """Return the real-time settings that the system grants, found out by a short-lived process.
 
-    The key ``supervision`` holds the settings of supervisor and recorder.
+    The keys are those of `apply_realtime`, for the control process. The key ``supervision`` holds
+    the scheduling of supervisor and recorder.
 
     Raises
     ------
     OSError, subprocess.SubprocessError, ValueError
-        If there is no such process, or it fails.
+        If the process cannot be started, or fails.
     """
     numbers = settings.priority, settings.supervision_priority, settings.cpu
-    command = [*OWN_PYTHON, "-c", _TRY, *map(str, numbers)]
-    tried = subprocess.run(command, capture_output=True, text=True, timeout=_PATIENCE_S, check=True)
-    obtained: dict[str, str]
-    obtained, supervision = json.loads(tried.stdout)
+    command = [*OWN_PYTHON, "-c", _GRANT_PROGRAM, *map(str, numbers)]
+    completed = subprocess.run(
+        command, capture_output=True, text=True, timeout=_GRANT_TIMEOUT_S, check=True
+    )
+    granted: dict[str, str]
+    granted, supervision = json.loads(completed.stdout)
     if supervision:
         cores = supervision.get("cores")
-        where = f" on core {cores}" if cores else ""
-        obtained["supervision"] = supervision["scheduling"] + where
-    return obtained
+        core_text = f" on core {cores}" if cores else ""
+        granted["supervision"] = supervision["scheduling"] + core_text
+    return granted
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
-    """Return the rows on the real-time settings that a session would be granted."""
+    """Yield the rows on the real-time settings that the system would grant to a session."""
     try:
-        obtained = settings_granted(settings)
+        granted = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         yield CheckRow(
             "real time", "rights", f"could not be tried: {error}", "", CheckResult.WARNING
@@ -78,44 +85,45 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
         return
     if settings.priority == 0:
         yield CheckRow("real time", "scheduling", "not requested", "", CheckResult.OK)
-    for name, text in obtained.items():
-        lacking = (
+    for name, text in granted.items():
+        not_granted = (
             text.startswith(REFUSED)
             or (name == "memory" and text != LOCKED)
             or (name == "supervision" and not text.startswith("SCHED_RR"))
         )
-        wanted = _WANTED.get(name, "granted") if lacking else ""
+        wanted = _REQUIRED_SETTINGS.get(name, "granted") if not_granted else ""
         yield CheckRow(
             "real time",
-            _ROWS.get(name, name.replace("_", " ")),
+            _ROW_LABELS.get(name, name.replace("_", " ")),
             text,
             wanted.format(
                 priority=settings.priority, supervision_priority=settings.supervision_priority
             ),
-            grade(fail=False, warn=lacking),
-            _remedy(name, settings) if lacking else "",
+            grade(fail=False, warn=not_granted),
+            _setting_advice(name, settings) if not_granted else "",
         )
 
 
-def _remedy(name: str, settings: RealtimeSettings) -> str:
-    """Return the remedy, which is too long for the table."""
+def _setting_advice(name: str, settings: RealtimeSettings) -> str:
+    """Return the advice for a setting that was not granted, or "" if there is none."""
     if name == "idle_states":
-        return _IDLE_STATES_REMEDY
+        return _IDLE_STATES_ADVICE
     lines = {
-        "memory": f"{_user()} - memlock unlimited",
-        "scheduling": f"{_user()} - rtprio {settings.priority}",
-        "supervision": f"{_user()} - rtprio {settings.priority}",
+        "memory": f"{_user_name()} - memlock unlimited",
+        "scheduling": f"{_user_name()} - rtprio {settings.priority}",
+        "supervision": f"{_user_name()} - rtprio {settings.priority}",
     }
     if name not in lines:
         return ""
-    row = _ROWS.get(name, name).capitalize()
+    row = _ROW_LABELS.get(name, name).capitalize()
     return (
         f"{row}: put this line into /etc/security/limits.d/rigd.conf and log in again: "
         f"{lines[name]}"
     )
 
 
-def _user() -> str:
+def _user_name() -> str:
+    """Return the name of the user of this process, or the user id if it has no name."""
     try:
         return pwd.getpwuid(os.geteuid()).pw_name
     except KeyError:
@@ -124,32 +132,41 @@ def _user() -> str:
 
 # Computer
 
-_GROUP = "computer"
-_CPU = Path("sys/devices/system/cpu")
-_CLOCK_SOURCE = Path("sys/devices/system/clocksource/clocksource0/current_clocksource")
-_THROTTLING = Path("proc/sys/kernel/sched_rt_runtime_us")
-_THROTTLING_PERIOD = Path("proc/sys/kernel/sched_rt_period_us")
-_REALTIME_KERNEL = Path("sys/kernel/realtime")
+_COMPUTER_GROUP = "computer"
+"""Group of the rows on the computer's settings."""
+_CPU_FOLDER = Path("sys/devices/system/cpu")
+"""Folder of the processor's settings, relative to the root of the file system."""
+_CLOCK_SOURCE_FILE = Path("sys/devices/system/clocksource/clocksource0/current_clocksource")
+"""File with the name of the kernel's clock source."""
+_RUNTIME_FILE = Path("proc/sys/kernel/sched_rt_runtime_us")
+"""File with the microseconds of each period that real-time processes may use."""
+_PERIOD_FILE = Path("proc/sys/kernel/sched_rt_period_us")
+"""File with the period in microseconds in which the kernel limits real-time processes."""
+_REALTIME_KERNEL_FILE = Path("sys/kernel/realtime")
+"""File that contains 1 on a real-time kernel."""
 _TIMEX_SIZE = 512
-"""More than the kernel's structure has on any architecture."""
-_NOT_SYNCHRONISED = 5
-_LEAST_RUNTIME = 0.95
-"""Fraction of each period that the kernel leaves to real-time processes by default."""
+"""Size in bytes of the buffer for the kernel's ``timex`` structure.
+
+It is larger than the structure on any architecture."""
+_TIME_ERROR_STATE = 5
+"""State that ``adjtimex`` returns for a wall clock that is not synchronised (TIME_ERROR)."""
+_MIN_RUNTIME_FRACTION = 0.95
+"""Smallest fraction of each period for real-time processes; it is the kernel's default."""
 
 
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[CheckRow]:
-    """Return the rows on settings of this computer that delay ticks, with remedies.
+    """Yield the rows on settings of this computer that can delay ticks, with advice.
 
     Parameters
     ----------
     settings
         Real-time settings of the profile.
     root
-        Root of the file system.
+        Root of the file system from which the settings are read.
     kernel
-        Version of the kernel as in ``uname -v``; empty: that of this computer.
+        Version of the kernel as in ``uname -v``, or "" for that of this computer.
     """
     kernel = kernel or platform.version()
     yield _kernel_row(root, kernel)
@@ -162,13 +179,14 @@ def machine_rows(
 
 
 def _kernel_row(root: Path, kernel: str) -> CheckRow:
-    preemptible = "PREEMPT_RT" in kernel or _read(root / _REALTIME_KERNEL) == "1"
+    """Return the row on whether the kernel is a real-time kernel."""
+    preemptible = "PREEMPT_RT" in kernel or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
     if preemptible:
         found = "PREEMPT_RT"
     else:
         found = "preemptible" if "PREEMPT" in kernel else "not preemptible"
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "kernel",
         found,
         "PREEMPT_RT",
@@ -182,10 +200,11 @@ def _kernel_row(root: Path, kernel: str) -> CheckRow:
 
 
 def _virtual_row(root: Path) -> CheckRow:
-    words = set(_read(root / "proc/cpuinfo").split())
-    virtual = "hypervisor" in words or bool(_read(root / "sys/hypervisor/type"))
+    """Return the row on whether this computer is a virtual machine."""
+    cpu_info_words = set(_read_or_empty(root / "proc/cpuinfo").split())
+    virtual = "hypervisor" in cpu_info_words or bool(_read_or_empty(root / "sys/hypervisor/type"))
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "hardware",
         "virtual machine" if virtual else "no hypervisor seen",
         "a dedicated computer",
@@ -198,27 +217,29 @@ def _virtual_row(root: Path) -> CheckRow:
 
 
 def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
+    """Return the row on whether the loop's core is isolated from other programs."""
     isolated = isolated_cores(root)
     cores = ", ".join(map(str, sorted(isolated)))
-    alone = settings.cpu in isolated if settings.cpu >= 0 else bool(isolated)
-    if settings.cpu >= 0 and isolated and not alone:
+    loop_core_isolated = settings.cpu in isolated if settings.cpu >= 0 else bool(isolated)
+    if settings.cpu >= 0 and isolated and not loop_core_isolated:
         found, remedy = (
             f"{cores}; the loop runs on {settings.cpu}",
             f"Isolated core: set realtime.cpu to -1 or to one of {cores}.",
         )
     else:
-        found, remedy = cores or "none", _how_to_isolate((os.cpu_count() or 1) - 1)
+        found, remedy = cores or "none", _isolation_advice((os.cpu_count() or 1) - 1)
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "isolated core",
         found,
         "one",
-        grade(fail=False, warn=not alone),
-        "" if alone else remedy,
+        grade(fail=False, warn=not loop_core_isolated),
+        "" if loop_core_isolated else remedy,
     )
 
 
-def _how_to_isolate(last: int) -> str:
+def _isolation_advice(last: int) -> str:
+    """Return the advice to isolate the last core, whose number is `last`."""
     if last == 0:
         return (
             "Isolated core: this computer has one core, which everything shares; use one with more."
@@ -231,44 +252,48 @@ def _how_to_isolate(last: int) -> str:
 
 
 def _governor_row(root: Path) -> CheckRow:
+    """Return the row on the governor of the processor's frequency."""
     governors = {
-        _read(path) for path in sorted((root / _CPU).glob("cpu[0-9]*/cpufreq/scaling_governor"))
+        _read_or_empty(path)
+        for path in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
     }
-    slow = bool(governors - {"performance"})
+    is_slow = bool(governors - {"performance"})
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "frequency governor",
         ", ".join(sorted(governors)) or "none: the frequency is not this system's",
         "performance",
-        grade(fail=False, warn=slow),
+        grade(fail=False, warn=is_slow),
         "Frequency governor: an idle core slows down and takes longer for the next tick; "
         "cpupower frequency-set -g performance."
-        if slow
+        if is_slow
         else "",
     )
 
 
 def _clock_row(root: Path) -> CheckRow:
-    source = _read(root / _CLOCK_SOURCE)
-    # On other architectures than x86 the counter is the architecture's own, and quick.
-    quick = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
+    """Return the row on the kernel's clock source."""
+    source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
+    # Architectures other than x86 have a fast counter of their own.
+    is_fast = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "clock source",
         source or "unknown",
         "tsc",
-        grade(fail=False, warn=not quick),
+        grade(fail=False, warn=not is_fast),
         ""
-        if quick
+        if is_fast
         else "Clock source: reading the time costs a microsecond each; the kernel log says why it "
         "does not trust the processor's counter (dmesg | grep -i tsc).",
     )
 
 
 def _wall_clock_row() -> CheckRow:
-    synchronised = _synchronised()
+    """Return the row on whether the wall clock is synchronised."""
+    synchronised = _is_wall_clock_synchronised()
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "wall clock",
         "synchronised" if synchronised else "not synchronised",
         "synchronised",
@@ -281,41 +306,44 @@ def _wall_clock_row() -> CheckRow:
 
 
 def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
-    runtime_us = _number(root / _THROTTLING, -1)
-    period_us = _number(root / _THROTTLING_PERIOD, 1_000_000)
+    """Return the row on the fraction of time that the kernel leaves to real-time processes."""
+    runtime_us = _read_number(root / _RUNTIME_FILE, -1)
+    period_us = _read_number(root / _PERIOD_FILE, 1_000_000)
     fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
-    low = fraction < _LEAST_RUNTIME and settings.priority > 0
+    too_low = fraction < _MIN_RUNTIME_FRACTION and settings.priority > 0
     return CheckRow(
-        _GROUP,
+        _COMPUTER_GROUP,
         "real-time share",
         "all of a core" if runtime_us < 0 else f"{100 * fraction:.0f} % of a core",
-        f"{100 * _LEAST_RUNTIME:.0f} %",
-        grade(fail=False, warn=low),
+        f"{100 * _MIN_RUNTIME_FRACTION:.0f} %",
+        grade(fail=False, warn=too_low),
         "Real-time share: the kernel stops real-time processes that take more; "
         "sysctl kernel.sched_rt_runtime_us=950000."
-        if low
+        if too_low
         else "",
     )
 
 
-def _synchronised() -> bool:
+def _is_wall_clock_synchronised() -> bool:
     """Return whether the kernel reports a synchronised wall clock."""
     try:
         state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
     except (OSError, AttributeError):
         return False
-    return 0 <= state < _NOT_SYNCHRONISED
+    return 0 <= state < _TIME_ERROR_STATE
 
 
-def _read(path: Path) -> str:
+def _read_or_empty(path: Path) -> str:
+    """Return the stripped text of a file, or an empty string if it cannot be read."""
     try:
         return path.read_text(errors="replace").strip()
     except OSError:
         return ""
 
 
-def _number(path: Path, otherwise: int) -> int:
+def _read_number(path: Path, default: int) -> int:
+    """Return the integer in a file, or `default` if there is none."""
     try:
-        return int(_read(path))
+        return int(_read_or_empty(path))
     except ValueError:
-        return otherwise
+        return default

@@ -55,22 +55,28 @@ if TYPE_CHECKING:
 
 # Closed loop
 
-TOLERANCE = 1.2
-"""Factor that the gains of command and torque reading may be wrong by, up and down."""
-LEAST_ANGLE_GAIN = 2.0
-LEAST_PHASE_RAD = radians(20.0)
-LEAST_DELAY_PERIODS = 1.0
+LEAST_TORQUE_GAIN_FACTOR = 1.2
+"""Smallest gain margin at torque command and torque reading, as a factor up and down."""
+LEAST_ANGLE_GAIN_FACTOR = 2.0
+"""Smallest gain margin at the angle reading, as a factor up and down."""
+LEAST_PHASE_MARGIN_RAD = radians(20.0)
+"""Smallest phase margin in rad without a warning."""
+LEAST_DELAY_MARGIN_PERIODS = 1.0
+"""Smallest delay margin without a warning, in periods of the loop."""
 
 
-STABILITY = "loop_stability"
+STABILITY_ROW = "loop_stability"
+"""Name of the row on the loop's stability."""
 
 
 def stability_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Check whether the loop of a profile's rig is stable."""
+    """Yield the row on whether the closed loop of a profile's rig is stable."""
     try:
         loop, warning = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
-        yield CheckRow("loop", "stability", str(error), "stable", CheckResult.FAIL, name=STABILITY)
+        yield CheckRow(
+            "loop", "stability", str(error), "stable", CheckResult.FAIL, name=STABILITY_ROW
+        )
         return
     found = f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s"
     yield CheckRow(
@@ -79,12 +85,12 @@ def stability_rows(profile: Profile) -> Iterator[CheckRow]:
         warning or found,
         "stable",
         grade(fail=False, warn=warning is not None),
-        name=STABILITY,
+        name=STABILITY_ROW,
     )
 
 
 def margin_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Check the margins of a stable loop."""
+    """Yield the rows on the stability margins of the closed loop; skipped if it is unstable."""
     from rigd.control import loop_margins
 
     try:
@@ -96,273 +102,315 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
         return
     period_s = 1.0 / profile.rig.rate_hz
     for margins in loop_margins(loop):
-        least_gain = LEAST_ANGLE_GAIN if margins.cut == "angle reading" else TOLERANCE
-        yield from _margin_rows(margins, least_gain, LEAST_DELAY_PERIODS * period_s)
+        least_gain = (
+            LEAST_ANGLE_GAIN_FACTOR if margins.cut == "angle reading" else LEAST_TORQUE_GAIN_FACTOR
+        )
+        yield from _margin_rows(margins, least_gain, LEAST_DELAY_MARGIN_PERIODS * period_s)
 
 
 def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) -> Iterator[CheckRow]:
+    """Yield the rows on the stability margins at one signal of the loop."""
     group = f"loop, {margins.cut}"
-    too_strong = "any" if margins.gain_up == inf else _at(_db(margins.gain_up), margins.gain_up_hz)
+    too_strong = (
+        "any"
+        if margins.gain_up == inf
+        else _with_frequency(_decibels(margins.gain_up), margins.gain_up_hz)
+    )
     too_weak = (
-        "any" if margins.gain_down == 0.0 else _at(_db(margins.gain_down), margins.gain_down_hz)
+        "any"
+        if margins.gain_down == 0.0
+        else _with_frequency(_decibels(margins.gain_down), margins.gain_down_hz)
     )
     yield CheckRow(
         group,
         "gain margin",
         f"{too_weak} / {too_strong}",
-        f"{_db(1 / least_gain)} / {_db(least_gain)}",
+        f"{_decibels(1 / least_gain)} / {_decibels(least_gain)}",
         grade(fail=False, warn=margins.gain_up < least_gain or margins.gain_down > 1 / least_gain),
     )
     yield CheckRow(
         group,
         "phase margin",
-        _at(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
-        f"{degrees(LEAST_PHASE_RAD):.0f}°",
-        grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_RAD),
+        _with_frequency(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
+        f"{degrees(LEAST_PHASE_MARGIN_RAD):.0f}°",
+        grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_MARGIN_RAD),
     )
     yield CheckRow(
         group,
         "delay margin",
         "any"
         if margins.delay_s == inf
-        else _at(f"{margins.delay_s * 1e3:.2f} ms", margins.delay_hz),
+        else _with_frequency(f"{margins.delay_s * 1e3:.2f} ms", margins.delay_hz),
         f"{least_delay_s * 1e3:.2f} ms",
         grade(fail=False, warn=margins.delay_s < least_delay_s),
     )
     yield CheckRow(
         group,
         "modulus margin",
-        _at(f"{margins.modulus:.2f}", margins.modulus_hz),
+        _with_frequency(f"{margins.modulus:.2f}", margins.modulus_hz),
         "",
         CheckResult.OK,
     )
 
 
-def _db(gain: float) -> str:
+def _decibels(gain: float) -> str:
+    """Format a gain in decibels with its sign."""
     return f"{20 * log10(gain):+.1f} dB"
 
 
-def _at(value: str, frequency_hz: float) -> str:
+def _with_frequency(value: str, frequency_hz: float) -> str:
+    """Append the frequency in brackets to a value, unless the frequency is not a number."""
     return value if frequency_hz != frequency_hz else f"{value} ({frequency_hz:.1f} Hz)"
 
 
 # Stopping distance
 
-_STEP_S = 5e-5
-_FOR_EVER_RAD = 100.0
-_NO_VISCOUS = 1e-6
-"""Viscous over Coulomb friction below which only the latter counts."""
-_GROUP = "travel"
-_LOOP_FAILS = "if the loop fails"
-TRAVEL_LOOP_FAILS = "travel_loop_fails"
-TRAVEL_ENCODER_FAILS = "travel_encoder_fails"
-TRAVEL_NO_ANGLE = "travel_no_angle"
-TRAVEL_MISSED_TICKS = "travel_missed_ticks"
+_TIME_STEP_S = 5e-5
+"""Time step in seconds of the simulated travel under torque."""
+_MAX_TRAVEL_RAD = 100.0
+"""Travel in rad above which the travel counts as infinite."""
+_NEGLIGIBLE_VISCOUS_RATIO = 1e-6
+"""Ratio of viscous to Coulomb friction torque below which viscous friction is neglected."""
+_TRAVEL_GROUP = "travel"
+"""Group of the rows on the stopping distance."""
+_LOOP_FAILS_LABEL = "if the loop fails"
+"""Label of the row on the travel after a failure of the loop."""
+TRAVEL_LOOP_FAILS_ROW = "travel_loop_fails"
+"""Name of the row on the travel after the loop has stopped."""
+TRAVEL_ENCODER_FAILS_ROW = "travel_encoder_fails"
+"""Name of the row on the travel after a failure of the encoder."""
+TRAVEL_NO_ANGLE_ROW = "travel_no_angle"
+"""Name of the row on the travel while no new angles arrive."""
+TRAVEL_MISSED_TICKS_ROW = "travel_missed_ticks"
+"""Name of the row on the travel during missed ticks."""
 
 
 @dataclass(frozen=True, slots=True)
 class Travel:
-    """Angles from where the loop fails, in rad."""
+    """Stopping distance of the shaft after a failure: angle under torque, then while coasting."""
 
     driven_rad: float
-    """While the torque is still on; infinite beyond 100 rad."""
+    """Angle that the shaft turns while the torque is still on; infinite above 100 rad."""
     coasting_rad: float
-    """While the shaft runs out; infinite beyond 100 rad, and where no friction stops it."""
+    """Angle that the shaft turns without torque until friction has stopped it.
+
+    It is infinite above 100 rad and without friction."""
 
     @property
     def total_rad(self) -> float:
-        """Angle until the shaft is at rest."""
+        """Angle in rad from the failure until the shaft is at rest."""
         return self.driven_rad + self.coasting_rad
 
 
 @lru_cache(maxsize=64)
 def worst_travel(
-    rig: RigParameters, limits: Limits, blind_s: float, max_speed_rad_s: float = inf
+    rig: RigParameters, limits: Limits, torque_on_s: float, max_speed_rad_s: float = inf
 ) -> Travel:
-    """Return the worst travel while nothing controls the shaft.
+    """Return the longest stopping distance that the limits allow while nothing controls the shaft.
 
     Parameters
     ----------
     rig, limits
         Parameters and limits of the profile.
-    blind_s
-        Time for which the torque stays on; infinite if nothing ends it.
+    torque_on_s
+        Time for which the torque remains on; infinite if nothing removes it.
     max_speed_rad_s
-        Speed above which the drive by itself exerts no torque.
+        Speed above which the drive itself exerts no torque.
 
     Notes
     -----
-    Unknown quantities are taken at their worst: while the torque is on the beam does not hold the
-    motor back, and after it all of the beam turns on with the shaft, as if it were rigid.
+    The beam acts in the worst way: it does not brake the motor while the torque is on, and it turns
+    with the shaft like a rigid body afterwards.
     """
-    if isinf(blind_s):
+    if isinf(torque_on_s):
         return Travel(inf, inf)
     motor, beam = rig.motor, rig.beam
-    light_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
-    heavy_kg_m2 = light_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
+    without_beam_kg_m2 = motor.inertia_kg_m2 + rig.sensor.tool_inertia_kg_m2
+    with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
     speed_rad_s = limits.velocity_rad_s
-    driven_rad = 0.0
-    steps = round(blind_s / _STEP_S)
+    under_torque_rad = 0.0
+    steps = round(torque_on_s / _TIME_STEP_S)
     for step in range(steps):
         torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
-        faster_rad_s = max(0.0, speed_rad_s + torque_nm / light_kg_m2 * _STEP_S)
-        before_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
-        driven_rad += 0.5 * (before_rad_s + speed_rad_s) * _STEP_S
-        if speed_rad_s == before_rad_s:  # it goes on like this
-            driven_rad += speed_rad_s * (steps - 1 - step) * _STEP_S
+        faster_rad_s = max(0.0, speed_rad_s + torque_nm / without_beam_kg_m2 * _TIME_STEP_S)
+        previous_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
+        under_torque_rad += 0.5 * (previous_rad_s + speed_rad_s) * _TIME_STEP_S
+        if speed_rad_s == previous_rad_s:  # it goes on like this
+            under_torque_rad += speed_rad_s * (steps - 1 - step) * _TIME_STEP_S
             break
-        if driven_rad > _FOR_EVER_RAD:
+        if under_torque_rad > _MAX_TRAVEL_RAD:
             break
-    if driven_rad > _FOR_EVER_RAD:
+    if under_torque_rad > _MAX_TRAVEL_RAD:
         return Travel(inf, inf)
-    coasting_rad = _coasting_rad(heavy_kg_m2, motor, speed_rad_s)
-    return Travel(driven_rad, coasting_rad if coasting_rad <= _FOR_EVER_RAD else inf)
+    coasting_rad = _coasting_rad(with_beam_kg_m2, motor, speed_rad_s)
+    return Travel(under_torque_rad, coasting_rad if coasting_rad <= _MAX_TRAVEL_RAD else inf)
 
 
 def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> float:
-    """Return the angle in which friction alone stops an inertia; infinite without friction."""
+    """Return the angle in rad in which friction alone stops a rotating inertia.
+
+    It is infinite if there is no friction.
+    """
     viscous, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
     ratio = viscous * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
-    if ratio < _NO_VISCOUS:
+    if ratio < _NEGLIGIBLE_VISCOUS_RATIO:
         return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
     if viscous == 0.0:
         return inf if speed_rad_s > 0.0 else 0.0
-    braked = log1p(ratio) / ratio if isfinite(ratio) else 0.0
-    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - braked)
+    coulomb_correction = log1p(ratio) / ratio if isfinite(ratio) else 0.0
+    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - coulomb_correction)
 
 
 @dataclass(frozen=True, slots=True)
-class _Blindness:
-    """One way in which the torque stays on while nothing controls the shaft."""
+class _UncontrolledFailure:
+    """A failure after which the torque remains on for a time while nothing controls the shaft."""
 
     name: str
+    """Name of the check's row."""
     what: str
+    """Condition of the failure, as a clause for the operator ("if the encoder fails")."""
     duration_s: float
+    """Longest time for which the torque remains on."""
     ended_by: str
-    """Limit or watchdog that ends it, with its key."""
+    """Limit or watchdog that removes the torque, with its key, as text for the operator."""
     key: str
+    """Key of the profile that determines the duration."""
 
 
-def _ways(profile: Profile) -> tuple[_Blindness, ...]:
+def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]:
+    """Return the failures after which the torque remains on for a time."""
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     assert drive is not None
-    stale, missed = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
-    own = drive.watchdog_s > drive.heartbeat_timeout_s
-    watchdog = "cia402.own_watchdog_s" if own else "cia402.heartbeat_timeout_s"
+    stale_ticks, missed_ticks = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
+    own_watchdog = drive.watchdog_s > drive.heartbeat_timeout_s
+    watchdog = "cia402.own_watchdog_s" if own_watchdog else "cia402.heartbeat_timeout_s"
     return (
-        _Blindness(
-            TRAVEL_LOOP_FAILS,
-            _LOOP_FAILS,
+        _UncontrolledFailure(
+            TRAVEL_LOOP_FAILS_ROW,
+            _LOOP_FAILS_LABEL,
             drive.watchdog_s,
             f"of the drive's watchdog ({watchdog})",
             watchdog,
         ),
-        # The tick that finds one too many switches off, and its command has its own delay.
-        _Blindness(
-            TRAVEL_NO_ANGLE,
+        # The tick that finds one old angle too many removes the torque, after the command's delay.
+        _UncontrolledFailure(
+            TRAVEL_NO_ANGLE_ROW,
             "if no angle comes",
-            (stale + 1) / rig.rate_hz + rig.actuation.delay_s,
-            f"of {stale} old angles (limits.stale_ticks_in_a_row)",
+            (stale_ticks + 1) / rig.rate_hz + rig.actuation.delay_s,
+            f"of {stale_ticks} old angles (limits.stale_ticks_in_a_row)",
             "limits.stale_ticks_in_a_row",
         ),
-        _Blindness(
-            TRAVEL_ENCODER_FAILS,
+        _UncontrolledFailure(
+            TRAVEL_ENCODER_FAILS_ROW,
             "if the encoder fails",
             ENCODER_FAILURE_S + 2 / rig.rate_hz + rig.actuation.delay_s,
             "of the encoder watch",
             "limits.standstill_torque_nm",
         ),
-        _Blindness(
-            TRAVEL_MISSED_TICKS,
+        _UncontrolledFailure(
+            TRAVEL_MISSED_TICKS_ROW,
             "if ticks are missed",
-            (missed + 1) / rig.rate_hz + rig.actuation.delay_s,
-            f"of {missed} missed ticks (limits.missed_ticks_in_a_row)",
+            (missed_ticks + 1) / rig.rate_hz + rig.actuation.delay_s,
+            f"of {missed_ticks} missed ticks (limits.missed_ticks_in_a_row)",
             "limits.missed_ticks_in_a_row",
         ),
     )
 
 
 def travel_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Compare the worst travel of each way with the angle available beyond the limit."""
+    """Yield the rows that compare the stopping distance after each failure with the free angle.
+
+    The free angle is that between the limit of the angle and the mechanical stop.
+    """
     rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
     if drive is None:
         why = "the drive is part of this program and ends with it"
-        yield CheckRow(_GROUP, _LOOP_FAILS, why, "", CheckResult.SKIPPED, name=TRAVEL_LOOP_FAILS)
+        yield CheckRow(
+            _TRAVEL_GROUP,
+            _LOOP_FAILS_LABEL,
+            why,
+            "",
+            CheckResult.SKIPPED,
+            name=TRAVEL_LOOP_FAILS_ROW,
+        )
         return
-    ways = _ways(profile)
+    failures = _uncontrolled_failures(profile)
     margin_rad = limits.stop_angle_rad - limits.angle_rad
     bound = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
-    unbounded = isinf(drive.watchdog_s)
-    if unbounded:
-        ways = tuple(way for way in ways if not isinf(way.duration_s))
+    has_no_bound = isinf(drive.watchdog_s)
+    if has_no_bound:
+        failures = tuple(failure for failure in failures if not isinf(failure.duration_s))
         yield CheckRow(
-            _GROUP,
-            f"worst, {_LOOP_FAILS}",
+            _TRAVEL_GROUP,
+            f"worst, {_LOOP_FAILS_LABEL}",
             "without bound: the profile accepts a drive without a watchdog",
             bound,
             CheckResult.WARNING,
-            f"Travel {_LOOP_FAILS}: nothing but the wired stop ends it "
+            f"Travel {_LOOP_FAILS_LABEL}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
-            TRAVEL_LOOP_FAILS,
+            TRAVEL_LOOP_FAILS_ROW,
         )
-    limited = drive.max_speed_rad_s > 0
-    most_rad_s = drive.max_speed_rad_s if limited else inf
-    travels = [worst_travel(rig, limits, way.duration_s, most_rad_s) for way in ways]
-    longest = max(range(len(ways)), key=lambda number: travels[number].total_rad)
-    for number, (way, travel) in enumerate(zip(ways, travels, strict=True)):
+    has_speed_limit = drive.max_speed_rad_s > 0
+    highest_rad_s = drive.max_speed_rad_s if has_speed_limit else inf
+    travels = [worst_travel(rig, limits, failure.duration_s, highest_rad_s) for failure in failures]
+    longest = max(range(len(failures)), key=lambda number: travels[number].total_rad)
+    for number, (failure, travel) in enumerate(zip(failures, travels, strict=True)):
         too_far = not travel.total_rad <= margin_rad
         detail = ""
         if number == longest:
-            free = worst_travel(rig, limits, way.duration_s)
-            detail = "" if unbounded else f"Travel: the worst is {way.what}. "
+            unlimited = worst_travel(rig, limits, failure.duration_s)
+            detail = "" if has_no_bound else f"Travel: the worst is {failure.what}. "
             detail += (
                 f"It relies on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
-                f"(object 6080); without it, it would be {_angle(free.total_rad)}."
-                if limited
+                f"(object 6080); without it, it would be {_format_angle(unlimited.total_rad)}."
+                if has_speed_limit
                 else "The drive's own speed limit (object 6080) is not set; "
                 "cia402.max_speed_rad_s shortens it."
             )
         if too_far:
             detail += (
-                f" Travel {way.what}: lower {way.key}, cia402.max_speed_rad_s, "
+                f" Travel {failure.what}: lower {failure.key}, cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
-        worst = "worst, " if number == longest and not unbounded else ""
+        worst = "worst, " if number == longest and not has_no_bound else ""
         yield CheckRow(
-            _GROUP,
-            f"{worst}{way.what}",
-            f"{_angle(travel.total_rad)}: {_angle(travel.driven_rad)} in the "
-            f"{way.duration_s * 1e3:g} ms {way.ended_by}, {_angle(travel.coasting_rad)} "
-            "coasting",
+            _TRAVEL_GROUP,
+            f"{worst}{failure.what}",
+            f"{_format_angle(travel.total_rad)}: {_format_angle(travel.driven_rad)} in the "
+            f"{failure.duration_s * 1e3:g} ms {failure.ended_by}, "
+            f"{_format_angle(travel.coasting_rad)} coasting",
             bound,
             grade(fail=too_far),
             detail.strip(),
-            way.name,
+            failure.name,
         )
 
 
-def _angle(angle_rad: float) -> str:
-    return f"more than {_FOR_EVER_RAD:g} rad" if isinf(angle_rad) else f"{angle_rad:.2f} rad"
+def _format_angle(angle_rad: float) -> str:
+    """Format an angle in rad; an infinite one as "more than 100 rad"."""
+    return f"more than {_MAX_TRAVEL_RAD:g} rad" if isinf(angle_rad) else f"{angle_rad:.2f} rad"
 
 
 def _friction_nm(rig: RigParameters, speed_rad_s: float) -> float:
+    """Return the friction torque of the motor at a speed in N·m."""
     return rig.motor.viscous_nm_s_per_rad * speed_rad_s + rig.motor.coulomb_nm
 
 
 # EDS file
 
-EDS = "eds"
+EDS_ROW = "eds"
+"""Name of the rows on the drive's EDS file."""
 
 
 def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
-    """Check an EDS file against the requirements on a drive.
+    """Yield the rows that compare a drive's EDS file with the requirements on a drive.
 
     Parameters
     ----------
     path
         Path of the EDS file.
     rig
-        Parameters of the profile that the drive is to serve, or None.
+        Parameters of the rig in which the drive is to be used, or None for any rig.
     """
     from rigd.devices.cia402 import Grade, check_suitability
     from rigd.devices.eds import EdsError, read_eds
@@ -379,9 +427,9 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
         node_id = rig.cia402.node_id if rig is not None and rig.cia402 is not None else 1
         eds = read_eds(path, node_id)
     except EdsError as error:
-        yield CheckRow("EDS", "file", str(error), "", CheckResult.FAIL, name=EDS)
+        yield CheckRow("EDS", "file", str(error), "", CheckResult.FAIL, name=EDS_ROW)
         return
-    yield CheckRow("EDS", "file", str(path), "", CheckResult.OK, name=EDS)
+    yield CheckRow("EDS", "file", str(path), "", CheckResult.OK, name=EDS_ROW)
     for finding in check_suitability(eds, rig).findings:
         yield CheckRow(
             "EDS",
@@ -390,12 +438,12 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
             finding.wanted,
             verdicts[finding.grade],
             finding.sentence,
-            EDS,
+            EDS_ROW,
         )
 
 
 def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Compare the EDS file that a profile names with what is required of a drive."""
+    """Yield the rows on the EDS file that the profile names; none if it names no file."""
     settings = profile.rig.cia402
     if settings is not None and settings.eds:
         yield from eds_rows(Path(settings.eds), profile.rig)
@@ -403,12 +451,14 @@ def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
 
 # Profile and wiring
 
-HIGH_LOAD = 0.7
-"""Load above which one more device, or repeated frames after a disturbance, do not fit."""
+HIGH_BUS_LOAD = 0.7
+"""Bus load, as a fraction, above which there is a warning.
+
+An additional device, or repeated frames after a disturbance, would not fit."""
 
 
 def profile_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Return the rows on the profile's name and its unverified numbers."""
+    """Yield the rows on the profile's name and its assumed, not verified, numbers."""
     yield CheckRow("profile", profile.name, str(profile.path), "", CheckResult.OK)
     assumed = [key for key, source in profile.sources.items() if source == "assumed"]
     yield CheckRow(
@@ -422,30 +472,38 @@ def profile_rows(profile: Profile) -> Iterator[CheckRow]:
 
 
 def record_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Return the row on the longest record, and whether a default chirp fits into it."""
+    """Yield the row on the longest possible record, and whether a default chirp fits into it."""
     options = signature(chirp).parameters
     limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
-    usual_s = sum(float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s"))
+    default_chirp_s = sum(
+        float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s")
+    )
     longest_s = MAX_SAMPLES / profile.rig.rate_hz
     yield CheckRow(
         "profile",
         "longest record",
         f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
-        f"{usual_s:g} s (run chirp)",
-        grade(fail=False, warn=longest_s < usual_s),
-        f"A chirp of {usual_s:g} s is refused: {limit}." if longest_s < usual_s else "",
+        f"{default_chirp_s:g} s (run chirp)",
+        grade(fail=False, warn=longest_s < default_chirp_s),
+        f"A chirp of {default_chirp_s:g} s is refused: {limit}."
+        if longest_s < default_chirp_s
+        else "",
     )
 
 
 _GRAVITY_M_PER_S2 = 9.81
-_AXIAL_LOAD = 1.5709
-"""Integral of (1 - x) φ'(x)² over that of φ(x)², x from 0 to 1, for mode 1 of a clamped-free beam:
-the stiffness that its own weight along it adds (Rayleigh), over the modal mass, in g / L."""
+"""Gravitational acceleration in m/s²."""
+_AXIAL_LOAD_COEFFICIENT = 1.5709
+"""Stiffness that the beam's axial weight adds to mode 1, over its modal mass, in units of g/L.
+
+It is Rayleigh's quotient of a clamped-free beam: the integral of (1 - x) φ'(x)² over that of φ(x)²,
+x from 0 to 1."""
 _EXAMPLE_TILT_DEG = 0.5
+"""Inclination in degrees of the example in the advice on the axis."""
 
 
-def plumb_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Check whether the motor's axis is stated to be vertical; no session is refused for it."""
+def axis_tilt_rows(profile: Profile) -> Iterator[CheckRow]:
+    """Yield the row on the measured inclination of the motor's axis; it refuses no session."""
     if profile.rig.devices.drive == "sim":
         found, detail, verdict = "the simulated rig has no gravity", "", CheckResult.SKIPPED
     elif profile.axis_tilt_deg is None:
@@ -465,30 +523,35 @@ def plumb_rows(profile: Profile) -> Iterator[CheckRow]:
 
 
 def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
-    """Return the relative change of mode 1's frequency by gravity along the beam, first order."""
+    """Return the first-order change in per cent of mode 1's frequency by gravity along the beam."""
     first_rad_s = undamped_frequencies_rad_s(beam, 1)[0]
-    along_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
-    sag = _AXIAL_LOAD * along_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
-    return float(100.0 * sag)
+    axial_gravity_m_per_s2 = _GRAVITY_M_PER_S2 * sin(radians(tilt_deg))
+    relative_shift = (
+        _AXIAL_LOAD_COEFFICIENT * axial_gravity_m_per_s2 / (2.0 * beam.length_m * first_rad_s**2)
+    )
+    return float(100.0 * relative_shift)
 
 
-UNKNOWN_VALUES = "unknown_values"
+UNKNOWN_VALUES_ROW = "unknown_values"
+"""Name of the rows on required values that the profile states as unknown."""
 
 
 def unknown_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Return the row on unknown values that every session needs."""
+    """Yield a failed row for each value that every session needs and the profile lacks."""
     for key in unknown_values(profile.rig):
         remedy = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
         yield CheckRow(
-            "profile", key, "unknown", "a value", CheckResult.FAIL, remedy, UNKNOWN_VALUES
+            "profile", key, "unknown", "a value", CheckResult.FAIL, remedy, UNKNOWN_VALUES_ROW
         )
 
 
-CAN_IDENTIFIERS, CAN_LOAD, SERIAL_LOAD = "can_identifiers", "can_load", "serial_load"
+CAN_IDENTIFIERS_ROW, CAN_LOAD_ROW, SERIAL_LOAD_ROW = "can_identifiers", "can_load", "serial_load"
+"""Names of the rows on colliding CAN identifiers, on the bus load, and on the serial line's load.
+"""
 
 
 def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
-    """Check identifiers and load of the bus or line in the profile."""
+    """Yield the rows on the CAN identifiers and on the load of the CAN bus and the serial line."""
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 
@@ -503,10 +566,14 @@ def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
 
 
 def _identifier_row(found: str, verdict: CheckResult) -> CheckRow:
-    return CheckRow("CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS)
+    """Return the row on the CAN identifiers."""
+    return CheckRow(
+        "CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS_ROW
+    )
 
 
 def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
+    """Return the row on the load of the CAN bus."""
     from rigd.devices.canbus import MAX_LOAD
 
     frames = ", ".join(
@@ -517,13 +584,14 @@ def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
         "load",
         f"{100 * load.worst:.1f} % at worst, {100 * load.plain:.1f} % without stuffing",
         f"at most {100 * MAX_LOAD:.0f} %",
-        grade(fail=load.worst > MAX_LOAD, warn=load.worst > HIGH_LOAD),
+        grade(fail=load.worst > MAX_LOAD, warn=load.worst > HIGH_BUS_LOAD),
         f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames}.",
-        CAN_LOAD,
+        CAN_LOAD_ROW,
     )
 
 
 def _line_row(serial: "AtiSerial") -> CheckRow:
+    """Return the row on the load of the serial line."""
     from rigd.devices.ati import RECORD_BITS
     from rigd.devices.canbus import MAX_LOAD
 
@@ -534,5 +602,5 @@ def _line_row(serial: "AtiSerial") -> CheckRow:
         f"{100 * load:.1f} % of {serial.baud} bit/s",
         f"at most {100 * MAX_LOAD:.0f} %",
         grade(fail=load > MAX_LOAD),
-        name=SERIAL_LOAD,
+        name=SERIAL_LOAD_ROW,
     )

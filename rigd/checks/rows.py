@@ -1,4 +1,4 @@
-"""Rows of a check: what was found, the verdict over all of them, and their table as text."""
+"""Rows of a check: value found, verdict over all rows, and their table as text."""
 
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
@@ -9,18 +9,18 @@ from rigd.units import UNITS, suffix_of
 
 # Values and their units
 
-_MILLISECONDS = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
-"""Times are shown in ms: unit of the key → how many ms it has."""
+_MILLISECONDS_PER_UNIT = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
+"""Map from a unit of time to its number of milliseconds; all times are shown in ms."""
 
 
-def name_of(key: str) -> str:
-    """Return a key as words, without its unit."""
-    end = _end(key)
+def key_label(key: str) -> str:
+    """Return a key with spaces instead of underscores and without its unit, as a label."""
+    end = _unit_suffix(key)
     return (key[: -len(end)] if end else key).replace("_", " ")
 
 
-def value_of(key: str, value: object) -> str:
-    """Return the value of a key with its unit; numbers to four digits.
+def format_value(key: str, value: object) -> str:
+    """Format the value of a key with its unit; numbers have four significant digits.
 
     Parameters
     ----------
@@ -29,10 +29,10 @@ def value_of(key: str, value: object) -> str:
     value
         Number, text, or a list of them.
     """
-    unit = UNITS.get(_end(key), "")
+    unit = UNITS.get(_unit_suffix(key), "")
     factor = 1.0
-    if unit in _MILLISECONDS:
-        factor, unit = _MILLISECONDS[unit], "ms"
+    if unit in _MILLISECONDS_PER_UNIT:
+        factor, unit = _MILLISECONDS_PER_UNIT[unit], "ms"
     if isinstance(value, list | tuple) and not all(_is_number(each) for each in value):
         return "; ".join(map(str, value))
     if isinstance(value, list | tuple):
@@ -46,12 +46,14 @@ def value_of(key: str, value: object) -> str:
     return f"{text} {unit}".rstrip()
 
 
-def _end(key: str) -> str:
-    # How many counts there are is a bare number, whose name says what is counted.
+def _unit_suffix(key: str) -> str:
+    """Return the unit suffix of a key, or an empty string."""
+    # A number of counts has no unit: the name of the key says what is counted.
     return "" if key.endswith("_counts") else suffix_of(key)
 
 
 def _is_number(value: object) -> bool:
+    """Return whether a value is an integer or a float, but not a boolean."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
@@ -59,39 +61,40 @@ def _is_number(value: object) -> bool:
 
 
 class CheckResult(Enum):
-    """Result of one row."""
+    """Result of one check of the rig."""
 
     OK = "ok"
     WARNING = "warning"
-    """A session can be run, with a caution."""
+    """A session can be run, but with caution."""
     FAIL = "failed"
     """No session may be run."""
     SKIPPED = "skipped"
-    """Not checked; `found` says why."""
+    """The check was not made; `CheckRow.found` states the reason."""
 
 
 @dataclass(frozen=True, slots=True)
 class CheckRow:
-    """One check and its result; all texts are for the operator."""
+    """Result of one check of the rig, as a row of a table for the operator."""
 
     group: str
-    """Part of the rig it belongs to."""
+    """Part of the rig that was checked."""
     what: str
-    """Quantity."""
+    """Checked quantity."""
     found: str
-    """Its value."""
+    """Value of the quantity, or the reason why it was not checked."""
     wanted: str
-    """Value it is compared with; empty if there is none."""
+    """Required value of the quantity, or an empty string if none is required."""
     verdict: CheckResult
     """Result of the check."""
     detail: str = ""
-    """Text that is too long for a table."""
+    """Explanation or remedy that is too long for the table, or an empty string."""
     name: str = ""
-    """Short name by which a session can accept a failure (`--accept`), of a check that needs no
-    device; else empty."""
+    """Short name by which a session can accept a failure of this check (`--accept`).
+
+    It is empty for checks of devices and for checks that cannot fail."""
 
     def as_dict(self) -> dict[str, str]:
-        """Return the row for a JSON document."""
+        """Return the fields of the row by name, for a JSON document."""
         return {
             "group": self.group,
             "what": self.what,
@@ -104,7 +107,10 @@ class CheckRow:
 
 
 def overall(rows: Iterable[CheckRow]) -> str:
-    """Return ``failed``, ``warnings`` or ``ok``; skipped rows do not count."""
+    """Return the verdict over all rows: ``failed``, ``warnings`` or ``ok``.
+
+    Skipped rows do not count.
+    """
     verdicts = {row.verdict for row in rows}
     if CheckResult.FAIL in verdicts:
         return "failed"
@@ -112,12 +118,12 @@ def overall(rows: Iterable[CheckRow]) -> str:
 
 
 def grade(*, fail: bool, warn: bool = False) -> CheckResult:
-    """Return the verdict on a comparison.
+    """Return the check result for two conditions: failed, warning or ok.
 
     Parameters
     ----------
     fail, warn
-        Whether it fails, and else whether it is a warning.
+        Whether the check fails and, if it does not fail, whether it gives a warning.
     """
     if fail:
         return CheckResult.FAIL
@@ -126,7 +132,7 @@ def grade(*, fail: bool, warn: bool = False) -> CheckResult:
 
 # Table
 
-_STYLES = {
+_VERDICT_STYLES = {  # Styles of the verdicts in the printed table
     CheckResult.OK: "green",
     CheckResult.WARNING: "yellow",
     CheckResult.FAIL: "bold red",
@@ -134,28 +140,31 @@ _STYLES = {
 }
 
 
-OF_A_RIG = {
+RIG_CONSEQUENCES = {
     "failed": "no session may be run",
     "warnings": "a session can be run",
     "ok": "a session can be run",
 }
-"""What the verdict over all rows means to the operator."""
-OF_AN_EDS = {
+"""Consequence of the verdict over all rows of a rig, for the operator."""
+EDS_CONSEQUENCES = {
     "failed": "this drive cannot be used",
     "warnings": "according to its EDS file, this drive can be used; read the warnings",
     "ok": "according to its EDS file, this drive can be used",
 }
+"""Consequence of the verdict over all rows of an EDS file, for the operator."""
 
 
-def print_table(rows: Sequence[CheckRow], consequences: Mapping[str, str] = OF_A_RIG) -> None:
-    """Print the table, the longer details, and the verdict, to standard output.
+def print_table(
+    rows: Sequence[CheckRow], consequences: Mapping[str, str] = RIG_CONSEQUENCES
+) -> None:
+    """Print the rows as a table, then their details and the verdict, to standard output.
 
     Parameters
     ----------
     rows
-        Rows, those of a group together.
+        Rows; those of a group are adjacent.
     consequences
-        Verdict → consequence, printed under the table.
+        Map from the verdict over all rows to its consequence, which is printed under the table.
     """
     from rich.box import SIMPLE_HEAD  # late: a session prints no table
     from rich.console import Console
@@ -168,16 +177,16 @@ def print_table(rows: Sequence[CheckRow], consequences: Mapping[str, str] = OF_A
     table.add_column("wanted", ratio=5, overflow="fold")
     table.add_column("", no_wrap=True, width=7)
     group = ""
-    named: set[str] = set()
+    shown_names: set[str] = set()
     for row in rows:
         if row.group != group:
             group = row.group
             if table.row_count:
                 table.add_row()
             table.add_row(Text(group, style="bold"))
-        style = _STYLES[row.verdict]
-        new = {row.name} - named - {""}
-        named |= new
+        style = _VERDICT_STYLES[row.verdict]
+        new = {row.name} - shown_names - {""}
+        shown_names |= new
         table.add_row(
             Text(f"  {row.what}").append("".join(f"\n  {name}" for name in new), style="dim"),
             Text(row.found),
@@ -190,10 +199,11 @@ def print_table(rows: Sequence[CheckRow], consequences: Mapping[str, str] = OF_A
         if row.detail:
             console.print(Text(row.detail))
             console.print()
-    console.print(Text(_verdict(rows, consequences), style="bold"))
+    console.print(Text(_verdict_line(rows, consequences), style="bold"))
 
 
-def _verdict(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
+def _verdict_line(rows: Sequence[CheckRow], consequences: Mapping[str, str]) -> str:
+    """Return the line under the table: verdict, numbers of rows by result, and consequence."""
     counts = {verdict: sum(row.verdict is verdict for row in rows) for verdict in CheckResult}
     text = (
         f"failed: {counts[CheckResult.FAIL]}, warnings: {counts[CheckResult.WARNING]}, "

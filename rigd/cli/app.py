@@ -21,6 +21,7 @@ from rigd.printable import readable_errors
 
 
 def _show_version(requested: bool) -> None:
+    """Print the version and end the command, if it is requested."""
     if requested:
         typer.echo(f"rigd {rigd.__version__}")
         raise typer.Exit
@@ -44,16 +45,17 @@ _SECTIONS: Final = {
     "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
-"""Commands by section of the help."""
+"""Names of the commands in each section of the help."""
 _OTHERS: Final = "Other commands"
+"""Title of the help's section with commands that are in no other section."""
 
 
 class RigdGroup(TyperGroup):
-    """Group of all commands; reports the message and the exit code of their errors."""
+    """Group of all commands, which turns errors into messages and exit codes."""
 
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
-        """Write the list of commands, in sections."""
+        """Write the list of commands of the help text, in sections."""
         listed = {name for names in _SECTIONS.values() for name in names}
         others = tuple(name for name in self.list_commands(ctx) if name not in listed)
         for title, names in {**_SECTIONS, _OTHERS: others}.items():
@@ -65,12 +67,12 @@ class RigdGroup(TyperGroup):
                     formatter.write_dl(rows)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
-        """Parse the options before the command."""
+        """Parse the options before the command, with readable error messages."""
         with readable_errors():
             return super().make_context(*args, **extra)
 
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the requested command."""
+        """Run the requested command, and end with the exit code of its error."""
         with readable_errors(), exit_on_errors():
             return super().invoke(ctx)
 
@@ -110,6 +112,6 @@ app.command()(inject)
 
 
 def main() -> None:
-    """Entry point of ``rigd``."""
+    """Run the command line ``rigd``."""
     # Until a command starts, Ctrl-C only reports that nothing has begun.
     run_command(typer.main.get_command(app))

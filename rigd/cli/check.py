@@ -1,4 +1,4 @@
-"""``rigd check``, ``reset`` and ``bench``: the state of rig and computer, and the fault reset."""
+"""Commands ``rigd check``, ``reset`` and ``bench``: check of rig and computer, reset of a fault."""
 
 import contextlib
 import json
@@ -40,17 +40,18 @@ def check(
 
     Example: rigd check --profile antenna_can
     """
-    _end_as_by_ctrl_c()
+    _interrupt_on_end_signals()
     if eds is not None:
-        _report(_rows_of(eds, profile), as_json=as_json, on_paper=True)
+        _print_result(_eds_file_rows(eds, profile), as_json=as_json, on_paper=True)
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
     from rigd.checks import check_rig
 
-    _report(check_rig(rig_profile), as_json=as_json, on_paper=False)
+    _print_result(check_rig(rig_profile), as_json=as_json, on_paper=False)
 
 
-def _rows_of(eds: Path, profile: str | None) -> "list[CheckRow]":
+def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
+    """Return the rows of an EDS file's check, by itself or against a profile."""
     from rigd.checks.on_paper import eds_rows
 
     if profile is None:
@@ -65,7 +66,11 @@ def _rows_of(eds: Path, profile: str | None) -> "list[CheckRow]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _report(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
+def _print_result(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
+    """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
+
+    `on_paper` states that the rows are those of an EDS file only.
+    """
     from rigd.checks.rows import overall
 
     verdict = overall(rows)
@@ -74,9 +79,9 @@ def _report(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
         typer.echo(json.dumps(document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import OF_A_RIG, OF_AN_EDS, CheckResult, print_table
+        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, CheckResult, print_table
 
-        print_table(rows, OF_AN_EDS if on_paper else OF_A_RIG)
+        print_table(rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
         failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}
         if failed and failed.issubset(ACCEPTABLE) and not on_paper:
             accepted = " ".join(f"--accept {name}" for name in ACCEPTABLE if name in failed)
@@ -99,7 +104,7 @@ def reset(
 
     Example: rigd reset --profile antenna_can
     """
-    _end_as_by_ctrl_c()
+    _interrupt_on_end_signals()
     if reset_by_daemon(profile):
         return
     rig_profile = _openable_profile("sim" if profile is None else profile)
@@ -112,7 +117,7 @@ def reset(
 
 
 def _openable_profile(name: str) -> "Profile":
-    """Load a profile whose devices this installation can open."""
+    """Load a profile, and check that this installation can open its devices."""
     from rigd.devices import check_selection
 
     profile = profile_named(name)
@@ -120,8 +125,8 @@ def _openable_profile(name: str) -> "Profile":
     return profile
 
 
-def _end_as_by_ctrl_c() -> None:
-    """Make every signal that requests an end act as Ctrl-C, so that the devices are closed."""
+def _interrupt_on_end_signals() -> None:
+    """Make SIGTERM and SIGHUP act as Ctrl-C, so that the devices are closed."""
     raise_on(signal.SIGTERM, signal.SIGHUP)
 
 
@@ -155,7 +160,7 @@ def bench(
     from rigd.bench import as_json as document_of
     from rigd.bench import report_lines
 
-    results = _run(rig_profile, rate_hz=rate, seconds=seconds, spin_us=spin_us)
+    results = _run_bench(rig_profile, rate_hz=rate, seconds=seconds, spin_us=spin_us)
     with contextlib.suppress(BrokenPipeError):
         if as_json:
             typer.echo(json.dumps(document_of(results), ensure_ascii=False))
@@ -163,7 +168,8 @@ def bench(
             typer.echo("\n".join(report_lines(results)))
 
 
-def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) -> "Results":
+def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) -> "Results":
+    """Run the series of latency measurements with progress on standard error."""
     from rich.console import Console
     from rich.status import Status
 
@@ -179,8 +185,8 @@ def _run(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: float) 
         Status("preparing", console=console) as status,
     ):
 
-        def on_progress(what: str, left_s: float) -> None:
-            status.update(f"{what}; {left_s // 60:.0f}:{left_s % 60:02.0f} left")
+        def on_progress(name: str, remaining_s: float) -> None:
+            status.update(f"{name}; {remaining_s // 60:.0f}:{remaining_s % 60:02.0f} left")
 
         bench = Bench(
             profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress

@@ -1,4 +1,4 @@
-"""``rigd serve``, ``status``, ``stop``, ``tare``, ``zero``: the daemon, and requests to it."""
+"""Commands ``rigd serve``, ``status``, ``stop``, ``tare``, ``zero``: daemon, and requests to it."""
 
 import json
 import signal
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
     from rigd.daemon.client import Client
 
 
-_POLL_S = 0.5
+_UPDATE_PERIOD_S = 0.5
+"""Period in seconds in which ``rigd status --watch`` updates the status."""
 
 
 def serve(
@@ -93,21 +94,22 @@ DaemonOf = Annotated[
 
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
-    """Connect to the daemon of a profile."""
+    """Connect to the daemon of a profile, or to the only running daemon; yield the client."""
     from rigd.daemon.client import Client
 
-    with Client(_socket_of(profile)) as client:
+    with Client(_socket_path(profile)) as client:
         yield client
 
 
-def _socket_of(profile: str | None) -> "Path":
+def _socket_path(profile: str | None) -> "Path":
+    """Return the path of the control socket of a profile's daemon, or of the only daemon."""
     from rigd.daemon.address import find
 
     return find(rig_name(profile))
 
 
 def rig_name(profile: str | None) -> str | None:
-    """Return the name of the rig of a profile, which identifies its daemon."""
+    """Return the name of a profile's rig, which identifies its daemon; None for no profile."""
     if profile is None:
         return None
     from rigd.daemon.address import running, socket_path
@@ -140,7 +142,7 @@ def status(
                 "daemon's socket.",
                 EXIT_WRONG_USE,
             )
-        _watch(profile)
+        _watch_status(profile)
         return
     with daemon_of(profile) as client:
         reply = client.ask("status")
@@ -184,7 +186,7 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     with daemon_of(profile) as client:
         reply = client.ask("tare")
     if as_json:
-        typer.echo(json.dumps(_measured(reply)))
+        typer.echo(json.dumps(_measured_values(reply)))
         return
     for axis, mean in reply["mean"].items():
         name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
@@ -202,13 +204,13 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     with daemon_of(profile) as client:
         reply = client.ask("zero")
     if as_json:
-        typer.echo(json.dumps(_measured(reply)))
+        typer.echo(json.dumps(_measured_values(reply)))
     else:
         typer.echo(f"Zero set (shift {reply['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Reset a rig through the daemon of its profile, or the only daemon; False without a daemon."""
+    """Reset a fault through a profile's daemon, or the only daemon; return whether one runs."""
     from rigd.daemon.address import running, socket_path
 
     sockets = running()
@@ -227,12 +229,13 @@ def reset_by_daemon(profile: str | None) -> bool:
     return True
 
 
-def _measured(reply: dict[str, Any]) -> dict[str, Any]:
+def _measured_values(reply: dict[str, Any]) -> dict[str, Any]:
+    """Return the measured values in a daemon's reply, without the reply's name and result."""
     return {name: value for name, value in reply.items() if name not in ("reply", "ok")}
 
 
-def _watch(profile: str | None) -> None:
-    """Show the status repeatedly, also after a restart of the daemon."""
+def _watch_status(profile: str | None) -> None:
+    """Show the daemon's status repeatedly until Ctrl-C, also after a restart of the daemon."""
     from rich.console import Console
     from rich.live import Live
 
@@ -242,16 +245,16 @@ def _watch(profile: str | None) -> None:
 
     name = rig_name(profile)
     with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:
-        link: Client | None = client
+        connected_client: Client | None = client
         while True:
             try:
-                link = link or Client(find(name))
-                reply = link.ask("status")
+                connected_client = connected_client or Client(find(name))
+                reply = connected_client.ask("status")
                 name = name or reply["daemon"]["profile"]
                 live.update(status_table(reply), refresh=True)
             except RigdError as error:
-                if link is not None:
-                    link.close()
-                    link = None
+                if connected_client is not None:
+                    connected_client.close()
+                    connected_client = None
                 live.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
-            time.sleep(_POLL_S)
+            time.sleep(_UPDATE_PERIOD_S)

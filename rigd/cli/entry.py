@@ -1,4 +1,4 @@
-"""Start and end of every command of ``rigd``; quick to import, for a stop."""
+"""Start and end of every command of ``rigd``, in a module that is imported quickly for a stop."""
 
 import contextlib
 import errno
@@ -12,12 +12,15 @@ from rigd.printable import readable_message
 from rigd.runtime import raise_on
 
 EXIT_FAILED = 1
+"""Exit code of a valid request that failed."""
 EXIT_WRONG_USE = 2
+"""Exit code of a request that must be changed."""
 EXIT_INTERRUPTED = 130
+"""Exit code after Ctrl-C."""
 
 
 def run_command(command: Callable[[], object]) -> None:
-    """Run a command, and end the process with its exit code or signal."""
+    """Run a command; Ctrl-C and system errors end the process with a message and an exit code."""
     raise_on(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that cannot encode "·" or "²" gets a "?" instead of an error.
@@ -29,14 +32,14 @@ def run_command(command: Callable[[], object]) -> None:
         sys.exit(EXIT_INTERRUPTED)
     except OSError as error:
         with contextlib.suppress(OSError):  # standard error may be closed as well
-            sys.stderr.write(f"Error: {readable_message(_explained(error))}\n")
+            sys.stderr.write(f"Error: {readable_message(_system_error_message(error))}\n")
         with contextlib.suppress(OSError):
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_FAILED)
 
 
-def _explained(error: OSError) -> str:
-    """Return the message for a system error that no command has handled."""
+def _system_error_message(error: OSError) -> str:
+    """Return the message on a system error that no command has caught."""
     if error.errno in (errno.EMFILE, errno.ENFILE):
         return (
             f"Too many open files ({error.strerror}); raise the limit (ulimit -n) "
@@ -44,5 +47,5 @@ def _explained(error: OSError) -> str:
         )
     if error.filename is not None:
         return f"{error.filename}: {error.strerror}."
-    # Nobody reads the output, or the disk of the output file is full.
+    # The reader of the output has ended, or the disk of the output file is full.
     return f"the output cannot be written ({error.strerror})."

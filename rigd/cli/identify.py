@@ -1,4 +1,4 @@
-"""``rigd identify``: parameters of the rig from dedicated sessions."""
+"""Command ``rigd identify``: estimates of the rig's parameters from dedicated sessions."""
 
 import json
 from pathlib import Path
@@ -107,15 +107,15 @@ def motor(
             hardware=hardware,
             quiet_stdout=as_json,
         )
-    _, found = _estimate(files, profile)
+    _, proposal = _estimate_motor(files, profile)
     if as_json:
-        document = {"files": [str(path) for path in files], **found.as_dict()}
+        document = {"files": [str(path) for path in files], **proposal.as_dict()}
         typer.echo(json.dumps(document))
         return
-    typer.echo("\n".join(["", *found.table(), ""]))
-    for note in found.notes:
+    typer.echo("\n".join(["", *proposal.table(), ""]))
+    for note in proposal.notes:
         typer.echo(f"Note: {note}")
-    typer.echo("\n".join(["", "For the profile:", "", *found.toml()]))
+    typer.echo("\n".join(["", "For the profile:", "", *proposal.toml()]))
 
 
 def _run_sessions(
@@ -130,13 +130,13 @@ def _run_sessions(
     hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
-    """Run the trial and both sessions, and return the files of the two sessions.
+    """Run the trial and the two sessions for the estimate, and return the files of these two.
 
     An incomplete session ends the command. The file of the trial is not returned, because its
     controller is too slow for the estimate.
     """
     stop, group = start_processes(live=False)
-    from rigd.identification import cautious, tuned
+    from rigd.identification import with_cautious_controller, with_tuned_controller
     from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
@@ -170,11 +170,11 @@ def _run_sessions(
         return path
 
     try:
-        trial = run(trial_session, cautious, 0, group)
-        estimate = _estimate([trial], profile_name)[0]
+        trial = run(trial_session, with_cautious_controller, 0, group)
+        estimate = _estimate_motor([trial], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":
-            return tuned(profile, estimate)
+            return with_tuned_controller(profile, estimate)
 
         return [
             run(session, tune, number, ProcessGroup(live=False))
@@ -184,7 +184,8 @@ def _run_sessions(
         ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
 
 
-def _estimate(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
+def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimate, Proposal]":
+    """Estimate the motor from session files, and propose values for the profile."""
     from rigd.identification import propose, read_recording
     from rigd.identification.estimate import estimate_motor
 

@@ -1,4 +1,4 @@
-"""``rigd list``, ``specimens``, ``info`` and ``recover``: recorded sessions and their specimens."""
+"""Commands ``rigd list``, ``specimens``, ``info`` and ``recover``: recorded sessions, specimens."""
 
 import json
 from collections.abc import Iterator, Sequence
@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from rigd.library import SessionRow
     from rigd.library.trend import ModeChange, ModeTrend, Quantity, TrendPoint
 
-_WIDEST: Final = 24
-"""Largest width of a text in a table, characters."""
-_PLOT: Final = 25
-"""Width of the plot of a trend, characters."""
+_MAX_TEXT_WIDTH: Final = 24
+"""Largest width of a text in a table, in characters."""
+_PLOT_WIDTH: Final = 25
+"""Width of the plot of a trend, in characters."""
 
 
 def list_sessions(
@@ -86,7 +86,7 @@ def list_sessions(
             )
     rows.sort(key=lambda row: row.start_utc_ns or 0, reverse=True)
     if trend:
-        trends = mode_trends(_of_one_specimen(rows))
+        trends = mode_trends(_sessions_of_one_specimen(rows))
     if as_json:
         document: dict[str, Any] = {"sessions": [row.as_dict() for row in rows]}
         if trend:
@@ -95,7 +95,7 @@ def list_sessions(
     elif trend:
         typer.echo("\n".join(_trend_lines(trends)))
     else:
-        typer.echo("\n".join(_lines(rows)))
+        typer.echo("\n".join(_session_lines(rows)))
 
 
 def specimens() -> None:
@@ -112,30 +112,31 @@ def specimens() -> None:
 
     for name, path in specimen_files().items():
         try:
-            found = load_specimen(path)
+            loaded = load_specimen(path)
         except ProfileError as error:
             text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
-            beam = found.beam
+            beam = loaded.beam
             text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
-                f"{beam.bending_stiffness_n_m2:g} N·m²{found.note and f', {found.note}'} ({path})"
+                f"{beam.bending_stiffness_n_m2:g} N·m²{loaded.note and f', {loaded.note}'} ({path})"
             )
         typer.echo(readable_message(f"{name}: {text}"))
 
 
-def _of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
-    """Return the sessions with modes; raise if they are of several specimens."""
-    found = [row for row in rows if row.modes]
-    specimens = sorted({row.specimen for row in found})
+def _sessions_of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
+    """Return the sessions whose modes are known; several specimens end the command."""
+    with_modes = [row for row in rows if row.modes]
+    specimens = sorted({row.specimen for row in with_modes})
     if len(specimens) > 1:
         names = ", ".join(repr(name) if name else "none" for name in specimens)
         fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
              EXIT_WRONG_USE)  # fmt: skip
-    return found
+    return with_modes
 
 
-def _local(row: "SessionRow") -> str:
+def _local_start(row: "SessionRow") -> str:
+    """Format the local date and time of a session's start; "" if it is unknown."""
     if row.start_utc_ns is None:
         return ""
     try:
@@ -144,35 +145,36 @@ def _local(row: "SessionRow") -> str:
         return ""
 
 
-def _table(heads: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
-    """Yield the lines of a table in columns, without empty columns."""
-    used = [column for column in range(len(heads)) if any(row[column] for row in rows)]
-    widths = {column: max(len(row[column]) for row in (heads, *rows)) for column in used}
-    for row in (heads, *rows):
-        yield "  ".join(f"{row[column]:{widths[column]}}" for column in used).rstrip()
+def _table_lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+    """Yield the lines of a table, without columns whose cells are all empty."""
+    filled_columns = [column for column in range(len(titles)) if any(row[column] for row in rows)]
+    widths = {column: max(len(row[column]) for row in (titles, *rows)) for column in filled_columns}
+    for row in (titles, *rows):
+        yield "  ".join(f"{row[column]:{widths[column]}}" for column in filled_columns).rstrip()
 
 
-def _lines(rows: "list[SessionRow]") -> Iterator[str]:
+def _session_lines(rows: "list[SessionRow]") -> Iterator[str]:
+    """Yield the lines of the list of sessions."""
     if not rows:
         yield "No sessions."
         return
-    heads = (
+    titles = (
         *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
         *("tip slope", "uniform beam", "report"),
     )
-    yield from _table(
-        heads,
+    yield from _table_lines(
+        titles,
         [
             (
-                _local(row),
+                _local_start(row),
                 printable(row.path.name),
                 *(
-                    printable(text, _WIDEST)
+                    printable(text, _MAX_TEXT_WIDTH)
                     for text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
-                ", ".join(map(_mode, row.modes)),
-                _validity(row),
-                _uniform_beam(row),
+                ", ".join(map(_mode_text, row.modes)),
+                _validity_text(row),
+                _uniform_beam_text(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
             for row in rows
@@ -183,50 +185,54 @@ def _lines(rows: "list[SessionRow]") -> Iterator[str]:
             yield f"{printable(row.path.name)}: {row.problem}"
 
 
-def _mode(mode: dict[str, Any]) -> str:
-    flagged = "?" if mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"] else ""
+def _mode_text(mode: dict[str, Any]) -> str:
+    """Format a mode's frequency and damping ratio; "?" marks flagged values."""
+    flag_mark = "?" if mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"] else ""
     frequency_hz, damping = mode["frequency_hz"]["value"], mode["damping_ratio"]["value"]
-    return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flagged}"
+    return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flag_mark}"
 
 
-def _validity(row: "SessionRow") -> str:
+def _validity_text(row: "SessionRow") -> str:
+    """Return the validity of a session's linear model in short; "" without modes."""
     from rigd.session import Validity
 
     return Validity.of_document(row.validity).short if row.modes else ""
 
 
-def _uniform_beam(row: "SessionRow") -> str:
+def _uniform_beam_text(row: "SessionRow") -> str:
+    """Return in short whether a uniform beam predicts a session's modes; "" if it is unknown."""
     from rigd.session import Validity
 
-    found = Validity.of_document(row.validity).uniform_beam
-    return "" if found is None or not row.modes else found.short
+    check_result = Validity.of_document(row.validity).uniform_beam
+    return "" if check_result is None or not row.modes else check_result.short
 
 
 # Trend
 
 
 def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
+    """Yield the lines that show how each mode changes over the sessions."""
     if not trends:
         yield "No modes are known of these sessions: analyze them first."
         return
     for number, trend in enumerate(trends, start=1):
         if number > 1:
             yield ""
-        low, high = _ends(trend)
-        yield from _table(
+        lowest_hz, highest_hz = _frequency_limits(trend)
+        yield from _table_lines(
             (
                 *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
                 *("tip slope", "file"),
             ),
             [
                 (
-                    _local(point.row),
-                    _uncertain(point.frequency_hz),
-                    _relative(point.frequency_change, trend.points[0].frequency_hz["value"]),
-                    _uncertain(point.damping_ratio, 100),
-                    _relative(point.damping_change, trend.points[0].damping_ratio["value"]),
-                    _interval(point, low, high),
-                    _validity(point.row),
+                    _local_start(point.row),
+                    _quantity_text(point.frequency_hz),
+                    _change_text(point.frequency_change, trend.points[0].frequency_hz["value"]),
+                    _quantity_text(point.damping_ratio, 100),
+                    _change_text(point.damping_change, trend.points[0].damping_ratio["value"]),
+                    _interval_plot(point, lowest_hz, highest_hz),
+                    _validity_text(point.row),
                     printable(point.row.path.name),
                 )
                 for point in trend.points
@@ -240,8 +246,8 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     )
 
 
-def _ends(trend: "ModeTrend") -> tuple[float, float]:
-    """Return the lower and upper limit of all intervals of the frequency."""
+def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
+    """Return the lowest and the highest limit of a mode's frequency intervals in Hz."""
     ends = [
         end
         for point in trend.points
@@ -250,27 +256,34 @@ def _ends(trend: "ModeTrend") -> tuple[float, float]:
     return min(ends), max(ends)
 
 
-def _interval(point: "TrendPoint", low: float, high: float) -> str:
-    """Draw the interval of the frequency between the limits of the plot."""
-    if high <= low:
+def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
+    """Return a line that shows a session's frequency interval between the plot's limits in Hz."""
+    if highest_hz <= lowest_hz:
         return ""
 
     def column_of(frequency_hz: float) -> int:
-        return min(max(round((frequency_hz - low) / (high - low) * (_PLOT - 1)), 0), _PLOT - 1)
+        return min(
+            max(
+                round((frequency_hz - lowest_hz) / (highest_hz - lowest_hz) * (_PLOT_WIDTH - 1)), 0
+            ),
+            _PLOT_WIDTH - 1,
+        )
 
     value = point.frequency_hz["value"]
     first, last = map(column_of, point.frequency_hz["interval_95"] or (value, value))
-    drawn = ["─" if first <= column <= last else " " for column in range(_PLOT)]
-    drawn[column_of(value)] = "●"
-    return "".join(drawn)
+    characters = ["─" if first <= column <= last else " " for column in range(_PLOT_WIDTH)]
+    characters[column_of(value)] = "●"
+    return "".join(characters)
 
 
-def _uncertain(quantity: "Quantity", scale: float = 1.0) -> str:
+def _quantity_text(quantity: "Quantity", scale: float = 1.0) -> str:
+    """Format a quantity with its 95 % interval; "?" marks a flagged one."""
     text = with_half_width(quantity["value"], quantity["interval_95"], scale)
     return f"{text} ?" if quantity["flag"] else text
 
 
-def _relative(change: "ModeChange | None", first: float) -> str:
+def _change_text(change: "ModeChange | None", first: float) -> str:
+    """Format a change in per cent of the first value; "*" marks a significant one."""
     if change is None or first == 0:
         return ""
     percent = 100 * change.difference / first
@@ -296,15 +309,15 @@ def info(
     failed = False
     for number, path in enumerate(paths):
         try:
-            found = describe(path)
+            description = describe(path)
         except SessionError as error:
             failed = True
             complain(str(error))
             documents.append({"path": str(path), "error": str(error)})
         else:
-            documents.append(found.as_dict())
+            documents.append(description.as_dict())
             if not as_json:
-                typer.echo(("\n" if number else "") + "\n".join(found.lines()))
+                typer.echo(("\n" if number else "") + "\n".join(description.lines()))
     if as_json and not (failed and len(paths) == 1):
         typer.echo(json.dumps(documents[0] if len(paths) == 1 else {"files": documents}))
     if failed:

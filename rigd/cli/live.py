@@ -1,4 +1,4 @@
-"""``rigd live`` and ``rigd replay``: window with a running or a recorded session."""
+"""Commands ``rigd live`` and ``rigd replay``: window with a running or a recorded session."""
 
 import contextlib
 import os
@@ -21,16 +21,17 @@ if TYPE_CHECKING:
     from rigd.live.address import LiveAddress
 
 
-_POLL_S = 0.5
+_POLL_PERIOD_S = 0.5
+"""Period in seconds in which live views are searched for."""
 
 
 def has_screen() -> bool:
-    """Return whether there is a display for a window."""
+    """Return whether this computer has a display on which a window can open."""
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 def tunnel_advice(view: "LiveAddress") -> str:
-    """Return the command that opens the live view from another computer."""
+    """Return a sentence with the command that opens a live view from another computer."""
     page, grpc = view.page_port, view.grpc_port
     return (
         f"From another computer: ssh -L {page}:127.0.0.1:{page} -L {grpc}:127.0.0.1:{grpc} "
@@ -40,7 +41,7 @@ def tunnel_advice(view: "LiveAddress") -> str:
 
 @contextlib.contextmanager
 def scratch_folder() -> Iterator[Path]:
-    """Yield a temporary folder for files that the viewer leaves."""
+    """Yield a temporary folder for files that the viewer does not remove itself."""
     try:
         folder = tempfile.TemporaryDirectory(prefix="rigd-view-", ignore_cleanup_errors=True)
     except OSError as error:
@@ -53,15 +54,15 @@ def scratch_folder() -> Iterator[Path]:
 
 
 @contextlib.contextmanager
-def ended_gently() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP act as Ctrl-C, so that temporary files are removed."""
+def interrupted_by_end_signals() -> Iterator[None]:
+    """Make SIGTERM and SIGHUP act as Ctrl-C in this context, to remove temporary files."""
     numbers = (signal.SIGTERM, signal.SIGHUP)
-    before = [signal.getsignal(number) for number in numbers]
+    previous_handlers = [signal.getsignal(number) for number in numbers]
     raise_on(*numbers)
     try:
         yield
     finally:
-        for number, handler in zip(numbers, before, strict=True):
+        for number, handler in zip(numbers, previous_handlers, strict=True):
             signal.signal(number, handler)
 
 
@@ -86,11 +87,11 @@ def live(
     Example: rigd live --profile antenna_can
     """
     rig = None if profile is None else _rig_name(profile)
-    view = _only_one(rig)
+    view = _only_running_view(rig)
     if view is None and wait:
-        view = _await(rig)
+        view = _wait_for_view(rig)
     if view is None:
-        fail(_how_to_start(profile), EXIT_FAILED)
+        fail(_start_advice(profile), EXIT_FAILED)
     if web:
         typer.echo(view.page_url)
         typer.echo(tunnel_advice(view), err=True)
@@ -106,11 +107,11 @@ def live(
             EXIT_FAILED,
         )
     else:
-        _show(view)
+        _show_view(view)
 
 
 def _rig_name(profile: str) -> str:
-    """Return the name of a profile's rig; an invalid profile ends the command."""
+    """Return the name of the rig of a profile; an invalid profile ends the command."""
     from rigd.daemon.client import find_views
 
     if find_views(profile):
@@ -120,8 +121,11 @@ def _rig_name(profile: str) -> str:
     return profile_named(profile).name
 
 
-def _only_one(rig: str | None) -> "LiveAddress | None":
-    """Return the only live view of a rig, or None; several live views end the command."""
+def _only_running_view(rig: str | None) -> "LiveAddress | None":
+    """Return the only running live view, of `rig` or of any rig, or None if there is none.
+
+    Several live views end the command.
+    """
     from rigd.daemon.client import find_views
 
     views = find_views(rig)
@@ -131,22 +135,24 @@ def _only_one(rig: str | None) -> "LiveAddress | None":
     return views[0] if views else None
 
 
-def _await(rig: str | None) -> "LiveAddress":
+def _wait_for_view(rig: str | None) -> "LiveAddress":
+    """Wait until a live view runs, and return its address."""
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
-    while (view := _only_one(rig)) is None:
-        time.sleep(_POLL_S)
+    while (view := _only_running_view(rig)) is None:
+        time.sleep(_POLL_PERIOD_S)
     return view
 
 
-def _how_to_start(profile: str | None) -> str:
+def _start_advice(profile: str | None) -> str:
+    """Return the advice for the operator if no live view is running."""
     from rigd.daemon.client import daemons
 
-    of_rig = "" if profile is None else f" of the rig {profile}"
+    rig_text = "" if profile is None else f" of the rig {profile}"
     name = profile or "NAME"
-    for rig, with_view in daemons().items():
+    for rig, has_view in daemons().items():
         if profile not in (None, rig):
             continue
-        if with_view:
+        if has_view:
             return (
                 f"The daemon of the rig {rig} has no live view at the moment: rigd status shows "
                 "its state. rigd live --wait waits for the view."
@@ -156,49 +162,52 @@ def _how_to_start(profile: str | None) -> str:
             f"with rigd serve --profile {rig} --live."
         )
     return (
-        f"No live view{of_rig} is running. Start one with rigd run chirp --profile {name} --live, "
-        f"or with rigd serve --profile {name} --live; rigd live --wait waits for it."
+        f"No live view{rig_text} is running. Start one with rigd run chirp --profile {name} "
+        f"--live, or with rigd serve --profile {name} --live; rigd live --wait waits for it."
     )
 
 
-def _show(view: "LiveAddress") -> None:
-    """Show the present live view in a window until the window is closed."""
+def _show_view(view: "LiveAddress") -> None:
+    """Show a live view in a window until the window is closed."""
     from rigd.live import Viewer
 
-    with ended_gently(), scratch_folder() as scratch:
+    with interrupted_by_end_signals(), scratch_folder() as scratch:
         viewer = Viewer(view, scratch)
         typer.echo(
             f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
             err=True,
         )
         try:
-            code = _follow(viewer, view)
+            code = _follow_servers(viewer, view)
         finally:
             viewer.close()
     if code:
         fail(f"{viewer.fault} rigd live --web shows the same in a browser.", EXIT_FAILED)
 
 
-def _follow(viewer: "Viewer", shown: "LiveAddress") -> int:
-    """Reconnect the window to each new server; return the exit code of the closed viewer."""
+def _follow_servers(viewer: "Viewer", shown: "LiveAddress") -> int:
+    """Connect a window to each new server of a live view until the window is closed.
+
+    Returns the exit code of the viewer.
+    """
     from rigd.daemon.client import find_views
 
-    there = True
+    view_is_running = True
     while (code := viewer.exit_code) is None:
-        time.sleep(_POLL_S)
+        time.sleep(_POLL_PERIOD_S)
         view = next(iter(find_views(shown.rig)), None)
         if view is not None and view.server != shown.server:
             if not viewer.connect(view):
                 continue  # tried again in the next round
             typer.echo(f"The live view of {view.rig} has restarted.", err=True)
             shown = view
-        elif view is None and there:
+        elif view is None and view_is_running:
             typer.echo(
                 f"The live view of {shown.rig} has ended; the window stays open and shows the next "
                 "one.",
                 err=True,
             )
-        there = view is not None
+        view_is_running = view is not None
     return code
 
 
@@ -229,30 +238,31 @@ def replay(
     Example: rigd replay sessions/20261120-101500-chirp.mcap
     """
     if save is not None:
-        with ended_gently():
-            _save(path, save, web=web)
+        with interrupted_by_end_signals():
+            _save_recording(path, save, web=web)
         return
     if not web and not has_screen():
-        _check_shown(path)  # the same files are valid for a window and for other outputs
-        elsewhere = (
+        _check_displayable(path)  # the same files are valid for a window and for other outputs
+        file_advice = (
             "the file can be opened elsewhere"
             if path.suffix == SUFFIX
             else f"--save OUT{SUFFIX} writes a file that can be opened elsewhere"
         )
         fail(
             "There is no screen for a window (neither DISPLAY nor WAYLAND_DISPLAY is set). "
-            f"rigd replay {path} --web prints an address for a browser; {elsewhere}.",
+            f"rigd replay {path} --web prints an address for a browser; {file_advice}.",
             EXIT_FAILED,
         )
-    with ended_gently(), scratch_folder() as scratch:
+    with interrupted_by_end_signals(), scratch_folder() as scratch:
         recording = _as_recording(path, scratch)
         if web:
-            _serve(recording, scratch, path)
+            _serve_recording(recording, scratch, path)
         else:
             _open_window(recording, scratch, path)
 
 
-def _save(path: Path, out: Path, *, web: bool) -> None:
+def _save_recording(path: Path, out: Path, *, web: bool) -> None:
+    """Write a recording of a session for Rerun to a new file."""
     if web:
         fail(
             "--save writes a file and shows nothing, so it cannot be combined with --web.",
@@ -268,8 +278,8 @@ def _save(path: Path, out: Path, *, web: bool) -> None:
     typer.echo(f"{out}: open it with rigd replay {out}.", err=True)
 
 
-def _check_shown(path: Path) -> None:
-    """Raise if the beginning of a file shows that it cannot be displayed."""
+def _check_displayable(path: Path) -> None:
+    """Raise an error if the beginning of a file shows that it cannot be displayed."""
     from rigd.session import check_beginning
 
     if path.suffix == SUFFIX:
@@ -279,7 +289,7 @@ def _check_shown(path: Path) -> None:
 
 
 def _convert(path: Path, out: Path) -> None:
-    """Write a session as a recording for Rerun."""
+    """Write a recording of a session for Rerun, with a progress line."""
     from rigd.session import read_session, read_timings
     from rigd.view import draw_session
 
@@ -289,7 +299,7 @@ def _convert(path: Path, out: Path) -> None:
 
 
 def _as_recording(path: Path, scratch: Path) -> Path:
-    """Return the file for Rerun's viewer, converted into the scratch folder if necessary."""
+    """Return the recording for Rerun's viewer; a session file is converted into `scratch`."""
     if path.suffix == SUFFIX:
         check_rrd_file(path)
         return path
@@ -299,6 +309,7 @@ def _as_recording(path: Path, scratch: Path) -> Path:
 
 
 def _open_window(recording: Path, scratch: Path, path: Path) -> None:
+    """Show a recording in a window until the window is closed."""
     from rigd.live import FileWindow
 
     with FileWindow(recording, scratch) as window:
@@ -310,7 +321,8 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
             )
 
 
-def _serve(recording: Path, scratch: Path, path: Path) -> None:
+def _serve_recording(recording: Path, scratch: Path, path: Path) -> None:
+    """Serve a recording for browsers until Ctrl-C."""
     from rigd.live import PageOfFile
 
     with PageOfFile(recording, scratch) as page:
@@ -319,4 +331,4 @@ def _serve(recording: Path, scratch: Path, path: Path) -> None:
             f"{path.name} is shown there until Ctrl-C. {tunnel_advice(page.address)}", err=True
         )
         page.wait()
-        fail(f"The Rerun server ended: {page.program.last_words}.", EXIT_FAILED)
+        fail(f"The Rerun server ended: {page.program.last_log_lines}.", EXIT_FAILED)

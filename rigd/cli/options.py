@@ -1,4 +1,4 @@
-"""Common options, exit codes and progress of the commands."""
+"""Options that several commands have in common, error messages and progress lines."""
 
 import contextlib
 import time
@@ -21,19 +21,19 @@ EXIT_INTERRUPTED = entry.EXIT_INTERRUPTED
 
 
 def fail(message: str, code: int) -> NoReturn:
-    """Write an error to standard error and end the command with an exit code."""
+    """Write an error message to standard error, and end the command with an exit code."""
     complain(message)
     raise typer.Exit(code)
 
 
 def complain(message: str) -> None:
-    """Write an error to standard error."""
+    """Write an error message to standard error."""
     typer.echo(f"Error: {readable_message(message)}", err=True)
 
 
 @contextlib.contextmanager
 def exit_on_errors() -> Iterator[None]:
-    """End the command with the message of an error of the rig and exit code 2 (usage) or 1."""
+    """Turn an error of the rig into a message and exit code 1, or 2 if the request is wrong."""
     try:
         yield
     except RigdError as error:
@@ -42,15 +42,15 @@ def exit_on_errors() -> Iterator[None]:
 
 # Progress
 
-_QUIET_S = 2.0
-"""Work up to this duration shows no progress."""
+_PROGRESS_DELAY_S = 2.0
+"""Seconds of work before a progress line appears."""
 
 
 @contextlib.contextmanager
 def progress(name: str) -> Iterator[Callable[[float], None]]:
-    """Yield a function that receives the completed fraction of the work.
+    """Show a progress line; yield a function that must be called with the completed fraction.
 
-    A progress line appears after `_QUIET_S`, on a terminal only.
+    The line appears after `_PROGRESS_DELAY_S`, on a terminal only.
     """
     started = time.monotonic()
     with contextlib.ExitStack() as stack:
@@ -58,8 +58,8 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 
         def on_progress(fraction: float) -> None:
             nonlocal show
-            if show is None and time.monotonic() - started > _QUIET_S:
-                show = stack.enter_context(_bar(name))
+            if show is None and time.monotonic() - started > _PROGRESS_DELAY_S:
+                show = stack.enter_context(_progress_line(name))
             if show is not None:
                 show(fraction)
 
@@ -67,7 +67,8 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 
 
 @contextlib.contextmanager
-def _bar(name: str) -> Iterator[Callable[[float], None]]:
+def _progress_line(name: str) -> Iterator[Callable[[float], None]]:
+    """Show a progress line at once; yield a function that receives the completed fraction."""
     with progress_bar() as bar:
         task = bar.add_task(name, total=1.0)
         yield lambda fraction: bar.update(task, completed=fraction)
@@ -163,25 +164,31 @@ WatchFit = Annotated[
 def session_notes(
     operator: str, specimen: str, note: str, meta: list[str] | None
 ) -> dict[str, str]:
-    """Return the metadata of a session by their keys in the file; invalid ones end the command."""
+    """Return the metadata of a session from the options, by their keys in the session file.
+
+    Invalid metadata end the command.
+    """
     from rigd.session.user_metadata import metadata_keys
 
     notes = {"operator": operator, "specimen": specimen, "note": note}
     for option, text in notes.items():
         if not text.isprintable():
             fail(f"--{option} {text!r}: must be a single line of plain text.", EXIT_WRONG_USE)
-    added: dict[str, str] = {}
-    for given in meta or []:
-        name, equals, value = given.partition("=")
-        if not equals or name in added:
-            wrong = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
-            fail(f"--meta {given!r}: {wrong}.", EXIT_WRONG_USE)
-        added[name] = value
-    return {name: text for name, text in notes.items() if text} | metadata_keys(added)
+    metadata: dict[str, str] = {}
+    for option_value in meta or []:
+        name, equals, value = option_value.partition("=")
+        if not equals or name in metadata:
+            problem = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
+            fail(f"--meta {option_value!r}: {problem}.", EXIT_WRONG_USE)
+        metadata[name] = value
+    return {name: text for name, text in notes.items() if text} | metadata_keys(metadata)
 
 
 def profile_named(name: str) -> "Profile":
-    """Load a profile, with a late import because it is slow."""
+    """Load a profile by its name or file.
+
+    The slow modules of profiles are imported in the function, for a quick start of other commands.
+    """
     from rigd.profile import load_profile
 
     return load_profile(name)

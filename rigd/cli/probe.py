@@ -1,4 +1,4 @@
-"""``rigd probe``: a small move that verifies scales and signs of motor, encoder and sensor."""
+"""Command ``rigd probe``: a small move that verifies scales and signs of the rig."""
 
 import json
 from functools import partial
@@ -29,7 +29,7 @@ def probe(
     from rigd.runtime import ignore
 
     try:
-        found, result = probe_in_foreground(
+        rig_profile, result = probe_in_foreground(
             group,
             stop,
             profile_name=profile,
@@ -39,12 +39,12 @@ def probe(
         )
     finally:
         ignore()
-    contradiction = result.contradiction(found)
+    contradiction = result.contradiction(rig_profile)
     if as_json:
         document = {"end": result.end.name.lower(), **result.estimate.as_dict()}
         typer.echo(json.dumps(document | {"contradiction": contradiction}))
     else:
-        typer.echo("\n".join(result.lines(found)))
+        typer.echo("\n".join(result.lines(rig_profile)))
         typer.echo(contradiction or "The rig agrees with its profile.")
     if contradiction:
         raise typer.Exit(EXIT_FAILED)

@@ -1,4 +1,4 @@
-"""``rigd profiles``: list, show and copy profiles, and write a new one from a drive's EDS file."""
+"""Command ``rigd profiles``: list, show and copy profiles, or write one from an EDS file."""
 
 import sys
 from pathlib import Path
@@ -52,12 +52,12 @@ def list_profiles() -> None:
     """
     from rigd.profile import ProfileError, load_profile, profile_files
 
-    for name, (used, *hidden) in profile_files().items():
+    for name, (used_file, *hidden) in profile_files().items():
         try:
-            description = load_profile(used.path).description
+            description = load_profile(used_file.path).description
         except ProfileError as error:
             description = f"cannot be used: {str(error).splitlines()[0]}"
-        typer.echo(printable(f"{name}: {description} ({used.path}, {used.origin})"))
+        typer.echo(printable(f"{name}: {description} ({used_file.path}, {used_file.origin})"))
         for other in hidden:
             typer.echo(printable(f"  hides {other.path} ({other.origin})"))
 
@@ -100,18 +100,18 @@ def copy(
             "copy into this folder by --here.",
             EXIT_FAILED,
         )
-    stem = new_name or profile.path.stem
-    if Path(stem).name != stem or stem.endswith(".toml"):
-        fail(f"{stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
-    path = folder / f"{stem}.toml"
+    file_stem = new_name or profile.path.stem
+    if Path(file_stem).name != file_stem or file_stem.endswith(".toml"):
+        fail(f"{file_stem}: is a path; a copy has a name only, without .toml.", EXIT_WRONG_USE)
+    path = folder / f"{file_stem}.toml"
     copy_profile(profile, path, new_name)
-    files = profile_files()[stem]
+    files = profile_files()[file_stem]
     position = [file.path.resolve() for file in files].index(path.resolve())
     if position:
         typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
     for other in files[position + 1 :]:
         typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
-    typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {stem}")
+    typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {file_stem}")
 
 
 @profiles_app.command()
@@ -142,30 +142,32 @@ def new(
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
-    for doubt in draft.doubts:
-        typer.echo(f"Note: {doubt}", err=True)
-    missing = draft.unanswered()
-    lacks = [finding.accept for finding in draft.unaccepted()]
-    if missing or lacks:
+    for remark in draft.remarks:
+        typer.echo(f"Note: {remark}", err=True)
+    unanswered = draft.unanswered_questions()
+    missing_features = [finding.accept for finding in draft.unaccepted_findings()]
+    if unanswered or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
-    for question in missing:
-        typer.echo(f"  {question.key} = {draft.shown(question.key)}: {question.text}", err=True)
-    if lacks:
+    for question in unanswered:
         typer.echo(
-            f"  cia402.accept_without: {', '.join(lacks)}: what the drive lacks; rigd refuses it "
-            "until you accept each by its name",
+            f"  {question.key} = {draft.value_text(question.key)}: {question.text}", err=True
+        )
+    if missing_features:
+        typer.echo(
+            f"  cia402.accept_without: {', '.join(missing_features)}: what the drive lacks; rigd "
+            "refuses it until you accept each by its name",
             err=True,
         )
     typer.echo(f"{output}: written. Next: rigd check --profile {output}")
 
 
 def is_terminal() -> bool:
-    """Return whether the command can ask the user."""
+    """Return whether standard input is a terminal, on which the user can answer questions."""
     return sys.stdin.isatty()
 
 
 def _ask_for_values(draft: "Draft") -> str:
-    """Ask for the values that no file states until the profile is valid; return its text."""
+    """Ask for values that no file states until the profile is valid, and return its text."""
     from rigd.profile import ProfileError
 
     typer.echo(
@@ -174,7 +176,7 @@ def _ask_for_values(draft: "Draft") -> str:
     try:
         while True:
             for question in draft.questions():
-                _ask(draft, question.key, question.text)
+                _ask_for_value(draft, question.key, question.text)
             try:
                 draft.text()
             except ProfileError as error:
@@ -188,24 +190,26 @@ def _ask_for_values(draft: "Draft") -> str:
 
 
 def _ask_for_acceptance(draft: "Draft") -> None:
-    """Ask for each missing feature of the drive whether it is accepted; Enter means no."""
+    """Ask the user whether to accept each missing feature of the drive; Enter means no."""
     declined: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
-    while lacks := [each for each in draft.unaccepted() if each.accept not in declined]:
-        typer.echo(lacks[0].sentence, err=True)
-        name = lacks[0].accept
+    while missing_features := [
+        each for each in draft.unaccepted_findings() if each.accept not in declined
+    ]:
+        typer.echo(missing_features[0].sentence, err=True)
+        name = missing_features[0].accept
         if typer.confirm(f"Run it without ({name})?", default=False, err=True):
             draft.accept(name)
         else:
             declined.add(name)
 
 
-def _ask(draft: "Draft", key: str, text: str) -> None:
-    """Ask until the answer is a valid value of the key."""
+def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
+    """Ask the user for the value of a key until the answer is valid."""
     while True:
-        given = typer.prompt(text, default=draft.shown(key), err=True)
+        reply = typer.prompt(text, default=draft.value_text(key), err=True)
         try:
-            draft.answer(key, given.strip())
+            draft.answer(key, reply.strip())
             return
         except ValueError as error:
             typer.echo(f"{key}: {error}.", err=True)

@@ -1,4 +1,4 @@
-"""``rigd run`` and ``rigd start``: sessions, with one command for each excitation.
+"""Commands ``rigd run`` and ``rigd start``: sessions, with a subcommand for each excitation.
 
 The options of each excitation are defined here once. ``rigd run`` runs the session in the
 foreground, ``rigd start`` has the daemon run it.
@@ -79,37 +79,47 @@ Model = Annotated[
 
 
 Parameters = Callable[..., "Mapping[str, Value | None]"]
-"""Returns the parameters of an excitation from its options, with the same names if possible."""
+"""Type of a function that turns the options of an excitation into its parameters.
+
+A parameter has the name of its option if possible."""
 
 
 def excitation_command(parameters: Parameters) -> Parameters:
-    """Register ``rigd run NAME`` and ``rigd start NAME``.
+    """Register the subcommands ``rigd run NAME`` and ``rigd start NAME`` of an excitation.
 
     Both have the excitation's own options and those of every session.
     """
-    _register(run_app, run_sessions, parameters)
-    _register(start_app, start_sessions, parameters)
+    _add_subcommand(run_app, run_sessions, parameters)
+    _add_subcommand(start_app, start_sessions, parameters)
     return parameters
 
 
-def _register(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
+def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
+    """Add the subcommand of an excitation to a command; `perform` runs its sessions."""
     kind = parameters.__name__
-    own = list(inspect.signature(parameters).parameters.values())
-    common = list(inspect.signature(perform).parameters.values())[2:]
+    own_parameters = list(inspect.signature(parameters).parameters.values())
+    common_parameters = list(inspect.signature(perform).parameters.values())[2:]
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
-        shared = {parameter.name: options.pop(parameter.name) for parameter in common}
-        given = {name: value for name, value in parameters(**options).items() if value is not None}
-        perform(kind, given, **shared)
+        common_options = {
+            parameter.name: options.pop(parameter.name) for parameter in common_parameters
+        }
+        given_parameters = {
+            name: value for name, value in parameters(**options).items() if value is not None
+        }
+        perform(kind, given_parameters, **common_options)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
-        [p.replace(kind=inspect.Parameter.KEYWORD_ONLY) for p in (*own, *common)]
+        [
+            p.replace(kind=inspect.Parameter.KEYWORD_ONLY)
+            for p in (*own_parameters, *common_parameters)
+        ]
     )
-    command.__annotations__ = {p.name: p.annotation for p in (*own, *common)}
+    command.__annotations__ = {p.name: p.annotation for p in (*own_parameters, *common_parameters)}
     text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
     # Otherwise the angle -0.3 would be read as an option.
-    settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
-    app.command(kind, help=text, context_settings=settings)(command)
+    command_settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
+    app.command(kind, help=text, context_settings=command_settings)(command)
 
 
 def run_sessions(
@@ -134,7 +144,7 @@ def run_sessions(
     watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
-    """Run sessions one after the other and report how they ended."""
+    """Run sessions of an excitation one after the other, and report how they ended."""
     notes = session_notes(operator, specimen, note, meta)
     fit = watch_fit or kind == "until"
     stop, group = start_processes(live=live, touch=kind == "touch", fit=fit)
@@ -450,6 +460,7 @@ def until(
 
 
 def _write_json(results: "list[RunResult]") -> None:
+    """Write the results of sessions as a JSON document to standard output."""
     from rigd.runner.session import results_document
 
     try:

@@ -1,4 +1,4 @@
-"""``rigd simulate`` and ``rigd inject``: simulated devices on the bus, and their faults."""
+"""Commands ``rigd simulate`` and ``rigd inject``: simulated devices on the bus, and faults."""
 
 from dataclasses import replace
 from pathlib import Path

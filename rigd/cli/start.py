@@ -1,4 +1,4 @@
-"""``rigd start``: sessions run by the daemon; also the start of the processes of a rig."""
+"""Implementation of ``rigd start``, whose sessions the daemon runs, and start of processes."""
 
 import contextlib
 import json
@@ -40,20 +40,21 @@ if TYPE_CHECKING:
     from rigd.runtime import StopRequest
 
 
-_POLL_S = 0.2
+_EVENT_TIMEOUT_S = 0.2
+"""Longest wait in seconds for an event of the daemon, after which Ctrl-C is checked."""
 _QUICK_LOOK_PATIENCE_S = 10.0
-"""Longest wait for the last quick look at the end."""
+"""Longest wait in seconds for the last quick look after the end of a series."""
 
 
 class SessionCommands(TyperGroup):
-    """Commands that run sessions; reports a Ctrl-C before they handle it themselves.
+    """Group of commands that run sessions, which reports a Ctrl-C before a session begins.
 
     After :func:`start_processes` Ctrl-C stops the session, which reports it.
     """
 
     # Typer's click is its own in some versions and the package of that name in others.
     def invoke(self, ctx: Any) -> Any:  # noqa: ANN401
-        """Run the requested command."""
+        """Run the requested command, and report a Ctrl-C before a session begins."""
         try:
             return super().invoke(ctx)
         except KeyboardInterrupt:
@@ -65,7 +66,7 @@ class SessionCommands(TyperGroup):
 def start_processes(
     *, live: bool, touch: bool = False, fit: bool = False
 ) -> "tuple[StopRequest, ProcessGroup]":
-    """Catch the operator's stop, and start the processes of the first session.
+    """Catch Ctrl-C as a request to stop, and start the processes of the first session.
 
     The processes import their modules while the command line imports others and plans.
     """
@@ -76,8 +77,10 @@ def start_processes(
     stop = StopRequest()
     stop.catch()
     try:
-        also = [process for process, wanted in ((TOUCH, touch), (FIT, fit)) if wanted]
-        return stop, ProcessGroup(live=live, also=also)
+        extra_processes = [
+            process for process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
+        ]
+        return stop, ProcessGroup(live=live, also=extra_processes)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "
@@ -104,7 +107,7 @@ def start_sessions(
     watch_fit: WatchFit = False,
     as_json: AsJson = False,
 ) -> None:
-    """Have the daemon run sessions, and report how they ended."""
+    """Run sessions of an excitation by the daemon, and report how they ended."""
     from rigd.session.user_metadata import META_PREFIX
 
     notes: dict[str, Any] = {}
@@ -157,7 +160,7 @@ def start_sessions(
             _print_plan(reply["plan"], err=as_json)
             # An older daemon makes no quick looks, or does not report for which sessions.
             quick_looks = daemon.get("quick_looks", False)
-            series = _follow(
+            series = _follow_series(
                 client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
             )
     if as_json:
@@ -170,7 +173,7 @@ def start_sessions(
 
 
 class _Interrupts:
-    """Counter of Ctrl-C: the first requests a stop, the second leaves."""
+    """Counts Ctrl-C: the first requests a stop, the second ends the command."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -178,50 +181,52 @@ class _Interrupts:
     @classmethod
     @contextmanager
     def caught(cls) -> Iterator["_Interrupts"]:
-        """Count interrupts within the context."""
+        """Count Ctrl-C within this context instead of raising KeyboardInterrupt."""
         interrupts = cls()
-        before = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
+        previous_handler = signal.signal(signal.SIGINT, lambda *_: interrupts.note())
         try:
             yield interrupts
         finally:
-            signal.signal(signal.SIGINT, before)
+            signal.signal(signal.SIGINT, previous_handler)
 
     def note(self) -> None:
-        """Count one interrupt."""
+        """Count one Ctrl-C."""
         self.count += 1
 
 
-def _follow(
+def _follow_series(
     client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, quick_looks: bool
 ) -> dict[str, Any]:
-    """Show the progress of a series to its end, and return its final event."""
+    """Show the progress of a series until its end, and return its final event."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
 
     stop_sent = False
-    done = 0
-    awaited: set[str] = set()
-    made: dict[str, str] = {}
+    ended_sessions = 0
+    awaited_quick_looks: set[str] = set()
+    quick_look_paths: dict[str, str] = {}
     fits: dict[str, Any] = {}
-    ended: dict[str, Any] | None = None
-    interrupts_before, deadline_s = 0, 0.0
-    line = ProgressLine()
+    final_event: dict[str, Any] | None = None
+    interrupts_at_end, deadline_s = 0, 0.0
+    progress_line = ProgressLine()
     try:
-        while ended is None or (awaited and time.monotonic() < deadline_s):
-            if ended is not None and interrupts.count > interrupts_before:
+        while final_event is None or (awaited_quick_looks and time.monotonic() < deadline_s):
+            if final_event is not None and interrupts.count > interrupts_at_end:
                 break
             if interrupts.count and not stop_sent:
                 stop_sent = True
                 client.send("stop")
-                line.say("Stopping; press Ctrl-C again to leave while the daemon finishes.")
-            if ended is None and interrupts.count > 1:
+                progress_line.say(
+                    "Stopping; press Ctrl-C again to leave while the daemon finishes."
+                )
+            if final_event is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
-            event = client.event(_POLL_S) or {}
+            event = client.event(_EVENT_TIMEOUT_S) or {}
             match event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
-                case "progress" if event["session"] > done:
-                    line.update(
+                case "progress" if event["session"] > ended_sessions:
+                    progress_line.update(
                         Phase[event["phase"].upper()],
                         event["tick"],
                         event["total"],
@@ -234,44 +239,45 @@ def _follow(
                 case "message" if "session" in event:
                     pass  # the end of a session is reported by the event of that name
                 case "message" if event["level"] != "info":
-                    line.say(f"{event['level'].capitalize()}: {event['text']}")
+                    progress_line.say(f"{event['level'].capitalize()}: {event['text']}")
                 case "message" if event.get("notable") or event["text"].startswith("Live view"):
-                    line.say(event["text"])
+                    progress_line.say(event["text"])
                 case "session":
-                    line.say(result_line(event))
-                    line.close()  # standard output may be the same terminal
+                    progress_line.say(result_line(event))
+                    progress_line.close()  # standard output may be the same terminal
                     if event["path"] is not None:
                         if not as_json:
                             typer.echo(event["path"])
                         if event.get("look_follows", quick_looks):
-                            awaited.add(event["path"])
+                            awaited_quick_looks.add(event["path"])
                         if "fit" in event:
                             fits[event["path"]] = event["fit"]
-                    line, done = ProgressLine(), event["number"]
-                case "quick_look" if event["path"] in awaited:
-                    awaited.discard(event["path"])
+                    progress_line, ended_sessions = ProgressLine(), event["number"]
+                case "quick_look" if event["path"] in awaited_quick_looks:
+                    awaited_quick_looks.discard(event["path"])
                     quick_look = QuickLook.of_event(event)
                     if quick_look.path is not None:
-                        made[event["path"]] = str(quick_look.path)
+                        quick_look_paths[event["path"]] = str(quick_look.path)
                     for text in quick_look.lines:
-                        line.say(text)
+                        progress_line.say(text)
                 case "series" if event["series"] == number:
-                    ended, interrupts_before = event, interrupts.count
+                    final_event, interrupts_at_end = event, interrupts.count
                     deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
-                    if awaited:
-                        line.say("Quick look at the session; Ctrl-C skips it.")
+                    if awaited_quick_looks:
+                        progress_line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
-        line.close()
+        progress_line.close()
     sessions = [
         each
-        | {"look": made.get(each["path"])}
+        | {"look": quick_look_paths.get(each["path"])}
         | ({"fit": fits[each["path"]]} if each["path"] in fits else {})
-        for each in ended["sessions"]
+        for each in final_event["sessions"]
     ]
-    return ended | {"sessions": sessions}
+    return final_event | {"sessions": sessions}
 
 
 def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
+    """Print the plan of a session, with `err` to standard error."""
     from rigd.runner import plan_lines
 
     for line in plan_lines(plan):

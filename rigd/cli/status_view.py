@@ -1,4 +1,4 @@
-"""Status of the daemon as text for the operator."""
+"""Display of the daemon's status on a terminal."""
 
 from collections.abc import Iterator
 from datetime import datetime
@@ -12,54 +12,62 @@ from rich.text import Text
 from rigd.daemon import page_address
 from rigd.engine.shared_state import Phase
 
-_STYLES = {
+_STATE_STYLES = {  # Style of each state of the daemon
     "idle": "dim",
     "ready": "green",
     "running": "bold green",
     "stopping": "yellow",
     "fault": "bold red",
 }
-_SHOWN_TRANSITIONS = 4
+_MAX_SHOWN_TRANSITIONS = 4
+"""Number of the daemon's last changes of state that are shown."""
 _BUSY_PERCENT = 80.0
+"""Load of the CAN bus in per cent above which the load is highlighted."""
 
 
 def print_status(status: dict[str, Any]) -> None:
-    """Print the status of the daemon."""
+    """Print the status of the daemon on the terminal."""
     Console(highlight=False).print(status_table(status))
 
 
 def status_table(status: dict[str, Any]) -> RenderableType:
-    """Return the daemon's reply to ``status`` as a rich table."""
-    head = Table(box=None, pad_edge=False, show_header=False)
-    head.add_column(style="dim", no_wrap=True)
-    head.add_column(overflow="fold")
-    for name, value in _rows(status):
-        head.add_row(name, value)
-    parts: list[RenderableType] = [head]
+    """Return the daemon's reply to the request ``status`` as a rich table."""
+    summary = Table(box=None, pad_edge=False, show_header=False)
+    summary.add_column(style="dim", no_wrap=True)
+    summary.add_column(overflow="fold")
+    for name, value in _summary_rows(status):
+        summary.add_row(name, value)
+    parts: list[RenderableType] = [summary]
     rig = status["rig"]
     if rig is not None:
         recording = status["state"] in ("running", "stopping")
         side_by_side = Table.grid(padding=(0, 2, 0, 0))
         side_by_side.add_row(
-            Group("", _signals(rig), "", _health(rig)),
+            Group("", _signal_table(rig), "", _health_table(rig)),
             Group(
-                "", _processes(rig["processes"]), "", _topics(rig["topics"], recording=recording)
+                "",
+                _process_table(rig["processes"]),
+                "",
+                _topic_table(rig["topics"], recording=recording),
             ),
         )
         parts.append(side_by_side)
-    parts.append(_history(status["history"]))
+    parts.append(_transition_table(status["history"]))
     return Group(*parts)
 
 
-def _rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
+def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
+    """Yield the names and values at the top of the status: rig, state, series and addresses."""
     daemon, series, progress = (status[name] for name in ("daemon", "series", "progress"))
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
-    doing = f" ({status['doing']})" if status["doing"] else ""
-    word = status["state"]
-    if word == "running" and progress is not None:
-        word = progress.get("activity", word)  # an older daemon has none
-    state = Text(f"{word}{doing}", style=_STYLES.get(status["state"], ""))
-    state.append(f" since {_clock(status['since_utc_ns'])}: {status['reason']}", style="default")
+    action = f" ({status['doing']})" if status["doing"] else ""
+    activity = status["state"]
+    if activity == "running" and progress is not None:
+        activity = progress.get("activity", activity)  # an older daemon has none
+    state = Text(f"{activity}{action}", style=_STATE_STYLES.get(status["state"], ""))
+    state.append(
+        f" since {_local_time(status['since_utc_ns'])}: {status['reason']}", style="default"
+    )
     yield "state", state
     if status["zero_lost"]:
         yield "zero", Text("lost with the connection: run rigd zero", style="bold yellow")
@@ -71,7 +79,7 @@ def _rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
         ),
     )
     if series is not None:
-        yield "series", Text(_series(series))
+        yield "series", Text(_series_text(series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
     # An older daemon reports no fit; a fit without lines belongs to a lost record.
@@ -86,9 +94,9 @@ def _rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
 
 
 def progress_text(progress: dict[str, Any]) -> str:
-    """Return the progress of a session as one line."""
-    left = progress["time_left_s"]
-    time_left = "" if left is None else f", {left:.0f} s left"
+    """Format the progress of a session as one line: phase, percentage, time left, and counts."""
+    remaining_s = progress["time_left_s"]
+    time_left = "" if remaining_s is None else f", {remaining_s:.0f} s left"
     return (
         f"{Phase[progress['phase'].upper()].words}, {progress['percent']:.0f} %"
         f"{time_left}; {progress['missed']} missed, {progress['late']} late, "
@@ -96,16 +104,18 @@ def progress_text(progress: dict[str, Any]) -> str:
     )
 
 
-def _series(series: dict[str, Any]) -> str:
-    what = f"{series['excitation']} {series['session']} of {series['repeat']}"
+def _series_text(series: dict[str, Any]) -> str:
+    """Return a line on a running or ended series of sessions."""
+    title = f"{series['excitation']} {series['session']} of {series['repeat']}"
     if series["running"]:
-        return f"{what}: {series['path'] or 'being planned'}"
-    done = [session for session in series["sessions"] if session["outcome"] == "complete"]
+        return f"{title}: {series['path'] or 'being planned'}"
+    complete = [session for session in series["sessions"] if session["outcome"] == "complete"]
     why = f" ({series['reason']})" if series["reason"] else ""
-    return f"{what}, ended: {len(done)} complete{why}"
+    return f"{title}, ended: {len(complete)} complete{why}"
 
 
-def _table(title: str, *columns: str) -> Table:
+def _empty_table(title: str, *columns: str) -> Table:
+    """Return an empty table with a left-aligned first column and right-aligned other ones."""
     table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline")
     table.add_column(title, no_wrap=True)
     for column in columns:
@@ -113,32 +123,32 @@ def _table(title: str, *columns: str) -> Table:
     return table
 
 
-def _signals(rig: dict[str, Any]) -> Table:
-    """Return the table of present signals and of the peaks of the record."""
-    table = _table("signal", "now", "peak")
-    known = rig["signals"] or {}
+def _signal_table(rig: dict[str, Any]) -> Table:
+    """Return the table of the rig's present signals and their peaks in the record."""
+    table = _empty_table("signal", "now", "peak")
+    signals = rig["signals"] or {}
     for name, unit, digits, now, peak in (
         ("angle", "rad", 5, rig["angle_rad"], None),
         (
             "tracking error",
             "rad",
             5,
-            known.get("tracking_error_rad"),
-            known.get("peak_tracking_error_rad"),
+            signals.get("tracking_error_rad"),
+            signals.get("peak_tracking_error_rad"),
         ),
         (
             "coupling torque",
             "N·m",
             4,
             rig["coupling_torque_nm"],
-            known.get("peak_coupling_torque_nm"),
+            signals.get("peak_coupling_torque_nm"),
         ),
         (
             "torque command",
             "N·m",
             4,
             rig["torque_command_nm"],
-            known.get("peak_torque_command_nm"),
+            signals.get("peak_torque_command_nm"),
         ),
     ):
         table.add_row(
@@ -149,27 +159,28 @@ def _signals(rig: dict[str, Any]) -> Table:
     return table
 
 
-def _health(rig: dict[str, Any]) -> Table:
-    """Return the table of the health of loop, recorder, bus and view; problems are in colour."""
-    table = _table("health", "")
+def _health_table(rig: dict[str, Any]) -> Table:
+    """Return the table of the health of loop, recorder, bus and view, with coloured problems."""
+    table = _empty_table("health", "")
     for name, text, style in _health_rows(rig):
         table.add_row(name, Text(text, style=style))
     return table
 
 
 def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
+    """Yield name, text and style of each row of the table of the rig's health."""
     health, signals = rig["health"], rig["signals"]
     if signals is not None:
         # The expected rate of the samples is that of the loop.
         expected_hz = max(topic["expected_hz"] or 0.0 for topic in rig["topics"])
-        slow = signals["rate_hz"] < 0.999 * expected_hz
-        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if slow else ""
-        late = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
-        yield "wake-up latency p50, p99", late, ""
+        is_slow = signals["rate_hz"] < 0.999 * expected_hz
+        yield "rate", f"{signals['rate_hz']:.1f} Hz", "yellow" if is_slow else ""
+        latency_text = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
+        yield "wake-up latency p50, p99", latency_text, ""
         yield "execution time p99", f"{signals['work_p99_us']:.0f} µs", ""
     lost = f"{health['missed']}, {health['late']}, {health['lost']}"
-    bad = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
-    yield "missed, late, lost", lost, bad
+    style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
+    yield "missed, late, lost", lost, style
     if health["bus_load_percent"] is not None:
         load = health["bus_load_percent"]
         yield "bus load", f"{load:.1f} %", "yellow" if load > _BUSY_PERCENT else ""
@@ -185,49 +196,54 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         yield "dropped by the viewer", f"{health['view_dropped']} samples", "yellow"
 
 
-def _processes(processes: list[dict[str, Any]]) -> Table:
-    table = _table("process", "pid", "state", "heartbeat, s ago")
+def _process_table(processes: list[dict[str, Any]]) -> Table:
+    """Return the table of the rig's processes with their state and last heartbeat."""
+    table = _empty_table("process", "pid", "state", "heartbeat, s ago")
     for process in processes:
-        bad = process["state"] in ("hung", "ended")
+        style = process["state"] in ("hung", "ended")
         table.add_row(
             process["name"],
             str(process["pid"]),
-            Text(process["state"], style="bold red" if bad else ""),
+            Text(process["state"], style="bold red" if style else ""),
             f"{process['still_s']:.1f}" if process["state"] not in ("waiting", "done") else "",
         )
     return table
 
 
-def _topics(topics: list[dict[str, Any]], *, recording: bool) -> Table:
-    table = _table("topic", "records", "Hz", "of Hz", "backlog")
+def _topic_table(topics: list[dict[str, Any]], *, recording: bool) -> Table:
+    """Return the table of recorded topics with their rate and the recorder's backlog."""
+    table = _empty_table("topic", "records", "Hz", "of Hz", "backlog")
     for topic in topics:
         table.add_row(
             topic["name"],
             str(topic["written"]),
-            _rate(topic["rate_hz"]),
-            _rate(topic["expected_hz"]) if recording else "",
+            _rate_text(topic["rate_hz"]),
+            _rate_text(topic["expected_hz"]) if recording else "",
             str(topic["waiting"]),
         )
     return table
 
 
-def _rate(rate_hz: float | None) -> str:
+def _rate_text(rate_hz: float | None) -> str:
+    """Format a rate in Hz; "" for None."""
     return "" if rate_hz is None else f"{rate_hz:.0f}"
 
 
-def _history(transitions: list[dict[str, Any]]) -> Table:
+def _transition_table(transitions: list[dict[str, Any]]) -> Table:
+    """Return the table of the daemon's last changes of state with their reasons."""
     table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0))
     table.add_column("when", no_wrap=True)
     table.add_column("from → to", no_wrap=True)
     table.add_column("why", overflow="fold")
-    for transition in transitions[-_SHOWN_TRANSITIONS:]:
+    for transition in transitions[-_MAX_SHOWN_TRANSITIONS:]:
         table.add_row(
-            _clock(transition["utc_ns"]),
+            _local_time(transition["utc_ns"]),
             f"{transition['from']} → {transition['to']}",
             Text(transition["reason"]),
         )
     return table
 
 
-def _clock(utc_ns: int) -> str:
+def _local_time(utc_ns: int) -> str:
+    """Format the local time of day of a UTC time in nanoseconds."""
     return f"{datetime.fromtimestamp(utc_ns * 1e-9):%H:%M:%S}"

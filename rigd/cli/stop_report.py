@@ -1,4 +1,4 @@
-"""Action and output of ``rigd stop``; quick to import."""
+"""Action and output of ``rigd stop``, in a module that is imported quickly."""
 
 import sys
 from typing import TYPE_CHECKING
@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
 
 def main() -> None:
-    """Run ``rigd stop`` without options, whose parser is slower than the stop itself."""
+    """Run ``rigd stop`` without the parser of options, which is slower than the stop itself."""
     run_command(lambda: sys.exit(stop_and_report(None, wait=True)))
 
 
@@ -21,9 +21,9 @@ def stop_and_report(profile: str | None, *, wait: bool) -> int:
     Parameters
     ----------
     profile
-        Profile of the only rig to stop; None: all.
+        Profile of the rig whose sessions are stopped, or None to stop all sessions.
     wait
-        Wait until the sessions have ended.
+        Whether to wait until the sessions have ended.
     """
     report = stop_all(profile, wait=wait)
     if profile is not None and not report.found:
@@ -32,11 +32,12 @@ def stop_and_report(profile: str | None, *, wait: bool) -> int:
         name = load_profile(profile).name
         if name != profile:
             report = stop_all(name, wait=wait)
-    _print(report)
+    _print_report(report)
     return 0 if report.sure else EXIT_FAILED
 
 
-def _print(report: "StopReport") -> None:
+def _print_report(report: "StopReport") -> None:
+    """Print the result of a stop to standard output, and problems to standard error."""
     lines = [f"Stopped: {text}." for text in report.stopped]
     lines += [f"{text} is being stopped." for text in report.stopping]
     lines += report.quiet
@@ -46,8 +47,10 @@ def _print(report: "StopReport") -> None:
         elif report.stopped:
             lines.append(f"All {len(report.stopped)} sessions have ended; the torque is off.")
         elif not report.quiet:
-            whose = " of yours" if report.others else ""
-            lines.append(f"No session{whose} is running. Searched: {', '.join(report.searched)}.")
+            owner_text = " of yours" if report.others else ""
+            lines.append(
+                f"No session{owner_text} is running. Searched: {', '.join(report.searched)}."
+            )
     problems = [
         f"Not stopped: {text}; only that user or root can stop it." for text in report.others
     ]

@@ -1,4 +1,4 @@
-"""Proposal of an estimate for the profile, and controllers for the sessions that it needs."""
+"""Proposed profile values from a motor's estimate, and controllers for the identification."""
 
 from dataclasses import dataclass, replace
 from math import floor, inf, log10
@@ -12,38 +12,41 @@ from rigd.units import unit_of
 # Controllers
 
 _CAUTIOUS_POLES_RAD_S = (40.0, 50.0, 63.0)
-"""At 40 rad/s the loop is stable for motors from a quarter to four times the inertia that the
-profile states, and for command delays up to 2.4 ms. A quicker one minds the delay of a light motor
-more; a slower one lets the beam take hold of the motor, and already 40 is too slow for the lightest
-ones."""
+"""Controller poles in rad/s for a motor with uncertain data, the slowest first.
+
+At 40 rad/s the loop is stable for motors from a quarter to four times the inertia that the profile
+states, and for command delays up to 2.4 ms. A faster controller is more sensitive to the delay of a
+light motor. With a slower one the beam would move the motor; even 40 rad/s is too slow for the
+lightest motors."""
 
 
-def cautious(profile: Profile) -> Profile:
-    """Return a profile with the slowest controller that holds its beam and tolerates errors.
+def with_cautious_controller(profile: Profile) -> Profile:
+    """Return a profile with the slowest stable controller, which tolerates wrong motor data.
 
-    Its scales are not compared: they are what the sessions measure.
+    The check of the scales (``limits.torque_ratio``) is off, since the sessions measure them.
     """
     profile = replace(profile, limits=replace(profile.limits, torque_ratio=inf))
     for pole_rad_s in _CAUTIOUS_POLES_RAD_S:
         if pole_rad_s < profile.control.pole_rad_s:
-            slow = replace(profile, control=replace(profile.control, pole_rad_s=pole_rad_s))
-            if _is_stable(slow):
-                return slow
+            slow_profile = replace(profile, control=replace(profile.control, pole_rad_s=pole_rad_s))
+            if _is_stable(slow_profile):
+                return slow_profile
     return profile
 
 
-def tuned(profile: Profile, estimate: MotorEstimate) -> Profile:
-    """Return a profile whose controller fits an estimate.
+def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
+    """Return a profile whose controller is designed for the estimated motor.
 
-    The commands keep their scale: inertia, friction and feed-forward are divided by it instead.
-    Where the loop is not stable with the profile's pole, it gets a cautious one.
+    The scale of the commands is unchanged: inertia, friction and feed-forward are divided by the
+    torque scale instead. If the loop is not stable with the profile's pole, the controller is that
+    of `with_cautious_controller`.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     estimate
-        Estimate of its motor.
+        Estimate of the rig's motor.
     """
     scale = estimate.torque_scale.value
     motor = replace(
@@ -54,10 +57,11 @@ def tuned(profile: Profile, estimate: MotorEstimate) -> Profile:
     control = replace(profile.control, feedforward_gain=profile.control.feedforward_gain / scale)
     limits = replace(profile.limits, torque_ratio=inf)
     fitted = replace(profile, design_motor=motor, control=control, limits=limits)
-    return fitted if _is_stable(fitted) else cautious(fitted)
+    return fitted if _is_stable(fitted) else with_cautious_controller(fitted)
 
 
 def _is_stable(profile: Profile) -> bool:
+    """Return whether the closed loop of a profile is stable."""
     try:
         check_stability(close_loop(profile.loop_model()))
     except ControlDesignError:
@@ -67,18 +71,22 @@ def _is_stable(profile: Profile) -> bool:
 
 # Proposal
 
-_DIFFERS = 3.0
-"""Standard deviations."""
-_HIGH_MISFIT = 1.5
+_SIGNIFICANT_STDS = 3.0
+"""Standard deviations by which an estimate must deviate from a profile's value to differ."""
+_MAX_UNREMARKED_MISFIT = 1.5
+"""Misfit of an estimate above which there is a note for the operator."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProposalRow:
-    """A number of the profile and its measured value."""
+    """Comparison of a number of the profile with its estimate."""
 
     key: str
+    """Dotted key of the number in the profile."""
     measured: MotorQuantity
+    """Estimate of the number."""
     profile_value: float
+    """Value of the number in the profile."""
     source: str
     """Source of the profile's value."""
     least: float = 0.0
@@ -86,26 +94,32 @@ class ProposalRow:
 
     @property
     def unit(self) -> str:
-        """Unit of all its numbers."""
+        """Unit of the compared numbers."""
         return unit_of(self.key)
 
     @property
     def is_below_least(self) -> bool:
-        """Whether the measured value is below its lower bound by more than its scatter."""
-        lowest = self.least - _DIFFERS * (self.measured.std or 0.0)
+        """Whether the estimate is significantly below the smallest allowed value."""
+        lowest = self.least - _SIGNIFICANT_STDS * (self.measured.std or 0.0)
         return self.least > 0.0 and self.measured.value < lowest
 
     @property
     def differs(self) -> bool | None:
-        """Whether measurement and profile are more than three deviations apart."""
+        """Whether estimate and profile differ by more than three standard deviations.
+
+        It is None if the quantity was not estimated.
+        """
         if self.measured.std is None:
             return None
-        return abs(self.measured.value - self.profile_value) > _DIFFERS * self.measured.std
+        return abs(self.measured.value - self.profile_value) > _SIGNIFICANT_STDS * self.measured.std
 
     def toml(self) -> str:
-        """Return the line to paste; a value below its bound by less than its scatter is raised."""
+        """Return the line with the estimate for the profile.
+
+        An estimate insignificantly below the smallest allowed value is replaced by that value.
+        """
         std = self.measured.std or 0.0
-        value, deviation = _rounded(self.measured.value, std)
+        value, deviation = _format_with_std(self.measured.value, std)
         if not self.is_below_least and float(value) < self.least:
             value = f"{self.least:g}"
         name = self.key.rpartition(".")[2]
@@ -114,24 +128,24 @@ class ProposalRow:
 
 @dataclass(frozen=True, slots=True)
 class Proposal:
-    """Comparison of an estimate with the profile that it is to improve."""
+    """Proposed values for a profile from an estimate of its motor."""
 
     estimate: MotorEstimate
     """Estimate of the motor."""
     rows: tuple[ProposalRow, ...]
-    """Comparison of estimate and profile, one row a quantity."""
+    """Comparison of estimate and profile, a row for each number."""
     notes: tuple[str, ...]
-    """Sentences for the operator."""
+    """Sentences for the operator on the estimate."""
 
     def table(self) -> list[str]:
-        """Return the comparison as lines of text."""
-        heads = ("", "measured", "± std", "profile", "source", "")
-        cells = [heads]
+        """Return the lines of a table that compares estimate and profile."""
+        titles = ("", "measured", "± std", "profile", "source", "")
+        cells = [titles]
         for row in self.rows:
             if row.measured.std is None:
                 value, deviation = "not identifiable", ""
             else:
-                value, deviation = _rounded(row.measured.value, row.measured.std)
+                value, deviation = _format_with_std(row.measured.value, row.measured.std)
             verdict = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
             cells.append(
                 (
@@ -143,26 +157,26 @@ class Proposal:
                     verdict,
                 )
             )
-        widths = [max(len(line[column]) for line in cells) for column in range(len(heads))]
+        widths = [max(len(line[column]) for line in cells) for column in range(len(titles))]
         lines = ("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in cells)
         return [line.rstrip() for line in lines]
 
     def toml(self) -> list[str]:
-        """Return the lines to paste into the profile, under their sections."""
+        """Return the lines with the estimates for the profile, under their sections."""
         lines: list[str] = []
         section = ""
         for row in self.rows:
             if row.measured.std is None:
                 continue
-            wanted = row.key.rpartition(".")[0]
-            if wanted != section:
-                section = wanted
+            row_section = row.key.rpartition(".")[0]
+            if row_section != section:
+                section = row_section
                 lines += [""] * bool(lines) + [f"[{section}]"]
             lines.append(row.toml())
         return lines
 
     def as_dict(self) -> dict[str, Any]:
-        """Return it as a document of JSON types."""
+        """Return the proposal as a JSON document."""
         scale = self.estimate.torque_scale
         return {
             "parameters": {
@@ -187,20 +201,20 @@ class Proposal:
 
 
 def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> Proposal:
-    """Compare an estimate with a profile.
+    """Compare a motor's estimate with the profile, and propose new values.
 
     Parameters
     ----------
     estimate
         Estimate of the profile's motor.
     profile
-        Profile in which the numbers are to go.
+        Profile for which values are proposed.
     unusable
-        Passes that were left out before the estimate.
+        Number of passes that were omitted before the estimate.
     """
     rig = profile.rig
     motor = rig.motor
-    found: list[tuple[str, MotorQuantity, float]] = [
+    compared: list[tuple[str, MotorQuantity, float]] = [
         ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
@@ -210,7 +224,7 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         ("motor.coulomb_nm", estimate.coulomb_nm, motor.coulomb_nm),
         (
             "motor.rated_torque_nm",
-            _times(motor.rated_torque_nm, estimate.torque_scale),
+            _scaled(motor.rated_torque_nm, estimate.torque_scale),
             motor.rated_torque_nm,
         ),
         ("actuation.delay_s", estimate.actuation_delay_s, rig.actuation.delay_s),
@@ -221,18 +235,18 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         ),
     ]
     if rig.cia402 is not None and rig.cia402.rated_torque_unit_nm > 0.0:
-        # The drive's own rated torque is compared with the profile's by it: both change alike.
+        # It converts the drive's own rated torque for the comparison: both change by one factor.
         unit_nm = rig.cia402.rated_torque_unit_nm
         key = "cia402.rated_torque_unit_nm"
-        found.append((key, _times(unit_nm, estimate.torque_scale), unit_nm))
-    waits = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
-    least = {"actuation.delay_s": 1 / rig.rate_hz} if waits else {}
+        compared.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
+    torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
+    smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
     rows = tuple(
-        ProposalRow(*row, profile.sources.get(row[0], "assumed"), least.get(row[0], 0.0))
-        for row in found
+        ProposalRow(*row, profile.sources.get(row[0], "assumed"), smallest_values.get(row[0], 0.0))
+        for row in compared
     )
     notes = _notes(estimate, profile, unusable)
-    if any(row.is_below_least for row in rows if row.key in least):
+    if any(row.is_below_least for row in rows if row.key in smallest_values):
         notes.append(
             "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
             'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'
@@ -240,12 +254,14 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
     return Proposal(estimate, rows, tuple(notes))
 
 
-def _times(factor: float, quantity: MotorQuantity) -> MotorQuantity:
+def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
+    """Return a quantity and its standard deviation, multiplied by a factor."""
     std = None if quantity.std is None else factor * quantity.std
     return MotorQuantity(factor * quantity.value, std)
 
 
 def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str]:
+    """Return the sentences for the operator on what the estimate does not determine."""
     scale = estimate.torque_scale
     if scale.std is None:
         notes = [
@@ -254,7 +270,7 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
             "drive states it, and inertia and friction refer to that."
         ]
     else:
-        value, deviation = _rounded(scale.value, scale.std)
+        value, deviation = _format_with_std(scale.value, scale.std)
         notes = [
             f"The motor exerts {value} ± {deviation} times the torque commanded, against the "
             "sensor; motor.rated_torque_nm is corrected by that. Inertia and friction refer to the "
@@ -268,25 +284,25 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str
     notes.append(
         "control.friction_compensation_nm switches the friction feed-forward on; 0 leaves it off."
     )
-    if estimate.misfit > _HIGH_MISFIT:
+    if estimate.misfit > _MAX_UNREMARKED_MISFIT:
         notes.append(
             f"The motor's equation leaves {estimate.misfit:.1f} times what scatter explains (up to "
             f"{estimate.friction_departure_nm:.2g} N·m of the mean torque of a pass): friction is "
             "not only viscous and Coulomb, or a delay of the profile is not true. The deviations "
             "are widened for it."
         )
-    left_out = unusable + estimate.dropped
-    if left_out:
+    omitted = unusable + estimate.dropped
+    if omitted:
         notes.append(
-            f"{left_out} of {left_out + estimate.windows} passes were left out: {unusable} with "
+            f"{omitted} of {omitted + estimate.windows} passes were left out: {unusable} with "
             f"missed ticks or held readings, {estimate.dropped} in which the shaft may have stood "
             "still."
         )
     return notes
 
 
-def _rounded(value: float, std: float) -> tuple[str, str]:
-    """Format a value and its deviation to two digits of the deviation."""
+def _format_with_std(value: float, std: float) -> tuple[str, str]:
+    """Format a value and its standard deviation, to two significant digits of the latter."""
     if std <= 0.0:
         return f"{value:.6g}", "0"
     exponent = floor(log10(max(abs(value), std)))

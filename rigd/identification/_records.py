@@ -1,4 +1,4 @@
-"""Windows of motion from recorded sessions, as input of the estimate."""
+"""Reader of recorded sessions whose windows of motion are the input of the motor's estimate."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -7,29 +7,41 @@ from pathlib import Path
 import numpy as np
 
 from rigd.identification.estimate import MotorEstimateError, PassReadings, Timing
-from rigd.identification.experiments import MULTISINE, SPEEDS, TOP_HZ, lay_out_passes, read_layout
+from rigd.identification.experiments import (
+    HIGHEST_FREQUENCY_HZ,
+    MULTISINE,
+    SPEEDS,
+    passes_of_schedule,
+    read_schedule,
+)
 from rigd.session import Session, read_session, sample_digests
 from rigd.session.layout import Status
 
-_USELESS = int(
+_UNUSABLE_STATUS = int(
     Status.ANGLE_STALE | Status.WRENCH_STALE | Status.WRENCH_SATURATED | Status.TORQUE_OFF
 )
-"""Status bits of held or clipped readings, which do not belong to the torque of their tick."""
+"""Status bits of samples that cannot be used.
+
+Their readings are old or clipped, or the torque was off, so that they do not belong to the torque
+that was commanded."""
 
 
 @dataclass(frozen=True, slots=True)
 class Recording:
-    """Data of some sessions of one rig for the estimate."""
+    """Windows of motion from sessions of one rig, for the estimate of its motor."""
 
     windows: list[PassReadings]
+    """Usable windows of all sessions."""
     timing: Timing
+    """Rate and delays of the readings."""
     tool_inertia_kg_m2: float
+    """Inertia between sensor and beam."""
     unusable: int
-    """Passes with gaps, or with readings that were held or clipped."""
+    """Number of passes with missing samples, or with old or clipped readings."""
 
 
 def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording:
-    """Read the passes of sessions that `rigd identify motor` ran.
+    """Read the windows of motion from sessions that `rigd identify motor` recorded.
 
     Parameters
     ----------
@@ -37,6 +49,11 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         Session files of one rig, in any order.
     actuation_delay_s
         Start value of the search for the command's delay.
+
+    Returns
+    -------
+    Recording
+        Windows, and timing of their readings.
 
     Raises
     ------
@@ -50,18 +67,18 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     unusable = 0
     first: tuple[Timing, float] | None = None
     digests: dict[Path, frozenset[bytes]] = {}
-    for number, path in enumerate(paths):
+    for session_number, path in enumerate(paths):
         session = read_session(path)
         samples = session.samples
-        own = sample_digests(samples["angle_rad"], samples["coupling_torque_nm"])
-        for other, theirs in digests.items():
-            if own & theirs:
+        digest = sample_digests(samples["angle_rad"], samples["coupling_torque_nm"])
+        for other, other_digest in digests.items():
+            if digest & other_digest:
                 raise MotorEstimateError(
                     f"{path}: it has samples of {other}, noise included, which would count twice; "
                     "give each session once."
                 )
-        digests[path] = own
-        found = (
+        digests[path] = digest
+        rig_data = (
             Timing(
                 session.number("rate_hz"),
                 session.number("angle_delay_s", 0.0),
@@ -71,18 +88,18 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             session.number("tool_inertia_kg_m2", 0.0),
         )
         if first is None:
-            first = found
-        if found != first:
+            first = rig_data
+        if rig_data != first:
             raise MotorEstimateError(
                 f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
                 "sessions of one rig."
             )
-        usable, expected = _passes(session, number, found[0].rate_hz)
+        usable, expected = _read_passes(session, session_number, rig_data[0].rate_hz)
         windows += usable
         unusable += expected - len(usable)
     if first is None:
         raise MotorEstimateError("No session file is given.")
-    if all(window.top_hz == TOP_HZ[SPEEDS] for window in windows):
+    if all(window.top_hz == HIGHEST_FREQUENCY_HZ[SPEEDS] for window in windows):
         raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."
@@ -90,34 +107,36 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
     return Recording(windows, *first, unusable)
 
 
-def _passes(session: Session, number: int, rate_hz: float) -> tuple[list[PassReadings], int]:
-    """Return the usable windows of a session, and how many there should be."""
-    layout = read_layout(session.metadata)
-    if layout is None:
+def _read_passes(
+    session: Session, session_number: int, rate_hz: float
+) -> tuple[list[PassReadings], int]:
+    """Return the usable windows of a session, and the number of its passes."""
+    schedule = read_schedule(session.metadata)
+    if schedule is None:
         raise MotorEstimateError(
             f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
             "give the files that it wrote."
         )
-    kind = session.metadata["excitation"]
+    excitation = session.metadata["excitation"]
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
-    useless = (samples["status"] & _USELESS) != 0
-    passes = lay_out_passes(layout, rate_hz)
+    is_unusable = (samples["status"] & _UNUSABLE_STATUS) != 0
+    passes = passes_of_schedule(schedule, rate_hz)
     windows = []
-    for run in passes:
-        first, end = np.searchsorted(ticks, (run.first, run.end)).tolist()
-        if end - first < run.end - run.first or useless[first:end].any():
+    for speed_pass in passes:
+        first, end = np.searchsorted(ticks, (speed_pass.first, speed_pass.end)).tolist()
+        if end - first < speed_pass.end - speed_pass.first or is_unusable[first:end].any():
             continue
-        part = samples[first:end]
+        window = samples[first:end]
         windows.append(
             PassReadings(
-                angle_rad=part["angle_rad"],
-                torque_command_nm=part["torque_command_nm"],
-                coupling_torque_nm=part["coupling_torque_nm"],
-                speed_rad_s=run.speed_rad_s,
-                top_hz=TOP_HZ[kind],
-                session=number,
-                key=(number, run.speed_rad_s),
+                angle_rad=window["angle_rad"],
+                torque_command_nm=window["torque_command_nm"],
+                coupling_torque_nm=window["coupling_torque_nm"],
+                speed_rad_s=speed_pass.speed_rad_s,
+                top_hz=HIGHEST_FREQUENCY_HZ[excitation],
+                session=session_number,
+                key=(session_number, speed_pass.speed_rad_s),
             )
         )
     return windows, len(passes)

@@ -1,18 +1,19 @@
-"""Inertia, friction, torque scale and delay of a motor from windows of its motion.
+"""Estimate of a motor's inertia, friction, torque scale and delay from windows of its motion.
 
-Windows of one key are repeats of the same motion. The motor's equation, with the torque held
-between commands,
+Windows with the same key are repeats of the same motion. The motor's equation, with a torque that
+is constant between commands,
 
     ``s u(t - D) = J θ'' + B θ' + C sign(θ') + z + τ_c``,
 
 is multiplied by smooth test functions ``w(t) exp(-iωt)`` and integrated by parts, so that no
-reading is differentiated; frequency by frequency this gives linear rows, moments of the readings
-(`_moments`). All integrals are exact for a command that changes at any moment of a period. The
+reading is differentiated. Each frequency gives a linear equation between moments of the readings
+(`_equations`). All integrals are exact for a command that changes at any moment of a period. The
 measured coupling torque τ_c is alone on its side because it carries the noise.
 
-The rows are fitted by weighted least squares (`_fit`). The mean of repeats is fitted, because the
-loop feeds the noise of a reading back into the command and so biases a fit of single ones; their
-scatter gives the weights, the remainder of that bias, and the standard deviations.
+The equations are solved by weighted least squares (`_fit_equation`). The mean of the repeats is
+fitted, because the loop feeds the noise of a reading back into the command, which would bias a fit
+of single repeats. The scatter of the repeats gives the weights, the remainder of this bias, and
+the standard deviations.
 """
 
 from collections.abc import Hashable, Sequence
@@ -30,53 +31,65 @@ Complex = NDArray[np.complex128]
 
 # The motor's equation as linear rows
 
-SCALE, INERTIA, VISCOUS, COULOMB, DELAY, ZERO = range(6)
-"""Indices of the unknowns; from the last on, one zero of the torque for each session."""
+SCALE_INDEX, INERTIA_INDEX, VISCOUS_INDEX, COULOMB_INDEX, DELAY_INDEX, ZERO_INDEX = range(6)
+"""Indices of the unknowns in the solution vector.
 
-_FLANK = 0.15
-"""Part of a window over which the test functions rise, and fall."""
+From the last one on, there is a zero of the torque for each session."""
+
+_RISE_FRACTION = 0.15
+"""Fraction of a window over which the test functions rise, and over which they fall."""
 
 
 @dataclass(frozen=True, slots=True)
 class Timing:
-    """Rate and delays of the readings, and where the search for the command's delay begins."""
+    """Rate and delays of the readings, and start value of the search for the command's delay."""
 
     rate_hz: float
     """Rate of the samples."""
     angle_delay_s: float
     """Age of an angle when it is read."""
     torque_delay_s: float
-    """Age of a torque when it is read."""
+    """Age of a coupling torque when it is read."""
     actuation_delay_s: float
-    """Start value of the search."""
+    """Start value of the search for the delay from a command to its torque."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Stack:
-    """Repeats of one motion, each array (r, n)."""
+class _MotionRepeats:
+    """Readings of all repeats of the same motion, in arrays of shape (repeats, samples)."""
 
     angle_rad: Real
+    """Measured angle."""
     torque_command_nm: Real
+    """Commanded torque."""
     coupling_torque_nm: Real
+    """Measured coupling torque."""
     direction: float
+    """Sign of the speed."""
     top_hz: float
+    """Highest frequency of the motion."""
     session: int
+    """Index of the session with this motion."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _StackMoments:
-    """Moments of a stack: ``y = x p``, a row a repeat and frequency."""
+class _MotionEquations:
+    """Linear equations ``y = x p`` for the unknowns p, one for each repeat and frequency."""
 
     y: Complex
-    """(r, m), of the coupling torque."""
+    """Moments of the coupling torque, shape (repeats, frequencies)."""
     x: Complex
-    """(r, m, p), of what belongs to each unknown."""
+    """Coefficients of the unknowns, shape (repeats, frequencies, unknowns)."""
 
 
-def _moments(
-    stack: _Stack, timing: Timing, delay_s: float, scale: float, unknowns: int
-) -> _StackMoments:
-    """Integrate a stack with the test functions; times count from the window's first angle."""
+def _equations(
+    stack: _MotionRepeats, timing: Timing, delay_s: float, scale: float, unknowns: int
+) -> _MotionEquations:
+    """Return the linear equations of a stack, integrated with the test functions.
+
+    `delay_s` and `scale` are the present estimates of the command's delay and the torque scale.
+    Times count from the window's first angle.
+    """
     period_s = 1.0 / timing.rate_hz
     repeats, n = stack.angle_rad.shape
     length_s = n * period_s
@@ -99,254 +112,279 @@ def _moments(
     age_s = timing.angle_delay_s - timing.torque_delay_s
     y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
 
-    # A command lasts a period: its middle, and the integral over the period around it.
-    middle_s = delay_s + 0.5 * period_s
-    w, w1, _ = _test_window(tick_s + middle_s, length_s)
-    held = np.sinc(omega * period_s / (2.0 * pi))
-    command = held * transform(w, stack.torque_command_nm, middle_s)
-    slope = held * transform(w1, stack.torque_command_nm, middle_s) - 1j * omega * command
+    # A command lasts a period: it is integrated over the period around its middle.
+    command_s = delay_s + 0.5 * period_s
+    w, w1, _ = _test_window(tick_s + command_s, length_s)
+    hold_response = np.sinc(omega * period_s / (2.0 * pi))
+    command = hold_response * transform(w, stack.torque_command_nm, command_s)
+    slope = hold_response * transform(w1, stack.torque_command_nm, command_s) - 1j * omega * command
 
     x = np.zeros((repeats, bins, unknowns), dtype=complex)
-    x[..., SCALE] = command
-    x[..., INERTIA] = -acceleration
-    x[..., VISCOUS] = -speed
-    x[..., COULOMB] = -stack.direction * constant
-    x[..., DELAY] = scale * slope
-    x[..., ZERO + stack.session] = -constant
-    return _StackMoments(y, x)
+    x[..., SCALE_INDEX] = command
+    x[..., INERTIA_INDEX] = -acceleration
+    x[..., VISCOUS_INDEX] = -speed
+    x[..., COULOMB_INDEX] = -stack.direction * constant
+    x[..., DELAY_INDEX] = scale * slope
+    x[..., ZERO_INDEX + stack.session] = -constant
+    return _MotionEquations(y, x)
 
 
 def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
-    """Window of a length, smooth to its third derivative, and its first two; zero outside."""
-    flank_s = _FLANK * length_s
-    nearest = np.minimum(t, length_s - t)
-    x = np.clip(nearest / flank_s, 0.0, 1.0)
+    """Return the test functions' window at times `t`, and its first and second derivative.
+
+    The window is smooth to its third derivative and zero outside of 0 to `length_s`.
+    """
+    rise_s = _RISE_FRACTION * length_s
+    distance = np.minimum(t, length_s - t)
+    x = np.clip(distance / rise_s, 0.0, 1.0)
     sign = np.where(t < 0.5 * length_s, 1.0, -1.0)
     w = x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
-    w1 = sign * 140.0 * (x * (1.0 - x)) ** 3 / flank_s
-    w2 = 420.0 * (x * (1.0 - x)) ** 2 * (1.0 - 2.0 * x) / flank_s**2
+    w1 = sign * 140.0 * (x * (1.0 - x)) ** 3 / rise_s
+    w2 = 420.0 * (x * (1.0 - x)) ** 2 * (1.0 - 2.0 * x) / rise_s**2
     return w, w1, w2
 
 
 # Weighted least squares
 
-_MARGIN = 1.25
-"""On all deviations: they are themselves known to some 15 %, and the filter of the readings and the
-beam's part in a jump of torque are not in the model."""
+_STD_MARGIN = 1.25
+"""Factor by which all standard deviations are widened.
+
+They are themselves known to some 15 %, and the model does not contain the filter of the readings
+and the beam's part in a jump of torque."""
 _MAX_ITERATIONS = 30
-_CONVERGED_S = 1e-9
+"""Largest number of iterations for delay and weights."""
+_DELAY_TOLERANCE_S = 1e-9
+"""Change of the delay in seconds below which the iteration has converged."""
 _LONGEST_DELAY_S = 0.05
+"""Largest delay in seconds that the search accepts."""
 _SMOOTHED_BINS = 9
+"""Number of neighbouring frequencies over which the noise variance is averaged."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class _Fit:
-    """Solution in the order of `_moments`, with diagnostics."""
+class _MotorFit:
+    """Estimated unknowns of the motor's equation, with standard deviations and diagnostics."""
 
     values: Real
-    """Scale, inertia, viscous, Coulomb, delay from command to angle, zeros of the sessions."""
+    """Estimates: torque scale, inertia, viscous and Coulomb friction, delay from command to angle,
+    and the sessions' zeros of the torque."""
     stds: Real
+    """Standard deviations of `values`; 0 for a scale that is not estimated."""
     misfit: float
+    """Mean square of the residual over that expected from the scatter of the repeats."""
     friction_departure_nm: float
+    """Largest departure of a pass's mean torque from viscous and Coulomb friction."""
 
 
-def _fit(stacks: Sequence[_Stack], timing: Timing, *, hold_scale: bool) -> _Fit | None:
-    """Fit by least squares, iterated for delay and weights; None if it does not converge.
+def _fit_equation(
+    stacks: Sequence[_MotionRepeats], timing: Timing, *, hold_scale: bool
+) -> _MotorFit | None:
+    """Return the weighted least-squares fit of all stacks, or None if it does not converge.
 
-    Parameters
-    ----------
-    stacks
-        At least two repeats in each.
-    timing
-        Timing of the readings; the search for the delay starts at its value.
-    hold_scale
-        Whether the commanded torque counts as the true one.
+    The fit is iterated for the delay and the weights. Each stack has at least two repeats. With
+    `hold_scale` the commanded torque counts as the true one.
     """
-    unknowns = ZERO + 1 + max(stack.session for stack in stacks)
-    free = np.arange(unknowns) != SCALE if hold_scale else np.full(unknowns, fill_value=True)
+    unknowns = ZERO_INDEX + 1 + max(stack.session for stack in stacks)
+    free = np.arange(unknowns) != SCALE_INDEX if hold_scale else np.full(unknowns, fill_value=True)
     delay_s, scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
     weights: list[Real] = []
     for _ in range(_MAX_ITERATIONS):
-        rows = [_moments(stack, timing, delay_s, scale, unknowns) for stack in stacks]
+        rows = [_equations(stack, timing, delay_s, scale, unknowns) for stack in stacks]
         weights = weights or [np.ones(row.y.shape[1]) for row in rows]
-        solution = _solve(rows, weights, free)
+        solution = _solve_mean_equations(rows, weights, free)
         residuals = [row.y - row.x @ solution for row in rows]
-        change_s = float(solution[DELAY])
-        if abs(change_s) < _CONVERGED_S:
+        change_s = float(solution[DELAY_INDEX])
+        if abs(change_s) < _DELAY_TOLERANCE_S:
             try:
-                return _with_uncertainty(rows, weights, residuals, free, solution, delay_s)
+                return _finish_fit(rows, weights, residuals, free, solution, delay_s)
             except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
-        delay_s, scale = delay_s + change_s, float(solution[SCALE])
+        delay_s, scale = delay_s + change_s, float(solution[SCALE_INDEX])
         if not (abs(delay_s) < _LONGEST_DELAY_S and scale > 0.0):
             return None
-        weights = _weights(residuals, stacks)
+        weights = _inverse_variances(residuals, stacks)
     return None
 
 
-def _solve(rows: Sequence[_StackMoments], weights: Sequence[Real], free: NDArray[np.bool_]) -> Real:
-    """Fit the means of the repeats; the scale, if it is not free, is 1."""
+def _solve_mean_equations(
+    rows: Sequence[_MotionEquations], weights: Sequence[Real], free: NDArray[np.bool_]
+) -> Real:
+    """Return the least-squares solution of the repeats' mean equations.
+
+    The torque scale is 1 if it is not `free`.
+    """
     solution = np.zeros(free.size)
-    solution[SCALE] = 1.0
-    matrix, side = [], []
+    solution[SCALE_INDEX] = 1.0
+    matrix, target = [], []
     for row, weight in zip(rows, weights, strict=True):
         root = np.sqrt(weight)
         x, y = row.x.mean(axis=0), row.y.mean(axis=0)
-        if not free[SCALE]:
-            y = y - x[:, SCALE]
+        if not free[SCALE_INDEX]:
+            y = y - x[:, SCALE_INDEX]
         matrix += [root[:, None] * x[:, free].real, root[:, None] * x[:, free].imag]
-        side += [root * y.real, root * y.imag]
+        target += [root * y.real, root * y.imag]
     columns = np.concatenate(matrix)
     size = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    solution[free] = np.linalg.lstsq(columns / size, np.concatenate(side), rcond=None)[0] / size
+    solution[free] = np.linalg.lstsq(columns / size, np.concatenate(target), rcond=None)[0] / size
     return solution
 
 
-def _weights(residuals: Sequence[Complex], stacks: Sequence[_Stack]) -> list[Real]:
-    """Return 1 over the variance of the mean of repeats, for each stack and frequency (m,).
+def _inverse_variances(
+    residuals: Sequence[Complex], stacks: Sequence[_MotionRepeats]
+) -> list[Real]:
+    """Return the weights of each stack's mean equations, shape (frequencies,) each.
 
-    The variance is that of single repeats, pooled over the stacks of a session (their noise is the
-    same) and over neighbouring frequencies.
+    A weight is the inverse variance of the mean of the repeats. The variance of single repeats is
+    pooled over the stacks of a session, which have the same noise, and over neighbouring
+    frequencies.
     """
-    pooled: dict[int, Real] = {}
+    variances: dict[int, Real] = {}
     for session in {stack.session for stack in stacks}:
-        chosen = [r for r, s in zip(residuals, stacks, strict=True) if s.session == session]
-        deviations = sum(np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in chosen)
-        variance = np.asarray(deviations) / sum(len(r) - 1 for r in chosen)
+        free_indices = [r for r, s in zip(residuals, stacks, strict=True) if s.session == session]
+        deviations = sum(np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in free_indices)
+        variance = np.asarray(deviations) / sum(len(r) - 1 for r in free_indices)
         width = min(_SMOOTHED_BINS, variance.size)
         kernel = np.ones(width)
         ends = np.convolve(np.ones(variance.size), kernel, "same")
-        pooled[session] = np.convolve(variance, kernel, "same") / ends
+        variances[session] = np.convolve(variance, kernel, "same") / ends
     return [
-        len(r) / np.maximum(pooled[stack.session], np.finfo(float).tiny)
+        len(r) / np.maximum(variances[stack.session], np.finfo(float).tiny)
         for r, stack in zip(residuals, stacks, strict=True)
     ]
 
 
-def _with_uncertainty(
-    rows: Sequence[_StackMoments],
+def _finish_fit(
+    rows: Sequence[_MotionEquations],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
     free: NDArray[np.bool_],
     solution: Real,
     delay_s: float,
-) -> _Fit:
+) -> _MotorFit:
     """Remove the bias by noise from the solution, and estimate its uncertainty."""
-    chosen = np.flatnonzero(free)
-    normal = np.zeros((chosen.size, chosen.size))
-    bias = np.zeros(chosen.size)
+    free_indices = np.flatnonzero(free)
+    normal = np.zeros((free_indices.size, free_indices.size))
+    bias = np.zeros(free_indices.size)
     for row, weight, residual in zip(rows, weights, residuals, strict=True):
         repeats = len(row.y)
-        x = row.x[..., chosen]
+        x = row.x[..., free_indices]
         mean = x.mean(axis=0)
         normal += np.einsum("mp,m,mq->pq", mean.conj(), weight, mean).real
-        apart = x - mean
-        part = weight / (repeats * (repeats - 1))
-        bias += np.einsum("rmp,m,rm->p", apart.conj(), part, residual).real
+        deviation = x - mean
+        bias_weight = weight / (repeats * (repeats - 1))
+        bias += np.einsum("rmp,m,rm->p", deviation.conj(), bias_weight, residual).real
     inverse = np.linalg.inv(normal)
 
-    # Each stack's part in the variance, from the scatter of what its repeats pull at the solution.
-    parts, degrees = [], []
-    left, terms = 0.0, 0
+    # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
+    variance_parts, degrees = [], []
+    squares, term_count = 0.0, 0
     departure_nm = 0.0
     for row, weight, residual in zip(rows, weights, residuals, strict=True):
         repeats = len(row.y)
-        mean = row.x[..., chosen].mean(axis=0)
-        pulls = np.einsum("mp,m,rm->rp", mean.conj(), weight, residual).real @ inverse
-        parts.append(pulls.var(axis=0, ddof=1) / repeats)
+        mean = row.x[..., free_indices].mean(axis=0)
+        effects = np.einsum("mp,m,rm->rp", mean.conj(), weight, residual).real @ inverse
+        variance_parts.append(effects.var(axis=0, ddof=1) / repeats)
         degrees.append(repeats - 1)
-        rest = residual.mean(axis=0)
-        left += float(np.sum(weight * np.abs(rest) ** 2))
-        terms += rest.size
-        constant = abs(row.x[0, 0, COULOMB])
-        departure_nm = max(departure_nm, abs(float(rest[0].real)) / float(constant))
-    parts_of_variance = np.array(parts)
+        mean_residual = residual.mean(axis=0)
+        squares += float(np.sum(weight * np.abs(mean_residual) ** 2))
+        term_count += mean_residual.size
+        constant = abs(row.x[0, 0, COULOMB_INDEX])
+        departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant))
+    parts_of_variance = np.array(variance_parts)
     variance = parts_of_variance.sum(axis=0)
-    freedom = variance**2 / np.sum(parts_of_variance**2 / np.array(degrees)[:, None], axis=0)
-    misfit = left / max(1.0, terms - 0.5 * chosen.size)
-    widening = _MARGIN * _coverage(freedom) * sqrt(max(1.0, misfit))
+    degrees_of_freedom = variance**2 / np.sum(
+        parts_of_variance**2 / np.array(degrees)[:, None], axis=0
+    )
+    misfit = squares / max(1.0, term_count - 0.5 * free_indices.size)
+    widening = _STD_MARGIN * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
 
     values, stds = solution.copy(), np.zeros(free.size)
-    values[chosen] -= inverse @ bias
-    values[DELAY] += delay_s
-    stds[chosen] = widening * np.sqrt(variance)
-    return _Fit(values, stds, misfit, departure_nm)
+    values[free_indices] -= inverse @ bias
+    values[DELAY_INDEX] += delay_s
+    stds[free_indices] = widening * np.sqrt(variance)
+    return _MotorFit(values, stds, misfit, departure_nm)
 
 
-def _coverage(freedom: Real) -> Real:
-    """Return Student's t over the normal quantile at 3 deviations, to second order in 1/freedom."""
-    return 1.0 + (7.5 / freedom + 17.25 / freedom**2) / 3.0
+def _student_factor(degrees_of_freedom: Real) -> Real:
+    """Return the ratio of Student's t to the normal quantile at three standard deviations.
+
+    It is exact to second order in the inverse degrees of freedom.
+    """
+    return 1.0 + (7.5 / degrees_of_freedom + 17.25 / degrees_of_freedom**2) / 3.0
 
 
 # Estimate of a motor
 
 LEAST_REPEATS = 4
-"""Fewer repeats do not determine the scatter."""
+"""Smallest number of repeats of a motion; fewer do not determine the scatter."""
 
-_LEAST_SPEED_PART = 0.1
-"""Fraction of the nominal speed below which a window may contain a standstill."""
-_SPEED_S = 0.01
-"""Half the time over which that speed is taken."""
+_MIN_SPEED_FRACTION = 0.1
+"""Fraction of the nominal speed below which the shaft may have stood still."""
+_HALF_SPEED_WINDOW_S = 0.01
+"""Half the time in seconds over which the shaft's speed is measured to detect a standstill."""
 _MAX_SCALE_STD = 0.05
-"""Accuracy of a torque constant from a datasheet."""
-_SCALES = (0.5, 2.0)
-"""Without a beam the equation is solved by no torque and no motor too: a scale beyond these is no
-torque constant."""
+"""Largest standard deviation of an estimated torque scale: the accuracy of a datasheet's value."""
+_PLAUSIBLE_SCALES = (0.5, 2.0)
+"""Smallest and largest plausible torque scale.
+
+Without a beam the equation also has the solution of no torque and no inertia."""
 
 
 class MotorEstimateError(FailureError, ValueError):
-    """The windows do not determine the motor's data; the message says why."""
+    """The recorded windows do not determine the motor's data; the message states the reason."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PassReadings:
-    """Readings during one pass at constant nominal speed, each of shape (n,)."""
+    """Readings in the evaluated window of one pass at constant nominal speed, shape (n,) each."""
 
     angle_rad: Real
-    """Angle of the shaft."""
+    """Measured angle of the shaft."""
     torque_command_nm: Real
-    """Torque commanded."""
+    """Commanded torque."""
     coupling_torque_nm: Real
-    """Torque between motor and beam."""
+    """Measured torque between motor and beam."""
     speed_rad_s: float
-    """Nominal, signed."""
+    """Nominal speed of the pass, with its sign."""
     top_hz: float
     """Highest frequency of the motion."""
     session: int
-    """Each session has its own zero of the torque."""
+    """Number of the session, since each session has its own zero of the torque."""
     key: Hashable
-    """Repeats of the same motion have equal keys."""
+    """Key of the motion: repeats of the same motion have equal keys."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorQuantity:
-    """An estimate and its standard deviation; None: it was not estimated."""
+    """Estimated quantity of a motor with its standard deviation."""
 
     value: float
-    """The estimate."""
+    """Estimate of the quantity, or its assumed value."""
     std: float | None
-    """Its standard deviation."""
+    """Standard deviation of the estimate, or None if the quantity was not estimated."""
 
 
 @dataclass(frozen=True, slots=True)
 class MotorEstimate:
-    """Estimate of the motor, at its output shaft."""
+    """Estimated parameters of a motor at its output shaft."""
 
     inertia_kg_m2: MotorQuantity
     """Inertia of the motor without the tool."""
     viscous_nm_s_per_rad: MotorQuantity
-    """Viscous friction."""
+    """Viscous friction of the motor."""
     coulomb_nm: MotorQuantity
-    """Coulomb friction."""
+    """Coulomb friction of the motor."""
     torque_scale: MotorQuantity
-    """True torque over commanded torque; without a standard deviation it is held at 1, and the
-    other quantities count in the drive's own torque."""
+    """Ratio of true to commanded torque.
+
+    If it could not be estimated, it is 1 without a standard deviation, and the other quantities
+    refer to the torque as the drive states it."""
     actuation_delay_s: MotorQuantity
-    """From the command to the torque."""
+    """Delay from the command to the torque."""
     windows: int
-    """Windows of the records that count."""
+    """Number of windows in which the shaft never stood still."""
     dropped: int
-    """Windows in which the shaft may have stood still."""
+    """Number of windows that were dropped because the shaft may have stood still."""
     misfit: float
     """Mean square of the residual over that expected from scatter: 1 if the equation holds."""
     friction_departure_nm: float
@@ -356,95 +394,107 @@ class MotorEstimate:
 def estimate_motor(
     windows: Sequence[PassReadings], timing: Timing, *, tool_inertia_kg_m2: float = 0.0
 ) -> MotorEstimate:
-    """Fit the motor's equation to windows in which its speed does not change sign.
+    """Estimate a motor's parameters from windows in which its speed does not change sign.
 
     Parameters
     ----------
     windows
         Windows of equal length; at least `LEAST_REPEATS` of each key, and both directions.
     timing
-        Timing of the readings. They show only the delay from command to angle: that of the angle is
-        taken off it.
+        Timing of the readings. The windows show only the delay from command to angle, from which
+        the angle's own delay is subtracted.
     tool_inertia_kg_m2
-        Between sensor and beam: it makes the coupling torque jump with each command, and where
-        within a period the sensor sees that is not known; the delay's deviation allows for it.
+        Inertia between sensor and beam. It makes the coupling torque jump with each command. The
+        moment within a period at which the sensor measures the jump is unknown, which widens the
+        standard deviation of the delay.
 
     Returns
     -------
     MotorEstimate
-        Standard deviations hold the scatter between repeats, widened for their finite number so
-        that three of them cover 99.7 %, for what the equation does not explain, and by a margin.
+        Estimates with standard deviations. These contain the scatter between repeats, are widened
+        for the finite number of repeats so that three of them cover 99.7 %, for the part of the
+        readings that the equation does not explain, and by a margin.
 
     Raises
     ------
     MotorEstimateError
         If there are too few windows, or the fit does not converge.
     """
-    moving = [window for window in windows if _never_stops(window, timing.rate_hz)]
-    stacks = _stack(moving, len(windows))
-    found = _fit(stacks, timing, hold_scale=False)
+    moving = [window for window in windows if _moves_throughout(window, timing.rate_hz)]
+    stacks = _group_repeats(moving, len(windows))
+    fit = _fit_equation(stacks, timing, hold_scale=False)
     scale_known = (
-        found is not None
-        and found.stds[SCALE] < _MAX_SCALE_STD
-        and _SCALES[0] < found.values[SCALE] < _SCALES[1]
+        fit is not None
+        and fit.stds[SCALE_INDEX] < _MAX_SCALE_STD
+        and _PLAUSIBLE_SCALES[0] < fit.values[SCALE_INDEX] < _PLAUSIBLE_SCALES[1]
     )
     if not scale_known:
-        found = _fit(stacks, timing, hold_scale=True)
-    if found is None:
+        fit = _fit_equation(stacks, timing, hold_scale=True)
+    if fit is None:
         raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
-    values, stds = found.values, found.stds
-    inertia = float(values[INERTIA])
+    values, stds = fit.values, fit.stds
+    inertia = float(values[INERTIA_INDEX])
     if inertia <= 0.0:
         raise MotorEstimateError(
             f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
-    jump = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
-    sampled_s = jump / timing.rate_hz / sqrt(12.0)
+    torque_jump_fraction = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
+    jump_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
-        inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA])),
-        viscous_nm_s_per_rad=MotorQuantity(float(values[VISCOUS]), float(stds[VISCOUS])),
-        coulomb_nm=MotorQuantity(float(values[COULOMB]), float(stds[COULOMB])),
+        inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA_INDEX])),
+        viscous_nm_s_per_rad=MotorQuantity(
+            float(values[VISCOUS_INDEX]), float(stds[VISCOUS_INDEX])
+        ),
+        coulomb_nm=MotorQuantity(float(values[COULOMB_INDEX]), float(stds[COULOMB_INDEX])),
         torque_scale=MotorQuantity(
-            float(values[SCALE]), float(stds[SCALE]) if scale_known else None
+            float(values[SCALE_INDEX]), float(stds[SCALE_INDEX]) if scale_known else None
         ),
         actuation_delay_s=MotorQuantity(
-            float(values[DELAY]) - timing.angle_delay_s,
-            sqrt(float(stds[DELAY]) ** 2 + sampled_s**2),
+            float(values[DELAY_INDEX]) - timing.angle_delay_s,
+            sqrt(float(stds[DELAY_INDEX]) ** 2 + jump_std_s**2),
         ),
         windows=len(moving),
         dropped=len(windows) - len(moving),
-        misfit=found.misfit,
-        friction_departure_nm=found.friction_departure_nm,
+        misfit=fit.misfit,
+        friction_departure_nm=fit.friction_departure_nm,
     )
 
 
-def _never_stops(window: PassReadings, rate_hz: float) -> bool:
-    half = max(1, round(_SPEED_S * rate_hz))
+def _moves_throughout(window: PassReadings, rate_hz: float) -> bool:
+    """Return whether the shaft moves in the nominal direction during the whole window."""
+    half_ticks = max(1, round(_HALF_SPEED_WINDOW_S * rate_hz))
     angle = window.angle_rad
-    speed = (angle[2 * half :] - angle[: -2 * half]) * rate_hz / (2 * half)
-    along = speed * np.sign(window.speed_rad_s)
-    return bool(np.min(along) > _LEAST_SPEED_PART * abs(window.speed_rad_s))
+    speed = (angle[2 * half_ticks :] - angle[: -2 * half_ticks]) * rate_hz / (2 * half_ticks)
+    forward_speed = speed * np.sign(window.speed_rad_s)
+    return bool(np.min(forward_speed) > _MIN_SPEED_FRACTION * abs(window.speed_rad_s))
 
 
-def _stack(windows: Sequence[PassReadings], given: int) -> list[_Stack]:
+def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_MotionRepeats]:
+    """Group windows into stacks of repeats, or raise MotorEstimateError if there are too few.
+
+    `window_count` is the number of windows before those with a standstill were removed.
+    """
     groups: dict[Hashable, list[PassReadings]] = {}
     for window in windows:
         groups.setdefault(window.key, []).append(window)
-    full = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
-    if {np.sign(group[0].speed_rad_s) for group in full} != {1.0, -1.0}:
+    complete_groups = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
+    if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
-            f"Of {given} passes {len(windows)} can be used, and that is too few: it takes at least "
-            f"{LEAST_REPEATS} of the same kind in both directions, without gaps and without a "
-            "standstill."
+            f"Of {window_count} passes {len(windows)} can be used, and that is too few: it takes "
+            f"at least {LEAST_REPEATS} of the same kind in both directions, without gaps and "
+            "without a standstill."
         )
-    sessions = {number: index for index, number in enumerate(sorted({g[0].session for g in full}))}
+    sessions = {
+        number: index
+        for index, number in enumerate(sorted({g[0].session for g in complete_groups}))
+    }
     return [
-        _Stack(
+        _MotionRepeats(
             np.array([window.angle_rad for window in group]),
             np.array([window.torque_command_nm for window in group]),
             np.array([window.coupling_torque_nm for window in group]),
@@ -452,5 +502,5 @@ def _stack(windows: Sequence[PassReadings], given: int) -> list[_Stack]:
             group[0].top_hz,
             sessions[group[0].session],
         )
-        for group in full
+        for group in complete_groups
     ]

@@ -1,10 +1,11 @@
-"""The sessions that identify a motor: a multisine on passes at constant speed, and slow passes.
+"""Excitations of the sessions that identify a motor: passes at constant speed, with a multisine.
 
-Friction jumps where a motor turns round, and nobody knows how: sticking, wind-up, backlash. So the
-shaft sweeps to and fro at constant speed, with smooth turns, and the estimate uses the inside of
-each pass, where the speed does not change sign and Coulomb friction is a constant. The multisine
-rides on fast passes and moves the speed by at most half of it. Every cycle of passes is the same,
-but for an offset of some encoder steps, so that cycles can be averaged and their scatter estimated.
+Friction changes in an unknown way when a motor reverses: sticking, wind-up, backlash. Therefore
+the shaft moves to and fro at constant speed, with smooth turns, and the estimate uses the inside
+of each pass, where the speed does not change sign and Coulomb friction is constant. The multisine
+is added to fast passes and changes their speed by at most half. All cycles of passes are the same,
+except for an offset of some encoder steps, so that cycles can be averaged and their scatter
+estimated.
 """
 
 from collections.abc import Mapping
@@ -21,116 +22,135 @@ from rigd.profile import Profile
 Real = NDArray[np.float64]
 
 TRIAL = "motor-trial"
+"""Name of the excitation of the short session before the others."""
 MULTISINE = "motor-multisine"
+"""Name of the excitation with a multisine on fast passes."""
 SPEEDS = "motor-speeds"
-"""Kinds of the sessions."""
+"""Name of the excitation with passes at four constant speeds."""
 
-TOP_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
-"""Highest frequency in Hz of the shaft's motion, or of the beam's swing after a turn, by kind."""
+HIGHEST_FREQUENCY_HZ = {TRIAL: 33.0, MULTISINE: 33.0, SPEEDS: 3.4}
+"""Highest frequency in Hz of the shaft's or the beam's motion, by the name of the excitation."""
 
 _MAX_SPEED_RAD_S = 1.0
-_LIMIT_FRACTION = 0.5
-"""Fraction of the profile's speed limit: the rest is for multisine and errors of the motor's
-data."""
+"""Largest speed of a pass in rad/s."""
+_SPEED_LIMIT_FRACTION = 0.5
+"""Largest speed of a pass as a fraction of the profile's speed limit.
+
+The remainder is for the multisine and errors of the motor's data."""
 _STROKE_FRACTION = 0.93
-"""Fraction of the stroke for the passes; the rest is for multisine, offsets and overshoot."""
-_SPEED_PARTS = (0.1, 0.3, 0.6, 1.0)
-_MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
-"""Part of the speed that the multisine modulates. The trial knows little of the motor: a quarter of
-the inertia that the profile states must not yet reverse the speed."""
-_CYCLES = {TRIAL: 6, MULTISINE: 16, SPEEDS: 5}
-_BAND_HZ = (1.6, 32.0)
-"""The beam's clamped-free modes in it make its torque unlike an inertia's, so that the scale of the
-motor's own torque shows; below 32 Hz the encoder's steps do not yet hide the acceleration."""
-_LEAST_MULTISINE = 0.1
+"""Fraction of the stroke that the passes use.
+
+The remainder is for multisine, offsets and overshoot."""
+_RELATIVE_SPEEDS = (0.1, 0.3, 0.6, 1.0)
+"""Speeds of the passes of `SPEEDS`, relative to the fastest."""
+_SPEED_MODULATION = {TRIAL: 0.2, MULTISINE: 0.5}
+"""Largest change of a pass's speed by the multisine, as a fraction, by excitation.
+
+It is small in the trial, in which the motor's data are uncertain: a quarter of the inertia that the
+profile states must not yet reverse the speed."""
+_CYCLE_COUNTS = {TRIAL: 6, MULTISINE: 16, SPEEDS: 5}
+"""Number of cycles of passes, by excitation."""
+_MULTISINE_BAND_HZ = (1.6, 32.0)
+"""Lowest and highest frequency of the multisine in Hz.
+
+In this band the beam's clamped-free modes make its torque differ from that of an inertia, so that
+the scale of the motor's own torque is identifiable. Below 32 Hz the encoder's steps do not yet hide
+the acceleration."""
+_MIN_MULTISINE_FRACTION = 0.1
+"""Smallest accepted fraction to which the torque limit may reduce the multisine."""
 _OFFSET_STEPS = 40.0
-"""Encoder steps: enough for its roundings not to repeat from cycle to cycle."""
-_GOLDEN = 0.618033988749895
+"""Range of the cycles' offsets in encoder steps.
+
+It is large enough that the encoder's rounding errors do not repeat from cycle to cycle."""
+_GOLDEN_FRACTION = 0.618033988749895
+"""Golden ratio minus 1, whose multiples modulo 1 are evenly distributed."""
 
 
 @dataclass(frozen=True, slots=True)
 class PassSchedule:
-    """Schedule of the shaft's motion, which defines all passes of a session.
+    """Speeds and durations of the passes of a session, which define its motion.
 
-    Each pass is a turn, a time to settle, and the window that is evaluated.
+    Each pass consists of a turn, a time to settle, and the window that is evaluated.
     """
 
     speeds_rad_s: tuple[float, ...]
-    """Speeds of a cycle; each is run forward, then back."""
+    """Speeds of the passes of a cycle; each speed is run forward, then back."""
     cycles: int
-    """Number of cycles."""
+    """Number of cycles in the session."""
     rest_s: float = 0.5
-    """Rest at the beginning."""
+    """Duration of the rest at the beginning."""
     approach_s: float = 2.0
-    """To the end of the stroke where the passes begin."""
+    """Duration of the motion to the end of the stroke where the passes begin."""
     turn_s: float = 0.4
-    """Turn before each pass."""
+    """Duration of the turn before each pass."""
     settle_s: float = 0.15
     """Time to settle after a turn."""
     window_s: float = 1.2
-    """Window of a pass."""
+    """Duration of the evaluated window of a pass."""
     end_s: float = 0.5
-    """Way back and rest at the end."""
+    """Duration of the rest at the end."""
 
 
 @dataclass(frozen=True, slots=True)
 class SpeedPass:
-    """A window of constant nominal speed."""
+    """Evaluated window of a pass at constant nominal speed."""
 
     first: int
-    """Its first tick."""
+    """First tick of the window."""
     end: int
-    """The tick after its last."""
+    """Tick after the last one of the window."""
     speed_rad_s: float
-    """Signed."""
+    """Nominal speed of the pass, with its sign."""
     cycle: int
-    """Number of its cycle, from 0 on."""
+    """Index of the pass's cycle, from 0."""
 
 
-def lay_out_passes(layout: PassSchedule, rate_hz: float) -> list[SpeedPass]:
-    """Return the passes of a session in their order.
+def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass]:
+    """Return the evaluated windows of a session's passes in their order.
 
     Parameters
     ----------
-    layout
-        Layout of the session.
+    schedule
+        Schedule of the session.
     rate_hz
         Rate of the samples.
     """
-    turn, settle, window = (
-        round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
+    turn_ticks, settle_ticks, window = (
+        round(time_s * rate_hz)
+        for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    tick = round(layout.rest_s * rate_hz) + round(layout.approach_s * rate_hz)
+    tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
     passes = []
-    for cycle in range(layout.cycles):
-        for speed in layout.speeds_rad_s:
-            for signed in (speed, -speed):
-                tick += turn + settle
-                passes.append(SpeedPass(tick, tick + window, signed, cycle))
+    for cycle in range(schedule.cycles):
+        for speed in schedule.speeds_rad_s:
+            for signed_speed in (speed, -speed):
+                tick += turn_ticks + settle_ticks
+                passes.append(SpeedPass(tick, tick + window, signed_speed, cycle))
                 tick += window
     return passes
 
 
 def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
-    """Make a short multisine session with little motion, to design the others' controller by.
+    """Return a short multisine excitation with little motion, run before the other sessions.
 
-    See :func:`multisine_session`.
+    The controller of the other sessions is designed from its estimate. The excitation is as that of
+    :func:`multisine_session`.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     torque_percent, stroke_rad
-        As for `multisine_session`.
+        Limits of torque and angle as for `multisine_session`.
     """
-    return _ride(TRIAL, profile, torque_percent, stroke_rad)
+    return _multisine_excitation(TRIAL, profile, torque_percent, stroke_rad)
 
 
 def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
-    """Make passes to and fro with a multisine on them, scaled to the torque allowed.
+    """Return passes to and fro with a multisine that is scaled to the allowed torque.
 
-    The multisine's speed is equal on all harmonics of the window, as the profile's closed loop
-    answers to it, with the phases of M. R. Schroeder (IEEE Trans. Inf. Theory 16 (1970) 85).
+    With the response of the profile's closed loop, the speed has equal amplitudes at all harmonics
+    of the window, with the phases of M. R. Schroeder (IEEE Trans. Inf. Theory 16 (1970) 85).
 
     Parameters
     ----------
@@ -144,79 +164,97 @@ def multisine_session(profile: Profile, *, torque_percent: float, stroke_rad: fl
     Raises
     ------
     ExcitationError
-        If an option is out of range or leaves too little to be measured.
+        If an option is out of range or too little torque is left for the multisine.
     ControlDesignError
         If the profile's loop cannot be closed.
     """
-    return _ride(MULTISINE, profile, torque_percent, stroke_rad)
+    return _multisine_excitation(MULTISINE, profile, torque_percent, stroke_rad)
 
 
-def _ride(kind: str, profile: Profile, torque_percent: float, stroke_rad: float) -> Excitation:
+def _multisine_excitation(
+    excitation_name: str, profile: Profile, torque_percent: float, stroke_rad: float
+) -> Excitation:
+    """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())
-    layout = _fit(kind, (1.0,), profile, stroke_rad)
-    carrier = _carrier(layout, profile)
-    ride = _multisine(layout, loop, _MODULATION[kind])
-    alone_nm = _peak_torque(loop, carrier)
-    together_nm = _peak_torque(loop, carrier + ride)
+    schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
+    passes_rad = _passes_reference(schedule, profile)
+    multisine = _multisine_reference(schedule, loop, _SPEED_MODULATION[excitation_name])
+    passes_nm = _peak_torque(loop, passes_rad)
+    peak_nm = _peak_torque(loop, passes_rad + multisine)
     fraction = 1.0
-    if together_nm > limit_nm:
-        # The peak is convex in the fraction: below the straight line between the two.
-        fraction = (limit_nm - alone_nm) / (together_nm - alone_nm)
-    if fraction < _LEAST_MULTISINE:
-        needed_nm = alone_nm + _LEAST_MULTISINE * (together_nm - alone_nm)
+    if peak_nm > limit_nm:
+        # The peak is a convex function of the fraction, below the straight line between the two.
+        fraction = (limit_nm - passes_nm) / (peak_nm - passes_nm)
+    if fraction < _MIN_MULTISINE_FRACTION:
+        needed_nm = passes_nm + _MIN_MULTISINE_FRACTION * (peak_nm - passes_nm)
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: of {limit_nm:.3g} N·m the passes alone take "
-            f"{alone_nm:.3g} N·m, and too little is left for the multisine; allow at least "
-            f"{_percent(profile, needed_nm)} % or a shorter --stroke-rad."
+            f"{passes_nm:.3g} N·m, and too little is left for the multisine; allow at least "
+            f"{_rounded_percent(profile, needed_nm)} % or a shorter --stroke-rad."
         )
-    return _excitation(
-        kind, layout, profile, loop, carrier + fraction * ride, torque_percent, stroke_rad
+    return _checked_excitation(
+        excitation_name,
+        schedule,
+        profile,
+        loop,
+        passes_rad + fraction * multisine,
+        torque_percent,
+        stroke_rad,
     )
 
 
 def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
-    """Make passes to and fro at four constant speeds.
-
-    Parameters, and what is raised, as for :func:`multisine_session`.
+    """Return passes to and fro at four constant speeds.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     torque_percent, stroke_rad
-        As for `multisine_session`.
+        Limits of torque and angle as for `multisine_session`.
+
+    Raises
+    ------
+    ExcitationError
+        If an option is out of range, or the turns need more torque than allowed.
+    ControlDesignError
+        If the profile's loop cannot be closed.
     """
     limit_nm = _torque_limit(profile, torque_percent)
     loop = close_loop(profile.loop_model())
-    layout = _fit(SPEEDS, _SPEED_PARTS, profile, stroke_rad)
-    reference = _carrier(layout, profile)
+    schedule = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
+    reference = _passes_reference(schedule, profile)
     peak_nm = _peak_torque(loop, reference)
     if peak_nm > limit_nm:
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: the turns take {peak_nm:.3g} N·m and only "
-            f"{limit_nm:.3g} N·m are allowed; allow at least {_percent(profile, peak_nm)} % or a "
-            "shorter --stroke-rad."
+            f"{limit_nm:.3g} N·m are allowed; allow at least "
+            f"{_rounded_percent(profile, peak_nm)} % or a shorter --stroke-rad."
         )
-    return _excitation(SPEEDS, layout, profile, loop, reference, torque_percent, stroke_rad)
+    return _checked_excitation(
+        SPEEDS, schedule, profile, loop, reference, torque_percent, stroke_rad
+    )
 
 
-def read_layout(metadata: Mapping[str, str]) -> PassSchedule | None:
-    """Return the layout stated in the metadata of a session; None for any other session."""
-    if metadata.get("excitation") not in TOP_HZ:
+def read_schedule(metadata: Mapping[str, str]) -> PassSchedule | None:
+    """Return the schedule in the metadata of a session, or None for any other excitation."""
+    if metadata.get("excitation") not in HIGHEST_FREQUENCY_HZ:
         return None
     try:
         speeds = tuple(float(text) for text in metadata["speeds_rad_s"].split())
-        times = {name: float(metadata[name]) for name in _TIMES}
+        times = {name: float(metadata[name]) for name in _DURATION_FIELDS}
         return PassSchedule(speeds, int(metadata["cycles"]), **times)
     except (KeyError, ValueError):
         return None
 
 
-_TIMES = ("rest_s", "approach_s", "turn_s", "settle_s", "window_s", "end_s")
+_DURATION_FIELDS = ("rest_s", "approach_s", "turn_s", "settle_s", "window_s", "end_s")
+"""Fields of `PassSchedule` that are durations."""
 
 
 def _torque_limit(profile: Profile, torque_percent: float) -> float:
+    """Return the allowed torque in N·m, or raise ExcitationError if the percentage is invalid."""
     if not 0.0 < torque_percent <= 100.0:
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: must be more than 0 and at most 100 % of the "
@@ -225,128 +263,150 @@ def _torque_limit(profile: Profile, torque_percent: float) -> float:
     return torque_percent / 100 * profile.rig.motor.rated_torque_nm
 
 
-def _percent(profile: Profile, torque_nm: float) -> int:
+def _rounded_percent(profile: Profile, torque_nm: float) -> int:
+    """Return a torque in percent of the rated torque, rounded up with a margin of 1 %."""
     return ceil(101 * torque_nm / profile.rig.motor.rated_torque_nm)
 
 
-def _fit(kind: str, parts: tuple[float, ...], profile: Profile, stroke_rad: float) -> PassSchedule:
-    """Choose the speed so that the passes fit into the stroke, and the speed into its limit."""
+def _fit_schedule(
+    excitation_name: str, relative_speeds: tuple[float, ...], profile: Profile, stroke_rad: float
+) -> PassSchedule:
+    """Return a schedule whose passes are as fast as stroke and speed limit allow.
+
+    `relative_speeds` are the speeds of a cycle relative to the fastest.
+    """
     limits = profile.limits
     if not 0.0 < stroke_rad <= limits.angle_rad:
         raise ExcitationError(
             f"--stroke-rad {stroke_rad:g}: must be more than 0 and at most limits.angle_rad = "
             f"{limits.angle_rad:g} rad."
         )
-    cycles = _CYCLES[kind]
-    travel_s = float(np.ptp(_path(PassSchedule(parts, 1), profile.rig.rate_hz)))
+    cycles = _CYCLE_COUNTS[excitation_name]
+    travel_s = float(np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz)))
     speed = min(
         _MAX_SPEED_RAD_S,
-        _LIMIT_FRACTION * limits.velocity_rad_s,
+        _SPEED_LIMIT_FRACTION * limits.velocity_rad_s,
         2 * _STROKE_FRACTION * stroke_rad / travel_s,
     )
-    return PassSchedule(tuple(part * speed for part in parts), cycles)
+    return PassSchedule(tuple(fraction * speed for fraction in relative_speeds), cycles)
 
 
-def _path(layout: PassSchedule, rate_hz: float) -> Real:
-    """Angle of the passes from the end of the approach on, beginning at 0."""
-    turn, settle, window = (
-        round(time_s * rate_hz) for time_s in (layout.turn_s, layout.settle_s, layout.window_s)
+def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
+    """Return the angle in rad during all passes; it begins at 0 at the end of the approach."""
+    turn_ticks, settle_ticks, window = (
+        round(time_s * rate_hz)
+        for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    change = _smooth(np.arange(turn) / turn)
+    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
     segments: list[Real] = []
-    before = 0.0
-    for speed in [s for v in layout.speeds_rad_s for s in (v, -v)] * layout.cycles:
-        segments.append(before + (speed - before) * change)
-        segments.append(np.full(settle + window, speed))
-        before = speed
-    segments.append(before * (1.0 - change))
+    previous = 0.0
+    for speed in [s for v in schedule.speeds_rad_s for s in (v, -v)] * schedule.cycles:
+        segments.append(previous + (speed - previous) * change)
+        segments.append(np.full(settle_ticks + window, speed))
+        previous = speed
+    segments.append(previous * (1.0 - change))
     speeds = np.concatenate(segments)
     path: Real = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]))]) / rate_hz
     return path
 
 
-def _carrier(layout: PassSchedule, profile: Profile) -> Real:
-    """Return the reference without a multisine: rest, approach, passes, end."""
+def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
+    """Return the reference angle in rad without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
-    path = _path(layout, rate_hz)
+    path = _passes_path(schedule, rate_hz)
     path -= 0.5 * (path.max() + path.min())
-    rest, approach, end = (
-        round(time_s * rate_hz) for time_s in (layout.rest_s, layout.approach_s, layout.end_s)
+    rest_ticks, approach_ticks, end = (
+        round(time_s * rate_hz) for time_s in (schedule.rest_s, schedule.approach_s, schedule.end_s)
     )
-    way = path[0] * _smooth(np.arange(approach) / approach)
-    reference = np.concatenate([np.zeros(rest), way, path, np.full(end, path[-1])])
-    _add_offsets(reference, layout, profile)
+    approach_rad = path[0] * _smooth_rise(np.arange(approach_ticks) / approach_ticks)
+    reference = np.concatenate([np.zeros(rest_ticks), approach_rad, path, np.full(end, path[-1])])
+    _add_offsets(reference, schedule, profile)
     return reference
 
 
-def _add_offsets(reference: Real, layout: PassSchedule, profile: Profile) -> None:
-    """Move each cycle by its own fraction of some encoder steps, in the turn before it."""
+def _add_offsets(reference: Real, schedule: PassSchedule, profile: Profile) -> None:
+    """Add to each cycle of a reference its own offset of some encoder steps.
+
+    The offset changes in the turn before the cycle.
+    """
     rate_hz = profile.rig.rate_hz
-    turn = round(layout.turn_s * rate_hz)
-    before = round((layout.turn_s + layout.settle_s) * rate_hz)
-    change = _smooth(np.arange(turn) / turn)
+    turn_ticks = round(schedule.turn_s * rate_hz)
+    previous = round((schedule.turn_s + schedule.settle_s) * rate_hz)
+    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
     offset = 0.0
-    seen = -1
-    for run in lay_out_passes(layout, rate_hz):
-        if run.cycle == seen:
+    last_cycle = -1
+    for speed_pass in passes_of_schedule(schedule, rate_hz):
+        if speed_pass.cycle == last_cycle:
             continue
-        seen = run.cycle
-        part = _GOLDEN * (seen + 1)
-        following = _OFFSET_STEPS * profile.rig.encoder.resolution_rad * (part - floor(part) - 0.5)
-        start = run.first - before
-        reference[start : start + turn] += (following - offset) * change
-        reference[start + turn :] += following - offset
-        offset = following
+        last_cycle = speed_pass.cycle
+        fraction = _GOLDEN_FRACTION * (last_cycle + 1)
+        next_offset = (
+            _OFFSET_STEPS * profile.rig.encoder.resolution_rad * (fraction - floor(fraction) - 0.5)
+        )
+        first_sample = speed_pass.first - previous
+        reference[first_sample : first_sample + turn_ticks] += (next_offset - offset) * change
+        reference[first_sample + turn_ticks :] += next_offset - offset
+        offset = next_offset
 
 
-def _multisine(layout: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
-    """Return the reference whose response modulates the speed of the passes by a fraction."""
+def _multisine_reference(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+    """Return the reference angle in rad of the multisine alone.
+
+    The response of the loop to it changes the speed of the passes by the fraction `modulation`.
+    """
     rate_hz = loop.model.rate_hz
-    window = round(layout.window_s * rate_hz)
+    window = round(schedule.window_s * rate_hz)
     step_hz = rate_hz / window
-    numbers = np.arange(ceil(_BAND_HZ[0] / step_hz), floor(_BAND_HZ[1] / step_hz) + 1)
+    numbers = np.arange(
+        ceil(_MULTISINE_BAND_HZ[0] / step_hz), floor(_MULTISINE_BAND_HZ[1] / step_hz) + 1
+    )
     frequency_hz = numbers.astype(np.float64) * step_hz
     phase = -pi * np.arange(numbers.size) * np.arange(1, numbers.size + 1) / numbers.size
     speed = np.zeros(window // 2 + 1, dtype=complex)
     speed[numbers] = np.exp(1j * phase)
     peak = float(np.max(np.abs(np.fft.irfft(speed, window))))
-    speed *= modulation * layout.speeds_rad_s[0] / peak
+    speed *= modulation * schedule.speeds_rad_s[0] / peak
     spectrum = np.zeros_like(speed)
     spectrum[numbers] = speed[numbers] / (2j * pi * frequency_hz) / loop.response(frequency_hz)
     period = np.fft.irfft(spectrum, window)
 
-    turn, settle = round(layout.turn_s * rate_hz), round(layout.settle_s * rate_hz)
-    half = turn // 2
-    rise = _smooth(np.arange(half) / half)
-    gate = np.concatenate([rise, np.ones(settle + window), 1.0 - rise])
-    gated = np.resize(np.roll(period, half + settle), gate.size) * gate
-    passes = lay_out_passes(layout, rate_hz)
-    total = passes[-1].end + turn + round(layout.end_s * rate_hz)
-    reference = np.zeros(total)
-    for run in passes:
-        start = run.first - settle - half
-        reference[start : start + gated.size] += gated
+    turn_ticks, settle_ticks = round(schedule.turn_s * rate_hz), round(schedule.settle_s * rate_hz)
+    half_turn_ticks = turn_ticks // 2
+    rise = _smooth_rise(np.arange(half_turn_ticks) / half_turn_ticks)
+    envelope = np.concatenate([rise, np.ones(settle_ticks + window), 1.0 - rise])
+    windowed = np.resize(np.roll(period, half_turn_ticks + settle_ticks), envelope.size) * envelope
+    passes = passes_of_schedule(schedule, rate_hz)
+    sample_count = passes[-1].end + turn_ticks + round(schedule.end_s * rate_hz)
+    reference = np.zeros(sample_count)
+    for speed_pass in passes:
+        first_sample = speed_pass.first - settle_ticks - half_turn_ticks
+        reference[first_sample : first_sample + windowed.size] += windowed
     return reference
 
 
-def _smooth(x: Real) -> Real:
-    """Rise from 0 to 1 over x in [0, 1], slope and curvature zero at both ends."""
+def _smooth_rise(x: Real) -> Real:
+    """Return a smooth rise from 0 to 1 for x from 0 to 1.
+
+    Its slope and curvature are zero at both ends.
+    """
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
 
 def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
+    """Return the largest predicted torque in N·m of a reference."""
     return float(np.max(np.abs(loop.simulate(reference).torque_nm)))
 
 
-def _excitation(
-    kind: str,
-    layout: PassSchedule,
+def _checked_excitation(
+    excitation_name: str,
+    schedule: PassSchedule,
     profile: Profile,
     loop: ClosedLoop,
     reference: Real,
     torque_percent: float,
     stroke_rad: float,
 ) -> Excitation:
+    """Return the excitation with a reference, or raise if its predicted angle is too large."""
     peak_rad = float(np.max(np.abs(loop.simulate(reference).angle_rad)))
     if peak_rad > stroke_rad:
         raise ExcitationError(
@@ -355,18 +415,22 @@ def _excitation(
         )
     rate_hz = profile.rig.rate_hz
     reference.flags.writeable = False
-    rest = round(layout.rest_s * rate_hz)
-    end = reference.size - round(layout.end_s * rate_hz)
+    rest_ticks = round(schedule.rest_s * rate_hz)
+    end = reference.size - round(schedule.end_s * rate_hz)
     parameters = {
-        **asdict(layout),
-        "speeds_rad_s": " ".join(repr(speed) for speed in layout.speeds_rad_s),
+        **asdict(schedule),
+        "speeds_rad_s": " ".join(repr(speed) for speed in schedule.speeds_rad_s),
         "torque_percent": torque_percent,
         "stroke_rad": stroke_rad,
-        # The controller's, which are not those of the profile's file after the trial.
+        # Settings of the controller, which differ from the profile's file after the trial.
         "control_inertia_kg_m2": profile.control_motor.inertia_kg_m2,
         "control_viscous_nm_s_per_rad": profile.control_motor.viscous_nm_s_per_rad,
         "control_pole_rad_s": profile.control.pole_rad_s,
         "control_feedforward_gain": profile.control.feedforward_gain,
     }
-    segments = {"rest": (0, rest), "sweep": (rest, end), "ring_down": (end, reference.size)}
-    return Excitation(kind, parameters, rate_hz, reference, segments)
+    segments = {
+        "rest": (0, rest_ticks),
+        "sweep": (rest_ticks, end),
+        "ring_down": (end, reference.size),
+    }
+    return Excitation(excitation_name, parameters, rate_hz, reference, segments)

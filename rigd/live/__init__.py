@@ -1,4 +1,4 @@
-"""The live view: a process that shows the samples in Rerun, and for which nothing waits.
+"""The live view: a process that shows the samples in Rerun without delaying other processes.
 
 The public interface is the viewer's window (`Viewer`, `FileWindow`), the page for browsers
 (`PageOfFile`), the running views (`LiveAddress`, `running`) and the jobs of the publisher

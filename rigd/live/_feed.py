@@ -1,8 +1,8 @@
-"""Connection from the publisher to the Rerun server, which never blocks and restores itself.
+"""Connection from the publisher to the Rerun server that never blocks and reconnects by itself.
 
 If its server is absent or frozen, the SDK first buffers silently and then blocks indefinitely.
-Therefore each batch of drawings is flushed with a time limit, and the next one is given to the SDK
-only when the one before has left. The SDK never buffers more than one batch.
+Therefore each batch of drawings is flushed with a timeout, and the next batch is passed to the SDK
+only after the previous one has been sent. The SDK never buffers more than one batch.
 """
 
 import contextlib
@@ -10,7 +10,7 @@ import threading
 from collections.abc import Callable, Iterable
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.live._server import Outlet
+from rigd.live._server import RerunServer
 from rigd.view.plots import APPLICATION_ID
 
 if TYPE_CHECKING:
@@ -18,96 +18,105 @@ if TYPE_CHECKING:
 
     from rigd.view import Drawing
 
-_PATIENCE_S: Final = 0.2
-_STALLED_PATIENCE_S: Final = 0.02
-"""Timeout of a flush while the server stalls, so that the session is not delayed repeatedly."""
-_MOST_STALLED_POLLS: Final = 200
-"""Polls of a stalled server after which it is killed: 10 s at the publisher's 20 per second."""
+_FLUSH_TIMEOUT_S: Final = 0.2
+"""Timeout of a flush in seconds."""
+_STALLED_FLUSH_TIMEOUT_S: Final = 0.02
+"""Timeout in seconds of a flush while the server stalls.
+
+It is short so that the view of the session is not delayed repeatedly."""
+_MAX_STALLED_POLLS: Final = 200
+"""Number of polls of a stalled server after which the server is killed.
+
+It corresponds to 10 s at the publisher's 20 polls per second."""
 
 
-class Feed:
-    """Stream of successive sessions' recordings to the present server.
+class DrawingStream:
+    """Sends the drawings of successive sessions to the present Rerun server.
 
     Parameters
     ----------
-    outlet
-        Outlet with the server.
+    server_program
+        Rerun server that is replaced when it ends.
 
     Attributes
     ----------
     connections
-        Number of connections so far, each of which began with the frame of the scene.
+        Number of connections so far; each one began with the drawings of the scene's frame.
     stalled
-        Whether the server does not accept the last drawings.
+        Whether the server has not accepted the last drawings yet.
     """
 
-    def __init__(self, outlet: Outlet) -> None:
-        self._outlet = outlet
+    def __init__(self, server_program: RerunServer) -> None:
+        self._server_program = server_program
         self._recording_id = ""
         self._frame: Callable[[], Iterable[Drawing]] = tuple
         self._stream: RecordingStream | None = None
         self._server: int | None = None
-        self._laid_out: int | None = None
+        self._server_with_layout: int | None = None
         self._stalled_polls = 0
-        self._breaking: list[threading.Thread] = []
+        self._closing_threads: list[threading.Thread] = []
         self.connections = 0
         self.stalled = False
 
     def begin(self, recording_id: str, frame: "Callable[[], Iterable[Drawing]]") -> None:
-        """Start a new recording.
+        """Start a new recording, to which viewers switch.
 
         Parameters
         ----------
         recording_id
-            Identifier of the recording; viewers switch to a new one.
+            Identifier of the recording.
         frame
-            Returns the first drawings of each connection.
+            Function that returns the first drawings of each connection.
         """
         self._recording_id, self._frame = recording_id, frame
 
     def ready(self) -> bool:
-        """Connect if necessary; return whether drawings can be sent without waiting."""
-        if not self._outlet.poll():
+        """Connect to the server if necessary, and return whether it accepts drawings now."""
+        if not self._server_program.poll():
             self._discard()
             return False
-        assert self._outlet.address is not None
-        if self._server != self._outlet.address.server:
+        assert self._server_program.address is not None
+        if self._server != self._server_program.address.server:
             self._discard()
-        if self.stalled and not self._recovered():
+        if self.stalled and not self._has_recovered():
             return False
         if self._stream is not None and self._stream.get_recording_id() != self._recording_id:
             self._close()
-        if self._stream is None and self._recording_id and self._outlet.answers():
+        if (
+            self._stream is None
+            and self._recording_id
+            and self._server_program.accepts_connections()
+        ):
             self._connect()
         return self._stream is not None and not self.stalled
 
     def send(self, drawings: "Iterable[Drawing]") -> bool:
-        """Send drawings; return whether the stream has accepted them.
+        """Send drawings, and return whether the connection still exists.
 
-        If the server stalls, they wait in the SDK until it recovers.
+        If the server stalls, the SDK buffers the drawings until it recovers.
         """
         if self._stream is None:
             return False
         for draw in drawings:
             draw(self._stream)
-        self._flush(_PATIENCE_S)
+        self._flush(_FLUSH_TIMEOUT_S)
         return self._stream is not None
 
-    def _recovered(self) -> bool:
-        """Return whether a stalled server has recovered; kill it if it never does."""
-        self._flush(_STALLED_PATIENCE_S)
+    def _has_recovered(self) -> bool:
+        """Return whether a stalled server accepts drawings again; kill it if it stalls too long."""
+        self._flush(_STALLED_FLUSH_TIMEOUT_S)
         if self.stalled:
             self._stalled_polls += 1
-            if self._stalled_polls > _MOST_STALLED_POLLS:
-                self._outlet.kill_server()
-        # If the connection broke instead, the state of the server is checked first.
+            if self._stalled_polls > _MAX_STALLED_POLLS:
+                self._server_program.kill_server()
+        # After a broken connection the next call first checks the state of the server.
         return self._stream is not None and not self.stalled
 
-    def _flush(self, patience_s: float) -> None:
-        """Flush the SDK with a timeout, and detect a stalled server or a broken connection."""
+    def _flush(self, timeout_s: float) -> None:
+        """Flush the SDK's buffer, and detect a stalled server or a broken connection."""
         assert self._stream is not None
         try:
-            self._stream.flush(timeout_sec=patience_s)
+            self._stream.flush(timeout_sec=timeout_s)
         except RuntimeError as error:
             if "timed out" in str(error):
                 self.stalled = True
@@ -119,43 +128,46 @@ class Feed:
             self._stalled_polls = 0
 
     def _close(self) -> None:
-        """Close a stream that has sent everything."""
+        """Close the stream, which has sent all its drawings."""
         assert self._stream is not None
-        # The clean-up of a stream waits for all others that are closing, and they for it.
-        forget = not any(thread.is_alive() for thread in self._breaking)
-        _in_background(_close_stream, [self._stream], forget)
+        # The SDK's clean-up would wait for streams that are still closing, and they for it.
+        release = not any(thread.is_alive() for thread in self._closing_threads)
+        _in_background(_close_stream, [self._stream], release)
         self._stream = None
 
     def _discard(self) -> None:
-        """Close a stream whose server is gone or replaced."""
+        """Close the stream after its server has ended or was replaced."""
         if self._stream is not None:
-            # In the background, because it tries to reach its server for up to 10 s.
-            self._breaking = [thread for thread in self._breaking if thread.is_alive()]
-            self._breaking.append(_in_background(_close_stream, [self._stream], False))
+            # In the background, because the SDK tries to reach the server for up to 10 s.
+            self._closing_threads = [
+                thread for thread in self._closing_threads if thread.is_alive()
+            ]
+            self._closing_threads.append(_in_background(_close_stream, [self._stream], False))
         self._stream = None
         self.stalled = False
         self._stalled_polls = 0
 
     def _connect(self) -> None:
+        """Connect to the present server, and send the frame of the scene."""
         import rerun as rr
 
-        address = self._outlet.address
+        address = self._server_program.address
         assert address is not None
         self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._recording_id)
         stream.connect_grpc(address.proxy_url)
         self._server = address.server
         self.connections += 1
-        laid_out = self._laid_out == self._server
-        target: Any = _LaidOut(stream) if laid_out else stream
+        has_layout = self._server_with_layout == self._server
+        target: Any = _StreamWithoutLayout(stream) if has_layout else stream
         for draw in self._frame():
             draw(target)
-        self._flush(_PATIENCE_S)
+        self._flush(_FLUSH_TIMEOUT_S)
         if self._stream is not None:
-            self._laid_out = self._server
+            self._server_with_layout = self._server
 
 
-class _LaidOut:
-    """A stream to viewers that already have their layout.
+class _StreamWithoutLayout:
+    """Stream that omits the layout, for viewers that have it already.
 
     It preserves changes of the layout by the operator. (Each blueprint also costs the SDK 2 MB and
     two threads that it never releases.)
@@ -168,20 +180,24 @@ class _LaidOut:
         return getattr(self._stream, name)
 
     def send_blueprint(self, *_: object, **__: object) -> None:
-        """Do nothing, so that the layout is unchanged."""
+        """Ignore the layout, so that the viewers keep theirs."""
 
 
 def _in_background(function: Callable[..., None], *arguments: object) -> threading.Thread:
+    """Start a function in a daemon thread, and return the thread."""
     thread = threading.Thread(target=function, args=arguments, daemon=True)
     thread.start()
     return thread
 
 
-def _close_stream(streams: "list[RecordingStream]", forget: bool) -> None:
-    """Close the only reference to a stream; `forget`: release its resources in the SDK."""
+def _close_stream(streams: "list[RecordingStream]", release: bool) -> None:
+    """Disconnect the stream in a list and drop its last reference.
+
+    With `release` the SDK also releases the stream's resources.
+    """
     from rerun_bindings import flush_and_cleanup_orphaned_recordings
 
     with contextlib.suppress(RuntimeError):
         streams.pop().disconnect()
-        if forget:
+        if release:
             flush_and_cleanup_orphaned_recordings()

@@ -1,7 +1,7 @@
 """Page of the live view for browsers: Rerun's web viewer on loopback, confined to this computer.
 
 Rerun's own page loads fonts from the internet and sends usage statistics there from the operator's
-browser. This module therefore serves the page with a policy by which browsers load from this
+browser. This module therefore serves the page with a policy that makes browsers load from this
 computer only. It adds a script that reloads the page when the server was replaced, because viewers
 do not reconnect by themselves.
 """
@@ -23,32 +23,39 @@ from typing import Any, Final
 from rigd.live.address import LOOPBACK, LiveAddress
 
 PAGE_PORT: Final = 9090
-"""Rerun's default port, unless another process uses it."""
-_STATE: Final = "live.json"
-"""File that identifies the present server."""
-_FILES: Final = frozenset(
+"""Preferred port of the page, Rerun's default."""
+_STATE_DOCUMENT: Final = "live.json"
+"""Name of the document that identifies the present server."""
+_SERVED_FILES: Final = frozenset(  # Names of all documents that the page serves
     {
-        _STATE,
+        _STATE_DOCUMENT,
         *("", "re_viewer.js", "re_viewer_bg.wasm", "sw.js", "favicon.ico", "apple-touch-icon.png"),
     }
 )
-_BLOCK: Final = 65_536
-_PATIENCE_S: Final = 10.0
-_POLL_S: Final = 0.1
-_LONGEST_S: Final = 60.0
-"""Longest connection: the viewer has 40 MB, and a tunnel may be slow."""
-_MOST_AT_ONCE: Final = 16
-_OWN_NAMES: Final = frozenset({LOOPBACK, "localhost"})
-"""Permitted host names: any page on the internet can resolve its own name to loopback."""
+_BLOCK_BYTES: Final = 65_536
+"""Number of bytes of Rerun's files that are forwarded at once."""
+_REQUEST_TIMEOUT_S: Final = 10.0
+"""Timeout in seconds of a browser's request and of Rerun's reply."""
+_POLL_PERIOD_S: Final = 0.1
+"""Period in seconds of the server's polls, and pause after a failed connection."""
+_MAX_CONNECTION_S: Final = 60.0
+"""Longest duration of a connection in seconds: the viewer has 40 MB, and a tunnel may be slow."""
+_MAX_CONNECTIONS: Final = 16
+"""Largest number of simultaneous connections."""
+_PERMITTED_HOSTS: Final = frozenset({LOOPBACK, "localhost"})
+"""Host names by which browsers may request the page.
 
-_HERE: Final = f"http://{LOOPBACK}:* http://localhost:*"
-_POLICY: Final = "; ".join(
+Other names are refused, since any page on the internet can resolve its own name to loopback."""
+
+_LOOPBACK_SOURCES: Final = f"http://{LOOPBACK}:* http://localhost:*"
+"""Sources in the content security policy that stand for servers on this computer."""
+_SECURITY_POLICY: Final = "; ".join(  # Content security policy of the page
     (
         "default-src 'none'",
         "script-src 'self' 'unsafe-inline' 'wasm-unsafe-eval'",
         "style-src 'unsafe-inline'",
         "img-src 'self' data: blob:",
-        f"connect-src 'self' {_HERE}",
+        f"connect-src 'self' {_LOOPBACK_SOURCES}",
         "worker-src 'self' blob:",
         "base-uri 'none'",
         "form-action 'none'",
@@ -56,7 +63,8 @@ _POLICY: Final = "; ".join(
     )
 )
 _REMOTE_LINK: Final = re.compile(r"<link\s[^>]*https?://[^>]*>")
-_AGAIN: Final = """
+"""Pattern of links in Rerun's page to other computers."""
+_RELOAD_SCRIPT: Final = """
     <script>
       let shown = null;
       async function beginAgain() {
@@ -73,22 +81,25 @@ _AGAIN: Final = """
 """
 
 
+"""Script that reloads the page after the server was replaced."""
+
+
 class ViewerPageServer:
-    """Server of the page for browsers on this computer, in separate threads.
+    """HTTP server of the live view's page for browsers on this computer, in separate threads.
 
     Parameters
     ----------
     port
-        Port on loopback; 0: the system chooses one.
+        Port on loopback, or 0 if the system chooses one.
     address
-        Returns the present view; None: there is none.
+        Function that returns the address of the present view, or None if there is none.
     upstream
-        Returns the port on loopback at which Rerun itself serves the page; 0: none.
+        Function that returns the port on loopback at which Rerun itself serves the page, or 0.
 
     Attributes
     ----------
     port
-        Port on which it listens.
+        Port on which the server listens.
 
     Raises
     ------
@@ -102,15 +113,15 @@ class ViewerPageServer:
         address: Callable[[], LiveAddress | None],
         upstream: Callable[[], int],
     ) -> None:
-        self._server = _Server(port, address, upstream)
+        self._server = _PageServer(port, address, upstream)
         self.port = self._server.server_port
         self._thread = threading.Thread(
-            target=self._server.serve_forever, args=(_POLL_S,), daemon=True
+            target=self._server.serve_forever, args=(_POLL_PERIOD_S,), daemon=True
         )
         self._thread.start()
 
     def close(self) -> None:
-        """Stop the server."""
+        """Stop the server of the page."""
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
@@ -119,17 +130,22 @@ class ViewerPageServer:
 def serve_page(
     address: Callable[[], LiveAddress | None], upstream: Callable[[], int]
 ) -> ViewerPageServer:
-    """Serve the page on :data:`PAGE_PORT` or on a free port if that is taken."""
+    """Start the page's server on :data:`PAGE_PORT`, or on a free port if that one is taken.
+
+    `address` and `upstream` are as for `ViewerPageServer`.
+    """
     try:
         return ViewerPageServer(PAGE_PORT, address, upstream)
     except OSError:
         return ViewerPageServer(0, address, upstream)
 
 
-class _Server(ThreadingHTTPServer):
+class _PageServer(ThreadingHTTPServer):
+    """HTTP server that limits the number and the duration of its connections."""
+
     daemon_threads = True
     block_on_close = False  # does not wait for browsers
-    # Permits the port of a view that has just ended, but not one with a listener.
+    # Permits the port of a view that has just ended, but not one on which a process listens.
     allow_reuse_address = True
 
     def __init__(
@@ -137,69 +153,72 @@ class _Server(ThreadingHTTPServer):
     ) -> None:
         self.address = address
         self.upstream = upstream
-        self.room = threading.BoundedSemaphore(_MOST_AT_ONCE)
-        super().__init__((LOOPBACK, port), _Handler)
+        self.free_connections = threading.BoundedSemaphore(_MAX_CONNECTIONS)
+        super().__init__((LOOPBACK, port), _PageHandler)
 
     def server_bind(self) -> None:
-        """Bind without the base class's name resolution of the address."""
+        """Bind the socket without the base class's name resolution of the address."""
         socketserver.TCPServer.server_bind(self)
         self.server_name, self.server_port = LOOPBACK, self.socket.getsockname()[1]
 
     def get_request(self) -> tuple[socket.socket, Any]:
-        """Accept a connection; pause if that fails for lack of descriptors."""
+        """Accept a connection, or pause if no file descriptors are left."""
         try:
             return super().get_request()
         except OSError:
-            time.sleep(_POLL_S)
+            time.sleep(_POLL_PERIOD_S)
             raise
 
     def process_request(self, request: Any, client_address: Any) -> None:  # noqa: ANN401 - as there
-        """Handle a request in a thread, unless there are too many."""
-        if self.room.acquire(blocking=False):
+        """Serve a connection in a thread, or close it if there are too many."""
+        if self.free_connections.acquire(blocking=False):
             super().process_request(request, client_address)
         else:
             self.shutdown_request(request)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
-        """Handle a request, and cut off the connection if that takes too long."""
-        end = threading.Timer(_LONGEST_S, _cut_off, (request,))
-        end.daemon = True
-        end.start()
+        """Serve a connection, and close it if it lasts too long."""
+        timer = threading.Timer(_MAX_CONNECTION_S, _shut_down, (request,))
+        timer.daemon = True
+        timer.start()
         try:
             super().process_request_thread(request, client_address)
         finally:
-            end.cancel()
-            self.room.release()
+            timer.cancel()
+            self.free_connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Ignore errors of browsers that disconnect."""
 
 
-class _Handler(BaseHTTPRequestHandler):
-    server: _Server
-    timeout = _PATIENCE_S
+class _PageHandler(BaseHTTPRequestHandler):
+    """Replies to the requests of browsers for the page and Rerun's files."""
+
+    server: _PageServer
+    timeout = _REQUEST_TIMEOUT_S
 
     def do_GET(self) -> None:
-        """Handle a request of a browser."""
+        """Send the requested document, or refuse a request under another host name."""
         host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-        if host in _OWN_NAMES:
-            self._answer()
+        if host in _PERMITTED_HOSTS:
+            self._send_document()
         else:
-            self._say(HTTPStatus.FORBIDDEN, f"Open this page as http://{LOOPBACK}:PORT.")
+            self._send_text(HTTPStatus.FORBIDDEN, f"Open this page as http://{LOOPBACK}:PORT.")
 
     def log_message(self, *_: object) -> None:
-        """Log nothing: the operator's terminal is for the session."""
+        """Write no log, because the operator's terminal shows the session."""
 
-    def _answer(self) -> None:
-        split = urllib.parse.urlsplit(self.path)
-        name, address = split.path.lstrip("/"), self.server.address()
-        if name not in _FILES:
-            self._say(HTTPStatus.NOT_FOUND, "Not found.")
+    def _send_document(self) -> None:
+        """Send the requested document, a redirection, or an error."""
+        url = urllib.parse.urlsplit(self.path)
+        name, address = url.path.lstrip("/"), self.server.address()
+        if name not in _SERVED_FILES:
+            self._send_text(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
             self._send_retry()
-        elif name == _STATE:
+        elif name == _STATE_DOCUMENT:
             self._send(json.dumps({"server": address.server}).encode(), "application/json")
-        elif not name and "url" not in urllib.parse.parse_qs(split.query):
+        elif not name and "url" not in urllib.parse.parse_qs(url.query):
             # Relative, because the browser may use a tunnel on another port.
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/?{urllib.parse.urlsplit(address.viewer_url).query}")
@@ -208,60 +227,66 @@ class _Handler(BaseHTTPRequestHandler):
             self._forward(name)
 
     def _forward(self, name: str) -> None:
-        """Send one of Rerun's files."""
-        link = http.client.HTTPConnection(LOOPBACK, self.server.upstream(), timeout=_PATIENCE_S)
+        """Send a file of Rerun's own page server, without links to other computers."""
+        rerun_connection = http.client.HTTPConnection(
+            LOOPBACK, self.server.upstream(), timeout=_REQUEST_TIMEOUT_S
+        )
         try:
-            link.request("GET", f"/{name}")
-            answer = link.getresponse()
-            kind = answer.headers.get("Content-Type", "application/octet-stream")
+            rerun_connection.request("GET", f"/{name}")
+            reply = rerun_connection.getresponse()
+            content_type = reply.headers.get("Content-Type", "application/octet-stream")
             if not name:
-                self._send(confine_to_loopback(answer.read().decode()).encode(), kind)
+                self._send(confine_to_loopback(reply.read().decode()).encode(), content_type)
                 return
-            self.send_response(answer.status)
-            self.send_header("Content-Type", kind)
+            self.send_response(reply.status)
+            self.send_header("Content-Type", content_type)
             # The length, although the transfer is chunked.
-            if (size := answer.headers.get("rerun-final-length")) is not None:
+            if (size := reply.headers.get("rerun-final-length")) is not None:
                 self.send_header("Content-Length", size)
             self._end_headers()
-            while block := answer.read(_BLOCK):
+            while block := reply.read(_BLOCK_BYTES):
                 self.wfile.write(block)
         except (OSError, http.client.HTTPException):
             # The server is being replaced, or the browser is gone.
             with suppress(OSError):
                 self._send_retry()
         finally:
-            link.close()
+            rerun_connection.close()
 
     def _send_retry(self) -> None:
-        """Make the browser try again."""
-        self._say(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", again=True)
+        """Send an error after which the browser repeats its request in a second."""
+        self._send_text(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", retry=True)
 
-    def _say(self, status: HTTPStatus, text: str, *, again: bool = False) -> None:
+    def _send_text(self, status: HTTPStatus, text: str, *, retry: bool = False) -> None:
+        """Send a text; with `retry` the browser repeats its request in a second."""
         self.send_response(status)
-        if again:
+        if retry:
             self.send_header("Refresh", "1")
         self.send_header("Content-Type", "text/plain; charset=utf-8")
         self._end_headers()
         self.wfile.write(text.encode())
 
-    def _send(self, body: bytes, kind: str) -> None:
+    def _send(self, body: bytes, content_type: str) -> None:
+        """Send a document of a content type that is not stored in caches."""
         self.send_response(HTTPStatus.OK)
-        self.send_header("Content-Type", kind)
+        self.send_header("Content-Type", content_type)
         self.send_header("Content-Length", str(len(body)))
         self.send_header("Cache-Control", "no-store")
         self._end_headers()
         self.wfile.write(body)
 
     def _end_headers(self) -> None:
-        self.send_header("Content-Security-Policy", _POLICY)
+        """Send the content security policy as the last header."""
+        self.send_header("Content-Security-Policy", _SECURITY_POLICY)
         self.end_headers()
 
 
-def _cut_off(connection: socket.socket) -> None:
+def _shut_down(connection: socket.socket) -> None:
+    """Shut down a connection in both directions."""
     with suppress(OSError):  # it has just ended by itself
         connection.shutdown(socket.SHUT_RDWR)
 
 
 def confine_to_loopback(page: str) -> str:
-    """Return Rerun's page without links to other computers, and with the reload script."""
-    return _REMOTE_LINK.sub("", page).replace("</body>", f"{_AGAIN}</body>", 1)
+    """Return the text of Rerun's page without links to other computers, with the reload script."""
+    return _REMOTE_LINK.sub("", page).replace("</body>", f"{_RELOAD_SCRIPT}</body>", 1)

@@ -1,4 +1,4 @@
-"""Rerun's program as a child process: silent, on loopback only, and ending with this process."""
+"""Rerun's program as a child process: silent, on loopback only, and killed with this process."""
 
 import collections
 import ctypes
@@ -16,45 +16,52 @@ from rigd.errors import FailureError
 from rigd.live.address import LOOPBACK
 from rigd.view.rrd_file import without_settings
 
-_NOWHERE = f"http://{LOOPBACK}:9"
-"""The discard port, on which no process listens."""
-_QUIET: Mapping[str, str] = {
+_REFUSING_PROXY = f"http://{LOOPBACK}:9"
+"""Proxy that refuses all requests: no process listens on the discard port."""
+_OFFLINE_ENVIRONMENT: Mapping[
+    str, str
+] = {  # Environment variables that keep Rerun off the internet
     # With this variable Rerun sends no usage data.
     "CI": "1",
     # Its requests to the web (newer versions, examples) fail on this computer. Its connections to
     # viewers and recordings ignore proxies.
-    **dict.fromkeys(("ALL_PROXY", "HTTPS_PROXY", "HTTP_PROXY"), _NOWHERE),
-    **dict.fromkeys(("all_proxy", "https_proxy", "http_proxy"), _NOWHERE),
+    **dict.fromkeys(("ALL_PROXY", "HTTPS_PROXY", "HTTP_PROXY"), _REFUSING_PROXY),
+    **dict.fromkeys(("all_proxy", "https_proxy", "http_proxy"), _REFUSING_PROXY),
     "NO_PROXY": "",
     "no_proxy": "",
     # Its log contains its ports, so it must be readable whatever the user has set.
     "RUST_LOG": "info",
     "NO_COLOR": "1",
 }
-_LISTENING = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
-_SERVING_PAGE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
-_NO_GRAPHICS = re.compile(
+_GRPC_PORT_LINE = re.compile(rf"gRPC connections on {re.escape(LOOPBACK)}:(\d+)")
+"""Pattern of the log line with the port for native viewers."""
+_PAGE_PORT_LINE = re.compile(rf"web-viewer at http://{re.escape(LOOPBACK)}:(\d+)")
+"""Pattern of the log line with the port of the page."""
+_NO_GRAPHICS_LINE = re.compile(  # Pattern of log lines about missing graphics
     # Neither Vulkan nor OpenGL, or only OpenGL, which is incomplete in Mesa's software renderer.
     "[Nn]o (suitable )?(graphics|wgpu) adapter|Failed to get render context"
 )
-_MOMENT_S: Final = 0.5
-_MOST_READING_S: Final = 10.0
+_LOG_WAIT_S: Final = 0.5
+"""Seconds to wait for further log lines of a running program."""
+_LAST_LOG_WAIT_S: Final = 10.0
+"""Longest time in seconds to read the log of an ended program to its end."""
 _PR_SET_PDEATHSIG = 1  # linux/prctl.h
+"""Option of prctl that sets the signal which a process receives when its parent ends."""
 
 
 class RerunError(FailureError):
-    """Rerun's program cannot run."""
+    """Rerun's program is missing, cannot be started, or has failed."""
 
 
 class RerunProgram:
-    """Rerun's program as a child process, which ends with this one.
+    """Rerun's program as a child process that the system kills when this process ends.
 
     Parameters
     ----------
     options
-        Options of its command line.
+        Options of the program's command line.
     environment
-        Environment variables in addition to this process's own.
+        Environment variables in addition to those of this process.
 
     Raises
     ------
@@ -65,11 +72,11 @@ class RerunProgram:
     def __init__(
         self, options: Sequence[str], environment: Mapping[str, str] | None = None
     ) -> None:
-        command = [_path(), *("--bind", LOOPBACK), *options]
+        command = [_program_path(), *("--bind", LOOPBACK), *options]
         try:
             self._process = subprocess.Popen(
                 command,
-                env={**without_settings(os.environ), **_QUIET, **(environment or {})},
+                env={**without_settings(os.environ), **_OFFLINE_ENVIRONMENT, **(environment or {})},
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,
@@ -88,64 +95,67 @@ class RerunProgram:
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id of Rerun's program."""
         return self._process.pid
 
     @property
     def running(self) -> bool:
-        """Whether the process exists, even if it is frozen."""
+        """Whether the program has not ended; it may be frozen."""
         return self._process.poll() is None
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code; None while it is running."""
+        """Exit code of Rerun's program, or None while it is running."""
         return self._process.poll()
 
     @property
     def grpc_port(self) -> int:
-        """Port for connections; 0: not known yet."""
-        return self._ports.get(_LISTENING, 0)
+        """Port of Rerun's server for native viewers, or 0 if it is not known yet."""
+        return self._ports.get(_GRPC_PORT_LINE, 0)
 
     @property
     def page_port(self) -> int:
-        """Port of the web viewer's page; 0: not known yet, or no page."""
-        return self._ports.get(_SERVING_PAGE, 0)
+        """Port of Rerun's page for browsers, or 0 if it is unknown or there is no page."""
+        return self._ports.get(_PAGE_PORT_LINE, 0)
 
     @property
-    def last_words(self) -> str:
-        """The last lines of its log."""
-        self._read_on()
+    def last_log_lines(self) -> str:
+        """Last lines of the program's log, or "it wrote no log"."""
+        self._wait_for_log()
         return " ".join(self._last_lines) or "it wrote no log"
 
     @property
     def without_graphics(self) -> bool:
-        """Whether its log reports that the computer has no usable graphics."""
-        self._read_on()
+        """Whether the program's log reports that the computer has no usable graphics."""
+        self._wait_for_log()
         return self._without_graphics
 
     def kill(self) -> None:
-        """Kill the process; it has nothing to save."""
+        """Kill Rerun's program, which has nothing to save."""
         self._process.kill()
         self._process.wait()
 
-    def _read_on(self) -> None:
-        # After the process has ended, read the log to its end.
-        self._reader.join(timeout=_MOMENT_S if self.running else _MOST_READING_S)
+    def _wait_for_log(self) -> None:
+        """Wait a moment for further log lines, or until the log of an ended program is complete."""
+        # After the end of the program the thread reads the log to its end.
+        self._reader.join(timeout=_LOG_WAIT_S if self.running else _LAST_LOG_WAIT_S)
 
     def _read_log(self) -> None:
+        """Read the program's log to its end, for ports and errors (run in a thread)."""
         assert self._process.stdout is not None
         with self._process.stdout as log:
             for line in log:
                 self._last_lines.append(line.strip()[:200])
                 # A backtrace follows this line, so it is not among the last lines.
-                self._without_graphics |= _NO_GRAPHICS.search(line) is not None
-                for pattern in (_LISTENING, _SERVING_PAGE):
-                    if found := pattern.search(line):
-                        self._ports[pattern] = int(found[1])
+                self._without_graphics |= _NO_GRAPHICS_LINE.search(line) is not None
+                for pattern in (_GRPC_PORT_LINE, _PAGE_PORT_LINE):
+                    if match := pattern.search(line):
+                        self._ports[pattern] = int(match[1])
 
 
-def _path() -> str:
-    # Not the `rerun` command on the path, a script: ending it would leave the program running.
+def _program_path() -> str:
+    """Return the path of Rerun's program, or raise RerunError if it is not installed."""
+    # The `rerun` command on the path is a script: killing it would leave the program running.
     package = importlib.util.find_spec("rerun_cli")
     if package is None or package.origin is None:
         raise RerunError("The Python package rerun-sdk is not installed; the live view needs it.")
@@ -156,4 +166,5 @@ _prctl = ctypes.CDLL(None).prctl
 
 
 def _die_with_parent() -> None:
+    """Make the system kill this new process when its parent ends."""
     _prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

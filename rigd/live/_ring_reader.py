@@ -1,4 +1,4 @@
-"""Reader of a session's rings for the live view."""
+"""Reader of a session's records in the ring buffers, for the live view."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -19,8 +19,8 @@ Records = TypeVar("Records")
 
 
 @dataclass(frozen=True, slots=True)
-class Harvest:
-    """Drawings of the records since the last call.
+class NewDrawings:
+    """Drawings of the records that were read from the rings in one call.
 
     Attributes
     ----------
@@ -29,7 +29,7 @@ class Harvest:
     drawings
         All other drawings.
     samples
-        Number of samples that the drawings show for the first time.
+        Number of samples in the drawings that no earlier publisher has shown.
     """
 
     notes: "list[Drawing]"
@@ -37,31 +37,31 @@ class Harvest:
     samples: int
 
 
-class Intake:
-    """Reader of one session's rings, from its first record to its last.
+class SessionRecordReader:
+    """Reads one session's records from the ring buffers, and turns them into drawings.
 
     Records that are overwritten before they are read are counted; the writer never waits.
 
     Parameters
     ----------
     session
-        Session to show.
+        Session to read.
     channels
-        The memory of the rig's processes.
+        Shared memory of the rig's processes.
     seen
-        Number of samples that an earlier publisher showed, counted as `begins` is. Those still in
-        the ring are read again for the scene.
+        Number of samples that an earlier publisher has shown, counted as `LiveSession.begins`.
+        Those that are still in the ring are read again for the scene.
     last
-        Response of the last session of the same specimen.
+        Frequency response of the last session of the same specimen, or None.
 
     Attributes
     ----------
-    picture
-        Scene of the session.
+    scene
+        Scene of the session, which makes the drawings.
     t_ns
-        Time of the newest sample, since the start of the session.
-    took_s
-        Duration of the samples that were read last.
+        Time of the newest sample since the start of the session.
+    read_duration_s
+        Duration of the samples that were read in the last call.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class Intake:
         seen: int = 0,
         last: LastResponse | None = None,
     ) -> None:
-        self.picture = Scene(session.subject, last=last)
+        self.scene = Scene(session.subject, last=last)
         self.t_ns = 0
-        self.took_s = 0.0
+        self.read_duration_s = 0.0
         self._rate_hz = session.subject.rate_hz
-        self._seen = seen
+        self._seen_samples = seen
         self._readers = {
             topic: _RingReader(ring, first, seen if topic is SAMPLE else 0)
             for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
@@ -84,17 +84,17 @@ class Intake:
 
     @property
     def dropped(self) -> int:
-        """Samples that were overwritten before they were read."""
+        """Number of samples that were overwritten before they were read."""
         return self._readers[SAMPLE].dropped
 
     @property
     def next(self) -> int:
-        """Number of the next sample, counted as `begins` is."""
+        """Number of the next sample to read, counted as `LiveSession.begins`."""
         return self._readers[SAMPLE].next
 
     @property
     def exhausted(self) -> bool:
-        """Whether the session is over and completely read."""
+        """Whether the session has ended and all its records were read."""
         return all(reader.exhausted for reader in self._readers.values())
 
     def end(self, ends: Sequence[int]) -> None:
@@ -103,49 +103,56 @@ class Intake:
             if topic in self._readers:
                 self._readers[topic].end = end
 
-    def take(self) -> Harvest:
-        """Return the drawings of the new records, from the scene."""
-        picture, readers = self.picture, self._readers
+    def read_new(self) -> NewDrawings:
+        """Read the new records, and return their drawings."""
+        scene, readers = self.scene, self._readers
         notes: list[Drawing] = []
         drawings: list[Drawing] = []
-        count = fresh = 0
+        count = first_shown = 0
         for events in readers[EVENT].records(read_events):
-            notes += picture.events([Note(e.t_ns, e.level, e.message) for e in events])
+            notes += scene.events([Note(e.t_ns, e.level, e.message) for e in events])
         for timings in readers[TIMING].records(decode_timings):
-            drawings += picture.timings(timings)
+            drawings += scene.timings(timings)
         for samples in readers[SAMPLE].records(decode_samples):
-            drawings += picture.samples(samples)
+            drawings += scene.samples(samples)
             self.t_ns = int(samples["t_ns"][-1])
             count += len(samples)
-            fresh += min(len(samples), max(0, self.next - self._seen))
-        self.took_s = count / self._rate_hz
-        return Harvest(notes, drawings, fresh)
+            first_shown += min(len(samples), max(0, self.next - self._seen_samples))
+        self.read_duration_s = count / self._rate_hz
+        return NewDrawings(notes, drawings, first_shown)
 
 
 class _RingReader:
-    """Reader of one session's records in a ring."""
+    """Reads one session's records from a ring buffer.
+
+    `first` is the number of the session's first record, `seen` that of the first record which no
+    earlier publisher has shown.
+    """
 
     def __init__(self, ring: Ring, first: int, seen: int) -> None:
         self._ring = ring
         # Overwritten records that an earlier publisher showed do not count as dropped.
         self._observer = Observer(ring, max(first, min(seen, ring.oldest)))
-        self._damaged = 0
+        self._damaged_records = 0
         self.end: int | None = None
 
     @property
     def dropped(self) -> int:
-        return self._observer.dropped + self._damaged
+        """Number of records that were overwritten before they were read."""
+        return self._observer.dropped + self._damaged_records
 
     @property
     def next(self) -> int:
+        """Number of the next record to read."""
         return self._observer.next
 
     @property
     def exhausted(self) -> bool:
+        """Whether the session has ended and all its records were read."""
         return self.end is not None and self._observer.next >= self.end
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
-        """Yield the present records in decoded blocks."""
+        """Yield the unread records in decoded blocks."""
         observer, written = self._observer, self._ring.written
         last = written if self.end is None else min(self.end, written)
         while True:
@@ -158,4 +165,4 @@ class _RingReader:
             try:
                 yield decode(block)
             except ValueError:  # overwritten while it was copied
-                self._damaged += len(block) // self._ring.record_size
+                self._damaged_records += len(block) // self._ring.record_size

@@ -1,4 +1,4 @@
-"""Server of the live view, which forwards the publisher's drawings to any number of viewers.
+"""Rerun server of the live view, which forwards the publisher's drawings to all viewers.
 
 It is a separate process so that a slow or frozen viewer delays nothing else, and because the SDK's
 own server listens on every interface. Viewers connect without authentication, so the server must
@@ -15,30 +15,35 @@ from rigd.live._program import RerunError, RerunProgram
 from rigd.live.address import LOOPBACK, LiveAddress, announce, withdraw
 
 GRPC_PORT: Final = 9876
-"""Rerun's default port, which viewers use by default and tunnels can forward in advance."""
-_BACKLOG: Final = "16MiB"
-"""Stored data for viewers that connect late: about 80 s."""
-_MOST_SESSIONS: Final = 20
-"""Sessions per server: each leaves about 300 kB of layout and charts in it."""
-_START_S: Final = 15.0
-"""Longest start of a server, on a busy computer."""
-_ANSWER_S: Final = 0.1
-_PAUSE_S: Final = 1.0
-"""Least time between two starts of a server."""
+"""Preferred port of the server, Rerun's default.
+
+Viewers use it by default, and tunnels can forward it in advance."""
+_SERVER_MEMORY: Final = "16MiB"
+"""Size of the data that the server stores for viewers that connect late: about 80 s."""
+_MAX_SESSIONS: Final = 20
+"""Number of sessions after which a server is replaced.
+
+Each session leaves about 300 kB of layout and charts in the server."""
+_START_TIMEOUT_S: Final = 15.0
+"""Longest time in seconds for the start of a server, on a busy computer."""
+_CONNECT_TIMEOUT_S: Final = 0.1
+"""Timeout in seconds of the test whether the server accepts connections."""
+_MIN_RESTART_INTERVAL_S: Final = 1.0
+"""Shortest time in seconds between two starts of a server."""
 
 
-class Outlet:
-    """A Rerun server that is replaced when it ends, with its announced address.
+class RerunServer:
+    """Rerun server that is restarted when it ends, with its announced address.
 
     Parameters
     ----------
     rig
-        The profile's name.
+        Name of the rig's profile.
 
     Attributes
     ----------
     address
-        Address of the present server; None while none accepts connections.
+        Address of the present server, or None while no server accepts connections.
 
     Raises
     ------
@@ -48,35 +53,37 @@ class Outlet:
 
     def __init__(self, rig: str) -> None:
         self.address: LiveAddress | None = None
-        self._announced: LiveAddress | None = None
+        self._announced_address: LiveAddress | None = None
         self._rig = rig
         self._grpc_port = free_port(GRPC_PORT)
         self._page = serve_page(lambda: self.address, lambda: self._program.page_port)
-        self._start()
+        self._start_program()
 
     def wait(self) -> LiveAddress:
-        """Wait for the first server, and return its address.
+        """Wait until the first server accepts connections, and return its address.
 
         Raises
         ------
         RerunError
-            If it ends or does not answer.
+            If the server ends or accepts no connections.
         """
-        deadline = time.monotonic() + 2 * _START_S
+        deadline = time.monotonic() + 2 * _START_TIMEOUT_S
         while not self.poll():
             if not self._program.running:
                 if not self._grpc_port:
-                    raise RerunError(f"The Rerun server ended: {self._program.last_words}.")
-                self._replace()
+                    raise RerunError(f"The Rerun server ended: {self._program.last_log_lines}.")
+                self._restart()
             if time.monotonic() > deadline:
                 self.close()
-                raise RerunError(f"The Rerun server does not answer: {self._program.last_words}.")
+                raise RerunError(
+                    f"The Rerun server does not answer: {self._program.last_log_lines}."
+                )
             time.sleep(0.01)
         assert self.address is not None
         return self.address
 
     def poll(self) -> bool:
-        """Check and replace the server if necessary; return whether it accepts connections."""
+        """Restart the server if it has ended, and return whether a server accepts connections."""
         program = self._program
         if program.running and program.grpc_port and program.page_port:
             if self.address is None:
@@ -84,50 +91,55 @@ class Outlet:
             return True
         self.address = None
         age_s = time.monotonic() - self._started_s
-        if age_s > _START_S:
-            # It mistook a listener on its port for another Rerun server, and serves nothing.
+        if age_s > _START_TIMEOUT_S:
+            # The program mistook a listener on its port for another Rerun server.
             program.kill()
-        if age_s > _PAUSE_S and not program.running:
-            self._replace()
+        if age_s > _MIN_RESTART_INTERVAL_S and not program.running:
+            self._restart()
         return False
 
-    def answers(self) -> bool:
-        """Return whether the server accepts connections: otherwise the SDK would wait 5 s."""
+    def accepts_connections(self) -> bool:
+        """Return whether the server accepts a connection; the SDK would wait 5 s for it."""
         try:
-            socket.create_connection((LOOPBACK, self._grpc_port), _ANSWER_S).close()
+            socket.create_connection((LOOPBACK, self._grpc_port), _CONNECT_TIMEOUT_S).close()
         except OSError:
             return False
         return True
 
-    def begin_session(self) -> None:
-        """Count a session; replace the server after many, because it never frees their data."""
+    def count_session(self) -> None:
+        """Count a session, and replace the server after many of them.
+
+        Rerun's server never frees the data of a session.
+        """
         self._sessions += 1
-        if self._sessions > _MOST_SESSIONS:
+        if self._sessions > _MAX_SESSIONS:
             self.kill_server()
 
     def kill_server(self) -> None:
-        """Kill the server, which is then replaced."""
+        """Kill the server; the next `poll` replaces it."""
         self._program.kill()
 
     def close(self) -> None:
-        """End the server and withdraw its address."""
+        """End the server and delete the file with its address."""
         self._program.kill()
         self._page.close()
-        if self._announced is not None:
+        if self._announced_address is not None:
             with suppress(OSError):  # readers of the file notice that its process has ended
-                withdraw(self._announced)
+                withdraw(self._announced_address)
 
-    def _replace(self) -> None:
-        """Start another server, on the same port for viewers and tunnels.
+    def _restart(self) -> None:
+        """Start another server, if possible on the same port for viewers and tunnels.
 
-        If the last one never served, the port was taken, and the system chooses another.
+        If the last server never accepted connections, the port was taken, and the system chooses
+        another one.
         """
         if not self._program.grpc_port:
             self._grpc_port = 0
         with suppress(RerunError):  # `poll` tries again
-            self._start()
+            self._start_program()
 
-    def _start(self) -> None:
+    def _start_program(self) -> None:
+        """Start Rerun's program as a server."""
         self._started_s = time.monotonic()
         self._sessions = 0
         self._program = RerunProgram(
@@ -135,29 +147,31 @@ class Outlet:
                 "--serve-web",
                 *("--port", str(self._grpc_port)),
                 *("--web-viewer-port", "0"),
-                *("--server-memory-limit", _BACKLOG),
+                *("--server-memory-limit", _SERVER_MEMORY),
             )
         )
 
     def _announce(self) -> None:
+        """Store the address of the server, and write it to its file."""
         self._grpc_port = self._program.grpc_port
-        self.address = self._announced = LiveAddress.of_this_process(
+        self.address = self._announced_address = LiveAddress.of_this_process(
             self._rig, self._grpc_port, self._page.port, time.time_ns()
         )
         with suppress(OSError):  # the view works nevertheless
             announce(self.address)
 
 
-def free_port(wanted: int) -> int:
-    """Return a port if no process listens on it, or 0, with which the system chooses one.
+def free_port(preferred_port: int) -> int:
+    """Return the port `preferred_port` if no process listens on it, otherwise 0.
 
-    Rerun's program cannot check this itself: it may mistake a listener for another Rerun server.
+    For port 0 the system chooses a free port. Rerun's program cannot check the port itself: it may
+    mistake a listener for another Rerun server.
     """
-    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as test_socket:
         # Connections of a server that has just ended do not count.
-        probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        test_socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:
-            probe.bind((LOOPBACK, wanted))
+            test_socket.bind((LOOPBACK, preferred_port))
         except OSError:
             return 0
-    return wanted
+    return preferred_port

@@ -1,4 +1,4 @@
-"""Rerun's native viewer: a window for a live view or a file, and the page for a file."""
+"""Windows of Rerun's viewer for a live view or a file, and its page for a file."""
 
 import contextlib
 import threading
@@ -12,34 +12,37 @@ from rigd.live._server import GRPC_PORT, free_port
 from rigd.live.address import LiveAddress, proxy_url
 from rigd.runtime.addresses import runtime_folder
 
-_MOST_MEMORY: Final = "4GiB"
-"""Limit beyond which the oldest data are dropped: enough for a session of some hours."""
-_START_S: Final = 30.0
-"""Longest start of a server."""
-_POLL_S: Final = 0.05
+_FILE_VIEWER_MEMORY: Final = "4GiB"
+"""Memory of a viewer for a file, above which the oldest data are dropped.
+
+It is enough for a session of some hours."""
+_START_TIMEOUT_S: Final = 30.0
+"""Longest time in seconds for the start of a server."""
+_POLL_PERIOD_S: Final = 0.05
+"""Period in seconds in which the program's state is polled."""
 
 
 # File in a window or a browser
 
 
-class _Playback:
-    """Rerun's program, which ends with this context."""
+class _RerunContext:
+    """Context manager of a running Rerun program, which ends when the context is left."""
 
     _program: RerunProgram
 
     @property
     def program(self) -> RerunProgram:
-        """Rerun's program."""
+        """Rerun's program of this window or page."""
         return self._program
 
     def wait(self) -> int:
-        """Wait until the program ends, such as a closed window, and return its exit code."""
+        """Wait until the program ends, for example a closed window, and return its exit code."""
         while (code := self._program.exit_code) is None:
-            time.sleep(_POLL_S)
+            time.sleep(_POLL_PERIOD_S)
         return code
 
     def close(self) -> None:
-        """End the program."""
+        """End Rerun's program."""
         self._program.kill()
 
     def __enter__(self) -> Self:
@@ -49,19 +52,20 @@ class _Playback:
         self.close()
 
 
-class _Window(_Playback):
-    """The viewer's window, which neither uses nor changes the user's settings of Rerun.
+class _Window(_RerunContext):
+    """Window of Rerun's viewer, which neither uses nor changes the user's settings of Rerun.
 
-    `shown` is the command line for its first contents, `memory` the limit beyond which the oldest
-    data are dropped, and `scratch` a folder for files that Rerun leaves when it is killed.
+    `content_options` are the command-line arguments for its first contents, `memory` is the limit
+    above which the oldest data are dropped, and `scratch` is a folder for files that Rerun leaves
+    when it is killed.
     """
 
     def __init__(
-        self, shown: tuple[str, ...], memory: str, scratch: Path, options: tuple[str, ...]
+        self, content_options: tuple[str, ...], memory: str, scratch: Path, options: tuple[str, ...]
     ) -> None:
         self._program = RerunProgram(
             (
-                *shown,
+                *content_options,
                 *("--port", "0"),
                 *("--memory-limit", memory),
                 "--hide-welcome-screen",
@@ -72,27 +76,27 @@ class _Window(_Playback):
 
     @property
     def fault(self) -> str:
-        """Reason, as a sentence, if the window was not closed by the user."""
+        """Sentence for the operator on why the window closed, if the user did not close it."""
         if self._program.without_graphics:
             return (
                 "The window cannot be drawn: this computer has no Vulkan driver, which Rerun's "
                 "viewer needs. Install one; on Debian and Ubuntu the package mesa-vulkan-drivers "
                 "has those for most graphics cards, and one that needs none."
             )
-        return f"The window was closed by a fault ({self._program.last_words})."
+        return f"The window was closed by a fault ({self._program.last_log_lines})."
 
 
 class FileWindow(_Window):
-    """The viewer's window for a file.
+    """Window of Rerun's viewer that shows a recording.
 
     Parameters
     ----------
     path
-        Path of the recording.
+        Path of the recording file.
     scratch
         Folder for files that Rerun leaves when it is killed.
     options
-        Further options of the command line.
+        Further options of Rerun's command line.
 
     Raises
     ------
@@ -101,18 +105,18 @@ class FileWindow(_Window):
     """
 
     def __init__(self, path: Path, scratch: Path, options: tuple[str, ...] = ()) -> None:
-        super().__init__((str(path.absolute()),), _MOST_MEMORY, scratch, options)
+        super().__init__((str(path.absolute()),), _FILE_VIEWER_MEMORY, scratch, options)
 
 
-class PageOfFile(_Playback):
-    """The viewer's page for a file, on loopback.
+class PageOfFile(_RerunContext):
+    """Page for browsers on this computer that shows a recording in Rerun's web viewer.
 
     Parameters
     ----------
     path
-        Path of the recording.
+        Path of the recording file.
     scratch
-        Folder for files that Rerun leaves.
+        Folder for files that Rerun leaves when it is killed.
 
     Attributes
     ----------
@@ -139,47 +143,55 @@ class PageOfFile(_Playback):
         )
 
     def close(self) -> None:
-        """Close the page and end the program."""
+        """Close the page and end Rerun's program."""
         self._page.close()
         super().close()
 
     def _serve(self, port: int) -> None:
+        """Start Rerun's program as a server of the recording on a port."""
         self._program = RerunProgram(
             (
                 str(self._file.absolute()),
                 "--serve-web",
                 *("--port", str(port)),
                 *("--web-viewer-port", "0"),
-                *("--server-memory-limit", _MOST_MEMORY),
+                *("--server-memory-limit", _FILE_VIEWER_MEMORY),
             ),
             {"TMPDIR": str(self._scratch)},
         )
 
     def _await_server(self) -> None:
-        deadline = time.monotonic() + _START_S
-        anywhere = False
+        """Wait until the server accepts connections; use another port if this one is taken."""
+        deadline = time.monotonic() + _START_TIMEOUT_S
+        any_port = False
         while not (self._program.grpc_port and self._program.page_port):
             if not self._program.running:
-                if anywhere or self._program.grpc_port:
-                    raise RerunError(f"The Rerun server ended: {self._program.last_words}.")
+                if any_port or self._program.grpc_port:
+                    raise RerunError(f"The Rerun server ended: {self._program.last_log_lines}.")
                 # Most likely another process has taken the port.
-                anywhere = True
+                any_port = True
                 self._serve(0)
             if time.monotonic() > deadline:
-                raise RerunError(f"The Rerun server does not answer: {self._program.last_words}.")
-            time.sleep(_POLL_S)
+                raise RerunError(
+                    f"The Rerun server does not answer: {self._program.last_log_lines}."
+                )
+            time.sleep(_POLL_PERIOD_S)
 
 
 # Window on a live view
 
-_WINDOW_MEMORY: Final = "2GiB"
-"""Limit beyond which the oldest data are dropped; the same computer may be running the loop."""
-_ANSWER_S: Final = 5.0
-_HOSTS: Final = ("127.0.0.1", "localhost")
+_LIVE_VIEWER_MEMORY: Final = "2GiB"
+"""Memory of a viewer for live views, above which the oldest data are dropped.
+
+It is limited because the same computer may be running the loop."""
+_SWITCH_TIMEOUT_S: Final = 5.0
+"""Longest time in seconds for the viewer to switch to another server."""
+_LOOPBACK_NAMES: Final = ("127.0.0.1", "localhost")
+"""Names of this computer, which are used in turn, since a viewer connects to a URL only once."""
 
 
 class Viewer(_Window):
-    """The viewer's window for live views.
+    """Window of Rerun's viewer that shows live views.
 
     Parameters
     ----------
@@ -188,7 +200,7 @@ class Viewer(_Window):
     scratch
         Folder for files that Rerun leaves when it is killed.
     options
-        Further options of the command line.
+        Further options of Rerun's command line.
 
     Raises
     ------
@@ -199,71 +211,76 @@ class Viewer(_Window):
     def __init__(self, address: LiveAddress, scratch: Path, options: tuple[str, ...] = ()) -> None:
         self._connections = 0
         self._connecting: threading.Thread | None = None
-        shown = ("--connect", self._next_url(address))
-        super().__init__(shown, _WINDOW_MEMORY, scratch, options)
+        content_options = ("--connect", self._next_url(address))
+        super().__init__(content_options, _LIVE_VIEWER_MEMORY, scratch, options)
 
     @property
     def pid(self) -> int:
-        """Its process id."""
+        """Process id of the viewer's program."""
         return self._program.pid
 
     @property
     def exit_code(self) -> int | None:
-        """Exit code; None while the window is open."""
+        """Exit code of the viewer's program, or None while its window is open."""
         return self._program.exit_code
 
     @property
-    def last_words(self) -> str:
-        """Last lines of its log."""
-        return self._program.last_words
+    def last_log_lines(self) -> str:
+        """Last lines of the viewer's log."""
+        return self._program.last_log_lines
 
     @property
     def without_graphics(self) -> bool:
-        """Whether its log reports that the computer has no usable graphics."""
+        """Whether the viewer's log reports that the computer has no usable graphics."""
         return self._program.without_graphics
 
     @property
     def control_url(self) -> str:
-        """Address at which the viewer accepts commands; empty: not known yet."""
+        """URL at which the viewer accepts commands, or "" if it is not known yet."""
         port = self._program.grpc_port
-        return proxy_url(_HOSTS[0], port) if port else ""
+        return proxy_url(_LOOPBACK_NAMES[0], port) if port else ""
 
     def connect(self, address: LiveAddress) -> bool:
-        """Connect to a live view whose server was replaced; return whether that succeeded.
+        """Connect the window to a live view whose server was replaced, and return whether it did.
 
-        The viewer connects to an address only once. It therefore gets another name of the same
-        address. Its earlier sessions are closed, because it would switch to the first of them.
+        The viewer connects to a URL only once, so it receives the URL with another name of this
+        computer. Its earlier sessions are closed, because it would switch to the first of them.
         """
         if not self.control_url or (self._connecting and self._connecting.is_alive()):
             return False
         self._connections += 1
         url = self._next_url(address)
-        done: list[bool] = []
+        successes: list[bool] = []
         # In a thread, because a frozen window never responds, and the wait would block Ctrl-C.
         self._connecting = threading.Thread(
-            target=_switch_server, args=(self.control_url, url, done), daemon=True
+            target=_switch_server, args=(self.control_url, url, successes), daemon=True
         )
         self._connecting.start()
-        self._connecting.join(_ANSWER_S)
-        return any(done)
+        self._connecting.join(_SWITCH_TIMEOUT_S)
+        return any(successes)
 
     def _next_url(self, address: LiveAddress) -> str:
-        return proxy_url(_HOSTS[self._connections % len(_HOSTS)], address.grpc_port)
+        """Return a URL of the live view's server that differs from the previous one."""
+        return proxy_url(
+            _LOOPBACK_NAMES[self._connections % len(_LOOPBACK_NAMES)], address.grpc_port
+        )
 
 
-def _switch_server(control_url: str, url: str, done: list[bool]) -> None:
-    """Switch a viewer to another server; append to `done` on success."""
+def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
+    """Switch a viewer to another server, and append True to `successes` on success."""
     from rerun.experimental import ViewerClient
 
     try:
         client = ViewerClient.connect(control_url)
         state = client.get_state()
-        earlier = [r.store_id for r in state.recordings if r.store_id != state.active_recording]
-        if earlier:
-            client.close(store_ids=earlier)
-        with contextlib.suppress(ConnectionError):  # it received nothing from there
+        earlier_recordings = [
+            r.store_id for r in state.recordings if r.store_id != state.active_recording
+        ]
+        if earlier_recordings:
+            client.close(store_ids=earlier_recordings)
+        with contextlib.suppress(ConnectionError):  # the viewer received nothing from this server
             client.close(url)
         client.open(url)
     except (OSError, RuntimeError):  # the viewer is busy or about to end
         return
-    done.append(True)
+    successes.append(True)

@@ -1,6 +1,6 @@
-"""Address of a live view, in a small file of the user's runtime folder while the view runs.
+"""Address of a running live view, stored in a small file of the user's runtime folder.
 
-The file of a killed process is recognised because the process is gone.
+The file of a killed process is recognised because the process does not exist any more.
 """
 
 import os
@@ -19,8 +19,11 @@ from rigd.runtime.addresses import (
 from rigd.runtime.addresses import announce as write_address
 
 LOOPBACK: Final = "127.0.0.1"
-_PREFIX: Final = "live-"
-_SUFFIX: Final = ".json"
+"""Address of this computer's loopback interface, on which all servers of the view listen."""
+_FILE_PREFIX: Final = "live-"
+"""Beginning of an address file's name, before the name of the rig."""
+_FILE_SUFFIX: Final = ".json"
+"""Suffix of an address file's name."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,9 +33,9 @@ class LiveAddress:
     Attributes
     ----------
     rig
-        The profile's name.
+        Name of the rig's profile.
     pid
-        Process of the publisher.
+        Process id of the publisher.
     born
         Start of that process in clock ticks since boot; together with `pid` it is unique.
     grpc_port
@@ -40,7 +43,7 @@ class LiveAddress:
     page_port
         Port on loopback for browsers.
     server
-        Unique number of the server, by which viewers notice a replacement.
+        Unique number of the server, by which viewers recognise that it was replaced.
     """
 
     rig: str
@@ -57,9 +60,9 @@ class LiveAddress:
         Parameters
         ----------
         rig
-            The profile's name.
+            Name of the rig's profile.
         grpc_port, page_port
-            Ports on loopback, for native viewers and for browsers.
+            Ports on loopback for native viewers and for browsers.
         server
             Unique number of the server.
         """
@@ -68,91 +71,95 @@ class LiveAddress:
 
     @property
     def proxy_url(self) -> str:
-        """Address for native viewers."""
+        """URL to which native viewers connect."""
         return proxy_url(LOOPBACK, self.grpc_port)
 
     @property
     def page_url(self) -> str:
-        """Address to open in a browser."""
+        """URL of the view's page for browsers."""
         return f"http://{LOOPBACK}:{self.page_port}"
 
     @property
     def viewer_url(self) -> str:
-        """Target of :attr:`page_url`: the page with the address of the server."""
+        """URL to which the page redirects browsers: the page with the server's address."""
         query = urllib.parse.urlencode({"url": self.proxy_url})
         return f"{self.page_url}/?{query}"
 
     @property
     def alive(self) -> bool:
-        """Whether the process still runs."""
+        """Whether the publisher's process still runs."""
         return started_at(self.pid) == self.born
 
 
 def proxy_url(host: str, grpc_port: int) -> str:
-    """Return the address at which the SDK and native viewers connect to a server.
+    """Return the URL at which Rerun's SDK and native viewers connect to a Rerun server.
 
     Parameters
     ----------
     host
-        Name or number of the computer.
+        Host name or IP address of the server's computer.
     grpc_port
-        Port of the server.
+        Port of the server for native viewers.
     """
     return f"rerun+http://{host}:{grpc_port}/proxy"
 
 
 def announce(address: LiveAddress) -> None:
-    """Write the address of a live view to its file, for this user only.
+    """Write the address of a live view to its file, which only this user can read.
 
     Raises
     ------
     OSError
         If the file cannot be written.
     """
-    write_address(_file(address.rig), asdict(address))
+    write_address(_address_path(address.rig), asdict(address))
 
 
 def withdraw(address: LiveAddress) -> None:
-    """Delete the file of an address, unless it belongs to another process by now."""
-    path = _file(address.rig)
-    found = _read(path)
-    if found is not None and (found.pid, found.born) == (address.pid, address.born):
+    """Delete the file of a view's address, unless another process has replaced it."""
+    path = _address_path(address.rig)
+    stored = _read_address_file(path)
+    if stored is not None and (stored.pid, stored.born) == (address.pid, address.born):
         path.unlink(missing_ok=True)
 
 
 def find(rig: str) -> LiveAddress | None:
-    """Return the address of a rig's live view; None if none runs."""
-    address = _read(_file(rig))
+    """Return the address of a rig's live view, or None if no view runs."""
+    address = _read_address_file(_address_path(rig))
     return address if address is not None and address.alive else None
 
 
 def running() -> list[LiveAddress]:
-    """Return the addresses of all live views of this user."""
-    found = map(_read, address_files(f"{_PREFIX}*{_SUFFIX}"))
-    return [address for address in found if address is not None and address.alive]
+    """Return the addresses of all running live views of this user."""
+    addresses = map(_read_address_file, address_files(f"{_FILE_PREFIX}*{_FILE_SUFFIX}"))
+    return [address for address in addresses if address is not None and address.alive]
 
 
-def _file(rig: str) -> Path:
-    return runtime_folder() / f"{_PREFIX}{file_name(rig)}{_SUFFIX}"
+def _address_path(rig: str) -> Path:
+    """Return the path of a rig's address file."""
+    return runtime_folder() / f"{_FILE_PREFIX}{file_name(rig)}{_FILE_SUFFIX}"
 
 
-def _read(path: Path) -> LiveAddress | None:
-    """Return the address in a file; None if it is invalid, because it is shown on terminals."""
-    found = read_address(path)
+def _read_address_file(path: Path) -> LiveAddress | None:
+    """Return the address in a file, or None if it is invalid.
+
+    The contents are checked because they are shown on terminals.
+    """
+    contents = read_address(path)
     try:
-        address = LiveAddress(**found)
+        address = LiveAddress(**contents)
     except TypeError:
         return None
-    return address if _is_sound(found) else None
+    return address if _is_valid(contents) else None
 
 
-def _is_sound(found: dict[str, object]) -> bool:
-    """Return whether the contents of a file are a valid address."""
-    rig = found.pop("rig")
-    ports = (found["grpc_port"], found["page_port"])
+def _is_valid(contents: dict[str, object]) -> bool:
+    """Return whether the fields read from an address file have valid values."""
+    rig = contents.pop("rig")
+    ports = (contents["grpc_port"], contents["page_port"])
     return (
         isinstance(rig, str)
         and rig.isprintable()
-        and all(type(number) is int for number in found.values())
+        and all(type(number) is int for number in contents.values())
         and all(0 < port < 1 << 16 for port in ports if isinstance(port, int))
     )

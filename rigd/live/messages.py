@@ -1,6 +1,6 @@
-"""Messages between the supervisor and the publisher of a live view.
+"""Messages between the supervisor and the publisher process of a live view.
 
-The publisher answers a `LiveJob` with a `rigd.live.address.LiveAddress`.
+The publisher's reply to a `LiveJob` is a `rigd.live.address.LiveAddress`.
 """
 
 from collections.abc import Mapping
@@ -14,16 +14,16 @@ from rigd.view import Subject
 
 @dataclass(frozen=True, slots=True)
 class LiveJob:
-    """Job of the publisher for a rig.
+    """First message to the publisher: the rig whose sessions it shows.
 
     Attributes
     ----------
     rig
-        Name of the profile, by which the view is found.
+        Name of the profile, by which viewers find the view.
     channels
         Shared memory of the rig's processes.
     linger_s
-        Time for which the view stays open after the last session.
+        Time for which the view remains open after the last session.
     """
 
     rig: str
@@ -33,19 +33,19 @@ class LiveJob:
 
 @dataclass(frozen=True, slots=True)
 class LiveSession:
-    """A session to show.
+    """Message to the publisher: a session that it shows from now on.
 
     Attributes
     ----------
     subject
-        Data of the session for its views.
+        Data of the session for its drawings.
     recording_id
-        Identifier of the session in viewers, also for a publisher that takes over.
+        Identifier of the session in viewers, also for a publisher that replaces this one.
     begins
         Number of records in each ring before the session, in the order of
         :data:`rigd.engine.channels.TOPICS`.
     folder
-        Folder of its file and of earlier sessions; None: unknown.
+        Folder of its file and of earlier sessions, or None if it is unknown.
     """
 
     subject: Subject
@@ -56,30 +56,31 @@ class LiveSession:
 
 @dataclass(frozen=True, slots=True)
 class LiveTouches:
-    """Estimates of touches in the session that is shown."""
+    """Message to the publisher: estimated touches in the session that it shows."""
 
     touches: tuple[Mapping[str, Any], ...]
-    """Touches as in JSON documents; a later estimate of a touch replaces an earlier one."""
+    """Estimated touches as JSON objects; a later estimate of a touch replaces an earlier one."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveFit:
-    """Fit of the record so far, in the session that is shown."""
+    """Message to the publisher: a fit of the record so far of the session that it shows."""
 
     fit: Mapping[str, Any]
-    """Fit as in JSON documents; it replaces the one before."""
+    """Fit as a JSON object; it replaces the previous fit."""
 
 
 @dataclass(frozen=True, slots=True)
 class LiveEnd:
-    """End of the session that is shown.
+    """Message to the publisher: the session that it shows has ended.
 
     Attributes
     ----------
     ends
-        Number of records in each ring at the end, as :attr:`LiveSession.begins`.
+        Number of records in each ring at the end of the session, counted as in
+        :attr:`LiveSession.begins`.
     outcome, reason
-        Outcome of the session and its reason; empty if unknown.
+        Outcome of the session and its reason, or empty strings if they are unknown.
     """
 
     ends: tuple[int, ...]
@@ -89,7 +90,7 @@ class LiveEnd:
 
 @dataclass(frozen=True, slots=True)
 class LiveShown:
-    """A session is shown from now on."""
+    """Message from the publisher: it has begun to show a session."""
 
     recording_id: str
-    """Identifier of its :class:`LiveSession`."""
+    """Identifier of the :class:`LiveSession` that is shown."""

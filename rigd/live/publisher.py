@@ -1,9 +1,10 @@
-"""The publisher process, which shows the records of the rings in Rerun, session by session.
+"""The publisher process, which shows the sessions of a rig in Rerun while they run.
 
-It only observes the rings, so it affects neither the loop nor the recorder. Samples that it cannot
-show in time are dropped and counted. Some seconds of samples wait for a slow server, and so do
-events, which must not be dropped (`Backlog`). The computations of the view do not depend on what
-could be shown. The process ends with its standard input, together with the server.
+It only observes the ring buffers with the loop's records, so it affects neither the loop nor the
+recorder. Samples that it cannot show in time are dropped and counted. If the server is slow, some
+seconds of samples are queued, and also events, which must not be dropped (`Backlog`). The
+computations of the view do not depend on what could be shown. The process ends when its standard
+input is closed, together with the server.
 """
 
 import collections
@@ -20,10 +21,10 @@ from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
 from rigd.engine.messages import Failed
 from rigd.engine.processes import Heartbeat, Parent
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
-from rigd.live._feed import Feed
+from rigd.live._feed import DrawingStream
 from rigd.live._program import RerunError
-from rigd.live._ring_reader import Intake
-from rigd.live._server import Outlet
+from rigd.live._ring_reader import SessionRecordReader
+from rigd.live._server import RerunServer
 from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.quick_look import last_quick_look, quick_look_path, read_quick_look
@@ -50,21 +51,29 @@ if TYPE_CHECKING:
     from rigd.view import Drawing
 
 
-_PERIOD_S: Final = 1 / 15
-"""Period of sending: smooth to the eye, while the cost grows with the number of messages."""
+_SEND_PERIOD_S: Final = 1 / 15
+"""Period in seconds in which drawings are sent during a session.
+
+The picture is smooth at this period. A shorter one would cost more, since the cost grows with the
+number of messages."""
 _IDLE_PERIOD_S: Final = 1.0
-_HURRY_S: Final = 0.2
-_WAITING_S: Final = 10.0
-"""Duration of the samples that may wait for a stalled server."""
-_STUCK_S: Final = 20
-_PARTING_S: Final = 0.3
-"""Time for the last messages to reach the viewers."""
-_ORPHANED_S: Final = 4.0
-"""Time for which a session without supervisor is shown; it ends in a fraction of that."""
+"""Period in seconds of the publisher between sessions."""
+_CATCH_UP_S: Final = 0.2
+"""Seconds of samples in one reading from which the publisher does not pause before the next."""
+_MAX_QUEUED_S: Final = 10.0
+"""Seconds of samples that are queued for a stalled server."""
+_WATCHDOG_TIMEOUT_S: Final = 20
+"""Seconds without progress after which the system kills the publisher."""
+_LAST_MESSAGES_S: Final = 0.3
+"""Seconds for the last messages to reach the viewers."""
+_MAX_ORPHANED_S: Final = 4.0
+"""Longest time in seconds for which a session without supervisor is shown.
+
+Such a session ends in a fraction of this time."""
 
 
 def main() -> None:
-    """Run as ``python -m rigd.live.publisher``."""
+    """Run the publisher as the program ``python -m rigd.live.publisher``."""
     ignore_signals()
     # The watchdog needs the signal, whatever handlers and masks are inherited.
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
@@ -74,324 +83,353 @@ def main() -> None:
     job: LiveJob = parent.receive_job()
     channels = attach_channels(job.channels)
     try:
-        outlet = Outlet(job.rig)
+        server_program = RerunServer(job.rig)
         import rerun  # noqa: F401 - half a second, spent while the server starts
 
-        outlet.wait()
+        server_program.wait()
     except (RerunError, ImportError) as error:
         parent.send(Failed(str(error)))
         raise SystemExit(1) from None
-    publisher = _Publisher(parent, channels, outlet)
+    publisher = _Publisher(parent, channels, server_program)
     publisher.serve()
     publisher.linger(job.linger_s)
-    outlet.close()
+    server_program.close()
     # Without the interpreter's clean-up, in which the SDK may wait for an unresponsive server.
     os._exit(0)
 
 
 class _Publisher:
-    def __init__(self, parent: Parent, channels: Channels, outlet: Outlet) -> None:
+    """Main loop of the publisher: receives sessions from the supervisor and shows them."""
+
+    def __init__(self, parent: Parent, channels: Channels, server_program: RerunServer) -> None:
         self._parent = parent
         self._channels = channels
-        self._outlet = outlet
-        self._feed = Feed(outlet)
-        self._shown: _ShownSession | None = None
-        self._last: LastResponse | None = None
+        self._server_program = server_program
+        self._drawing_stream = DrawingStream(server_program)
+        self._shown_session: _ShownSession | None = None
+        self._last_response: LastResponse | None = None
         self._announced_server: int | None = None
 
     def serve(self) -> None:
-        """Show sessions until the supervisor is gone or closes the input."""
+        """Show sessions until the supervisor has ended or closes the standard input."""
         while self._parent.alive():
             _arm_watchdog()
-            self._step()
+            self._show_new_records()
             try:
                 message = self._parent.poll(self._pause_s)
             except EOFError:
                 break
             match message:
                 case LiveSession():
-                    self._begin(message)
+                    self._begin_session(message)
                 case LiveTouches(touches):
-                    if self._shown is not None:
-                        self._shown.touched(touches)
+                    if self._shown_session is not None:
+                        self._shown_session.show_touches(touches)
                 case LiveFit(fit):
-                    if self._shown is not None:
-                        self._shown.fitted(fit)
+                    if self._shown_session is not None:
+                        self._shown_session.show_fit(fit)
                 case LiveEnd():
-                    self._finish(message)
+                    self._finish_session(message)
         self._show_orphaned()
 
     def linger(self, linger_s: float) -> None:
-        """Keep the view open for a while after the last session."""
-        parted = time.monotonic() + (_PARTING_S if self._feed.connections else 0.0)
-        end = max(parted, time.monotonic() + linger_s)
-        while time.monotonic() < (end if self._parent.alive() else parted):
+        """Keep the view open for `linger_s` seconds after the last session."""
+        earliest_end = time.monotonic() + (
+            _LAST_MESSAGES_S if self._drawing_stream.connections else 0.0
+        )
+        end = max(earliest_end, time.monotonic() + linger_s)
+        while time.monotonic() < (end if self._parent.alive() else earliest_end):
             _arm_watchdog()
-            self._step()
-            time.sleep(_PERIOD_S)
+            self._show_new_records()
+            time.sleep(_SEND_PERIOD_S)
 
     @property
     def _pause_s(self) -> float:
-        shown = self._shown
-        if shown is not None and not shown.over:
-            # Faster than real time, too many records would wait.
-            return _PERIOD_S if shown.intake.took_s < _HURRY_S else 0.0
-        waits = self._feed.stalled or (shown is not None and bool(shown.backlog))
-        return _PERIOD_S if waits else _IDLE_PERIOD_S
+        """Seconds to wait for a message of the supervisor before the next step."""
+        shown = self._shown_session
+        if shown is not None and not shown.has_ended:
+            # In a session that runs faster than real time, records would accumulate.
+            return _SEND_PERIOD_S if shown.reader.read_duration_s < _CATCH_UP_S else 0.0
+        must_wait = self._drawing_stream.stalled or (shown is not None and bool(shown.backlog))
+        return _SEND_PERIOD_S if must_wait else _IDLE_PERIOD_S
 
-    def _begin(self, session: LiveSession) -> None:
-        self._finish(LiveEnd(session.begins))
-        if self._shown is not None:
-            self._last = self._shown.intake.picture.last_response or self._last
-        self._shown = _ShownSession(session, self._channels, last_response(session, self._last))
-        self._outlet.begin_session()
-        self._feed.begin(session.recording_id, self._shown.intake.picture.frame)
-        self._step()
+    def _begin_session(self, session: LiveSession) -> None:
+        """Show a new session, after the end of the previous one."""
+        self._finish_session(LiveEnd(session.begins))
+        if self._shown_session is not None:
+            self._last_response = (
+                self._shown_session.reader.scene.last_response or self._last_response
+            )
+        self._shown_session = _ShownSession(
+            session, self._channels, last_response(session, self._last_response)
+        )
+        self._server_program.count_session()
+        self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
+        self._show_new_records()
         self._parent.send(LiveShown(session.recording_id))
 
-    def _finish(self, end: LiveEnd) -> None:
-        if self._shown is not None and not self._shown.over:
-            self._shown.finish(end)
-            self._step()
+    def _finish_session(self, end: LiveEnd) -> None:
+        """Show the end of the present session, unless it has been shown already."""
+        if self._shown_session is not None and not self._shown_session.has_ended:
+            self._shown_session.finish(end)
+            self._show_new_records()
 
     def _show_orphaned(self) -> None:
-        """Show a session without supervisor until its torque is off."""
-        shown, shared_state = self._shown, self._channels.shared_state
-        if shown is None or shown.over:
+        """Show a session whose supervisor has ended until its torque is off."""
+        shown, shared_state = self._shown_session, self._channels.shared_state
+        if shown is None or shown.has_ended:
             return
-        shown.lost = True
-        end = time.monotonic() + _ORPHANED_S
+        shown.supervisor_lost = True
+        end = time.monotonic() + _MAX_ORPHANED_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end:
             _arm_watchdog()
-            self._step()
-            time.sleep(_PERIOD_S)
-        self._finish(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
+            self._show_new_records()
+            time.sleep(_SEND_PERIOD_S)
+        self._finish_session(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
 
-    def _step(self) -> None:
-        """Show the new records, and count those that cannot be shown."""
+    def _show_new_records(self) -> None:
+        """Show the new records of the session, and count those that cannot be shown."""
         self._channels.shared_state.beat(StateField.LIVE_BEAT)
-        if self._shown is not None:
-            self._shown.gather()
-        before = self._feed.connections
-        if self._feed.ready() and self._shown is not None:
-            self._shown.send(self._feed, connected=self._feed.connections != before)
+        if self._shown_session is not None:
+            self._shown_session.queue_new_records()
+        previous_connections = self._drawing_stream.connections
+        if self._drawing_stream.ready() and self._shown_session is not None:
+            self._shown_session.send(
+                self._drawing_stream,
+                connected=self._drawing_stream.connections != previous_connections,
+            )
         self._announce_address()
 
     def _announce_address(self) -> None:
-        """Send the view's address to the supervisor whenever the server is replaced."""
-        address = self._outlet.address
+        """Send the view's address to the supervisor if the server was started or replaced."""
+        address = self._server_program.address
         if address is not None and address.server != self._announced_server:
             self._announced_server = address.server
             self._parent.send(address)
 
 
 class _ShownSession:
-    """The session that is shown, or was shown last."""
+    """Session that the publisher shows, or showed last, with its queue of drawings."""
 
     def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
         shared_state = self._shared_state = channels.shared_state
         begin, seen = session.begins[TOPICS.index(SAMPLE)], shared_state[StateField.LIVE_SEEN]
-        # Continue the count of an earlier publisher of the same session.
+        # Continue the count of a previous publisher of the same session.
         self._dropped_before = shared_state[StateField.LIVE_DROPPED] if seen > begin else 0
-        self.intake = Intake(session, channels, seen, last)
-        self.backlog = Backlog(round(_WAITING_S * session.subject.rate_hz))
-        self.over = False
-        self.lost = False  # whether the supervisor is gone
-        self._vitals = Vitals(channels)
-        self._states = StateWatch(channels)
-        self._unsent = 0
+        self.reader = SessionRecordReader(session, channels, seen, last)
+        self.backlog = Backlog(round(_MAX_QUEUED_S * session.subject.rate_hz))
+        self.has_ended = False
+        self.supervisor_lost = False
+        self._health_reader = HealthReader(channels)
+        self._state_watch = StateWatch(channels)
+        self._unsent_samples = 0
         folder, name = session.folder, session.subject.name
         self._quick_look_path = None if folder is None else quick_look_path(folder / f"{name}.mcap")
 
     @property
     def dropped(self) -> int:
-        """Number of samples that could not be shown."""
-        dropped = self.intake.dropped + self.backlog.dropped + self._unsent
+        """Number of the session's samples that could not be shown."""
+        dropped = self.reader.dropped + self.backlog.dropped + self._unsent_samples
         return self._dropped_before + dropped
 
-    def gather(self) -> None:
-        """Process the new records, or after the session its quick look."""
-        if self.over:
+    def queue_new_records(self) -> None:
+        """Queue drawings of the new records or, after the session, of its quick look."""
+        if self.has_ended:
             self._add_quick_look()
             return
-        harvest = self.intake.take()
-        drawings = harvest.drawings
+        new_drawings = self.reader.read_new()
+        drawings = new_drawings.drawings
         now_s = time.monotonic()
-        if self._vitals.due(now_s):
-            health = self._vitals.read(now_s, self.dropped)
-            drawings += self.intake.picture.health(self.intake.t_ns, health)
-        state = SUPERVISOR_LOST if self.lost else self._states.read(now_s)
-        drawings += self.intake.picture.state(self.intake.t_ns, state)
-        self.backlog.put_required(harvest.notes)
-        self.backlog.put(drawings, harvest.samples)
+        if self._health_reader.is_due(now_s):
+            health = self._health_reader.read(now_s, self.dropped)
+            drawings += self.reader.scene.health(self.reader.t_ns, health)
+        state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
+        drawings += self.reader.scene.state(self.reader.t_ns, state)
+        self.backlog.put_required(new_drawings.notes)
+        self.backlog.put(drawings, new_drawings.samples)
         self._store_counts()
 
     def _store_counts(self) -> None:
-        """Write the counts to the shared state, for a publisher that takes over."""
+        """Write the counts to the shared state, for a publisher that replaces this one."""
         shared_state = self._shared_state
         shared_state[StateField.LIVE_DROPPED] = self.dropped
-        shown = self.intake.next - self.backlog.samples
+        shown = self.reader.next - self.backlog.samples
         shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown)
 
-    def touched(self, touches: "Sequence[Mapping[str, Any]]") -> None:
-        """Draw touches, with a log line for each."""
-        picture, t_ns = self.intake.picture, self.intake.t_ns
+    def show_touches(self, touches: "Sequence[Mapping[str, Any]]") -> None:
+        """Queue the drawings and log lines of estimated touches."""
+        scene, t_ns = self.reader.scene, self.reader.t_ns
         lines = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
-        self.backlog.put_required([*picture.touches(touches), *picture.events(lines)])
+        self.backlog.put_required([*scene.touches(touches), *scene.events(lines)])
 
-    def fitted(self, fit: "Mapping[str, Any]") -> None:
-        """Draw a fit of the record so far, with log lines."""
-        picture, t_ns = self.intake.picture, self.intake.t_ns
+    def show_fit(self, fit: "Mapping[str, Any]") -> None:
+        """Queue the drawings and log lines of a fit of the record so far."""
+        scene, t_ns = self.reader.scene, self.reader.t_ns
         lines = [Note(t_ns, "info", line) for line in fit["text"]]
-        self.backlog.put_required([*picture.fit(fit), *picture.events(lines)])
+        self.backlog.put_required([*scene.fit(fit), *scene.events(lines)])
 
     def finish(self, end: LiveEnd) -> None:
-        """Process the remaining records and the outcome of the session."""
-        self.intake.end(end.ends)
-        self.gather()
-        picture, t_ns = self.intake.picture, self.intake.t_ns
+        """Queue the drawings of the session's remaining records and of its outcome."""
+        self.reader.end(end.ends)
+        self.queue_new_records()
+        scene, t_ns = self.reader.scene, self.reader.t_ns
         state = ended(end.outcome, end.reason)
-        if self.lost:
-            off = self._shared_state[StateField.PHASE] == Phase.OFF
-            state = SUPERVISOR_LOST_TORQUE_OFF if off else SUPERVISOR_LOST
-            self.backlog.put_required(picture.events([Note(t_ns, "error", state.reason)]))
+        if self.supervisor_lost:
+            is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
+            state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
+            self.backlog.put_required(scene.events([Note(t_ns, "error", state.reason)]))
         elif end.outcome:
-            self.backlog.put_required(picture.events([outcome_note(t_ns, end.outcome, end.reason)]))
-        # After all waiting drawings, which show a running session.
-        self.backlog.put([*picture.finish(), *picture.state(t_ns, state)], 0)
-        self.over = True
+            self.backlog.put_required(scene.events([outcome_note(t_ns, end.outcome, end.reason)]))
+        # They follow all queued drawings, which show a running session.
+        self.backlog.put([*scene.finish(), *scene.state(t_ns, state)], 0)
+        self.has_ended = True
         self._add_quick_look()
 
     def _add_quick_look(self) -> None:
-        """Add the text of the quick look to the log, once it exists."""
+        """Queue the log lines of the session's quick look as soon as its file exists."""
         if self._quick_look_path is None or not self._quick_look_path.exists():
             return
-        # Only once: the file gets its name when it is complete, and an invalid one stays invalid.
+        # Read only once: the file gets its name when it is complete, and an invalid one stays so.
         quick_look, self._quick_look_path = read_quick_look(self._quick_look_path), None
         if quick_look is None:
             return
-        picture, t_ns = self.intake.picture, self.intake.t_ns
+        scene, t_ns = self.reader.scene, self.reader.t_ns
         self.backlog.put_required(
-            picture.events([Note(t_ns, "info", line) for line in quick_look["text"]])
+            scene.events([Note(t_ns, "info", line) for line in quick_look["text"]])
         )
 
-    def send(self, feed: Feed, *, connected: bool) -> None:
-        """Send the waiting drawings; a new connection (`connected`) has the frame already."""
+    def send(self, drawing_stream: DrawingStream, *, connected: bool) -> None:
+        """Send the queued drawings.
+
+        After a new connection (`connected`) the frame has already been sent, which contains all
+        drawings that must not be dropped.
+        """
         if connected:
             self.backlog.drop_required()
         if self.backlog:
             drawings, samples = self.backlog.take()
-            if not feed.send(drawings):
-                self._unsent += samples
-            if not self.over:
+            if not drawing_stream.send(drawings):
+                self._unsent_samples += samples
+            if not self.has_ended:
                 self._store_counts()
 
 
 def _arm_watchdog() -> None:
-    """Make the system kill this process unless this function is called again in time.
+    """Make the system kill this process unless this function is called again in 20 s.
 
     A call into Rerun that never returns would block Python's signal handlers, so the watchdog uses
     the signal's default action. The server ends with this process.
     """
-    signal.alarm(_STUCK_S)
+    signal.alarm(_WATCHDOG_TIMEOUT_S)
 
 
 # Queue of drawings
 
-_MOST_REQUIRED: Final = 1000
+_MAX_REQUIRED_DRAWINGS: Final = 1000
+"""Largest number of queued events and other required drawings.
+
+Only beyond it the oldest of them are dropped."""
 
 
 class Backlog:
-    """Queue of one session's drawings for the viewers.
+    """Queue of a session's drawings that are not yet sent to the viewers.
 
     Parameters
     ----------
-    most_samples
-        Limit of the waiting samples, beyond which the oldest are dropped.
+    max_samples
+        Largest number of queued samples; the oldest beyond it are dropped.
 
     Attributes
     ----------
     samples
-        Number of waiting samples.
+        Number of samples that the queued drawings show.
     dropped
-        Number of dropped samples.
+        Number of samples whose drawings were dropped.
     """
 
-    def __init__(self, most_samples: int) -> None:
-        self._most_samples = most_samples
-        self._waiting: collections.deque[tuple[list[Drawing], int]] = collections.deque()
+    def __init__(self, max_samples: int) -> None:
+        self._max_samples = max_samples
+        self._queue: collections.deque[tuple[list[Drawing], int]] = collections.deque()
         self.samples = 0
-        self._required: collections.deque[Drawing] = collections.deque(maxlen=_MOST_REQUIRED)
+        self._required_drawings: collections.deque[Drawing] = collections.deque(
+            maxlen=_MAX_REQUIRED_DRAWINGS
+        )
         self.dropped = 0
 
     def __bool__(self) -> bool:
-        return bool(self._waiting or self._required)
+        """Return whether any drawings are queued."""
+        return bool(self._queue or self._required_drawings)
 
     def put(self, drawings: "list[Drawing]", samples: int) -> None:
-        """Add drawings, and drop the oldest ones beyond the limit.
+        """Queue drawings, and drop the oldest ones if there are too many samples.
 
         Parameters
         ----------
         drawings
-            Drawings in order.
+            Drawings in the order in which they are sent.
         samples
             Number of samples that they show.
         """
         if drawings:
-            self._waiting.append((drawings, samples))
+            self._queue.append((drawings, samples))
             self.samples += samples
-        while self.samples > self._most_samples and len(self._waiting) > 1:
-            _, lost = self._waiting.popleft()
+        while self.samples > self._max_samples and len(self._queue) > 1:
+            _, lost = self._queue.popleft()
             self.samples -= lost
             self.dropped += lost
 
     def put_required(self, drawings: "Iterable[Drawing]") -> None:
-        """Add drawings that are never dropped for lack of room."""
-        self._required.extend(drawings)
+        """Queue drawings that must not be dropped, such as events."""
+        self._required_drawings.extend(drawings)
 
     def drop_required(self) -> None:
-        """Drop these drawings, because the frame of a new connection contains them."""
-        self._required.clear()
+        """Remove the drawings of `put_required`, which the frame of a new connection contains."""
+        self._required_drawings.clear()
 
     def take(self) -> "tuple[list[Drawing], int]":
-        """Remove and return all drawings, with the number of samples that they show."""
-        drawings = [*self._required, *(draw for group, _ in self._waiting for draw in group)]
+        """Return all queued drawings and the number of samples they show, and clear the queue."""
+        drawings = [*self._required_drawings, *(draw for batch, _ in self._queue for draw in batch)]
         samples, self.samples = self.samples, 0
-        self._required.clear()
-        self._waiting.clear()
+        self._required_drawings.clear()
+        self._queue.clear()
         return drawings, samples
 
 
 # Response of the last session
 
 
-def last_response(session: "LiveSession", own: LastResponse | None) -> LastResponse | None:
-    """Return the response of the last session of the same specimen.
+def last_response(session: "LiveSession", shown_last: LastResponse | None) -> LastResponse | None:
+    """Return the frequency response measured in the last session of the same specimen.
 
-    It is from the newest quick look in the session's folder, or from this view itself if that is of
-    a later session.
+    It is read from the newest quick look in the session's folder, unless the response that this
+    view showed last belongs to a later session.
 
     Parameters
     ----------
     session
         Session that begins.
-    own
-        Response of the session that this view showed last.
+    shown_last
+        Frequency response of the session that this view showed last, or None.
+
+    Returns
+    -------
+    LastResponse or None
+        Response for comparison, or None if there is none.
     """
     specimen = session.subject.specimen
-    if own is not None and own.specimen != specimen:
-        own = None
+    if shown_last is not None and shown_last.specimen != specimen:
+        shown_last = None
     if session.folder is None:
-        return own
-    found = last_quick_look(
+        return shown_last
+    newest = last_quick_look(
         session.folder, specimen, but=session.subject.name, usable=itemgetter("response")
     )
-    if found is None:
-        return own
-    path, quick_look = found
+    if newest is None:
+        return shown_last
+    path, quick_look = newest
     # Names of session files begin with the time of the session.
-    if own is not None and path.stem < own.session:
-        return own
+    if shown_last is not None and path.stem < shown_last.session:
+        return shown_last
     frequency_hz, magnitude, phase_rad = (
         np.array(quick_look["response"][key]) for key in ("frequency_hz", "magnitude", "phase_rad")
     )
@@ -400,10 +438,11 @@ def last_response(session: "LiveSession", own: LastResponse | None) -> LastRespo
 
 # State and health of a session
 
-_SILENT_S: Final = 0.6
-"""Time without a heartbeat of the supervisor after which the view reports it."""
+_SUPERVISOR_TIMEOUT_S: Final = 0.6
+"""Seconds without a heartbeat of the supervisor after which the view reports it as silent."""
 _TORQUE_PHASES: Final = (Phase.SETTLING, Phase.READY, Phase.RUNNING, Phase.RETURNING)
-_STATES: Final = {
+"""Phases of a session in which the torque is on."""
+_ACTIVITY_BANNERS: Final = {  # Banner for each activity of the rig
     Activity.STOPPING: STOPPING,
     Activity.RUNNING: RUNNING,
     Activity.RETURNING: RETURNING,
@@ -412,7 +451,7 @@ _STATES: Final = {
 
 
 class StateWatch:
-    """Reader of a session's state in the shared state of the processes.
+    """Derives the state that the view's banner shows from the shared state of the processes.
 
     Parameters
     ----------
@@ -425,7 +464,7 @@ class StateWatch:
         self._supervisor = Heartbeat()
 
     def read(self, now_s: float) -> BannerState:
-        """Return the state of the session; call it several times per second.
+        """Return the state of the session for the banner; call it several times per second.
 
         Parameters
         ----------
@@ -434,26 +473,26 @@ class StateWatch:
         """
         shared_state = self._shared_state
         phase = Phase(shared_state[StateField.PHASE])
-        still_s = self._supervisor.stalled_for(shared_state[StateField.SUPERVISOR_BEAT], now_s)
-        if still_s > _SILENT_S:
+        silent_s = self._supervisor.stalled_for(shared_state[StateField.SUPERVISOR_BEAT], now_s)
+        if silent_s > _SUPERVISOR_TIMEOUT_S:
             if phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
             if shared_state[StateField.GO] and phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
-        now = activity(shared_state)
-        if now is Activity.PREPARING:
+        current = activity(shared_state)
+        if current is Activity.PREPARING:
             return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
-        return _STATES[now]
+        return _ACTIVITY_BANNERS[current]
 
 
 POLL_S: Final = 0.25
-"""Period of the polls."""
+"""Period in seconds in which the rig's health is read."""
 _RATE_POLLS: Final = 4
-"""Number of polls over which the rate is measured."""
+"""Number of readings over which the loop's rate is measured."""
 
 
-class Vitals:
-    """Reader of the rig's health, a few times per second during a session.
+class HealthReader:
+    """Reads the rig's health from the shared state, a few times per second during a session.
 
     Parameters
     ----------
@@ -467,28 +506,28 @@ class Vitals:
         self._ticks: collections.deque[tuple[float, int]] = collections.deque(
             maxlen=_RATE_POLLS + 1
         )
-        self._due_s = 0.0
+        self._next_reading_s = 0.0
 
-    def due(self, now_s: float) -> bool:
-        """Return whether a poll is due at the time `now_s` of a monotonic clock."""
-        return now_s >= self._due_s
+    def is_due(self, now_s: float) -> bool:
+        """Return whether the next reading is due at the time `now_s` of a monotonic clock."""
+        return now_s >= self._next_reading_s
 
     def read(self, now_s: float, view_dropped: int) -> Health:
-        """Return the present health.
+        """Return the present health of the rig: missed ticks, load, errors and rate.
 
         Parameters
         ----------
         now_s
-            As for :meth:`due`.
+            Time of a monotonic clock.
         view_dropped
             Number of the session's samples that could not be shown.
         """
         shared_state = self._shared_state
-        self._due_s = now_s + POLL_S
-        # Until tick 0 the shared state has the counts of the session before.
-        began = bool(shared_state[StateField.GO])
+        self._next_reading_s = now_s + POLL_S
+        # Until tick 0 the shared state has the counts of the previous session.
+        has_begun = bool(shared_state[StateField.GO])
         scheduled, missed, late, lost = (
-            shared_state[field] if began else 0
+            shared_state[field] if has_begun else 0
             for field in (StateField.SCHEDULED, StateField.MISSED, StateField.LATE, StateField.LOST)
         )
         load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
@@ -506,13 +545,18 @@ class Vitals:
         )
 
     def _rate_hz(self, now_s: float, scheduled: int) -> float | None:
+        """Return the measured rate of the loop in Hz, or None between sessions."""
         ticks = self._ticks
         if ticks and scheduled < ticks[-1][1]:
             ticks.clear()  # another session
         ticks.append((now_s, scheduled))
-        (first_s, first), (last_s, last) = ticks[0], ticks[-1]
+        (first_time_s, first_count), (last_time_s, last_count) = ticks[0], ticks[-1]
         # While the count is constant, there is no session, or it is in preparation.
-        return (last - first) / (last_s - first_s) if last > first else None
+        return (
+            (last_count - first_count) / (last_time_s - first_time_s)
+            if last_count > first_count
+            else None
+        )
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Checks of a profile in addition to types and ranges, and the messages about its mistakes.
+"""Checks for contradictions between a profile's values, and the messages on its mistakes.
 
 Values may contradict each other (`contradictions`), also for the wiring of the devices
 (`wiring_contradictions`). Sources, keys and sections may be missing or unknown.
@@ -27,12 +27,20 @@ from rigd.devices.obstacles import (
 )
 from rigd.devices.parameters import AtiSerial
 from rigd.printable import printable
-from rigd.profile._schema import SECTIONS, SOURCES, TEXTS, WIRING, fields_of, is_number, keys
+from rigd.profile._schema import (
+    DEVICE_SECTIONS,
+    SECTIONS,
+    SOURCES,
+    TEXT_KEYS,
+    is_number,
+    key_types,
+    section_fields,
+)
 from rigd.safety.limits import BUFFERED_S
 from rigd.session.user_metadata import NOTES, MetadataError, check_name
 from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 
-_UNITS_OF_SIX = {
+_AXIS_UNITS = {  # Units of keys with six numbers, one for each axis of the sensor
     "sensor.resolution": "N, N, N, N·m, N·m, N·m",
     "sensor.range": "N, N, N, N·m, N·m, N·m",
     "sensor.projection": "m, m, m, 1, 1, 1",
@@ -40,37 +48,43 @@ _UNITS_OF_SIX = {
     "simulation.offset": "N, N, N, N·m, N·m, N·m",
 }
 
-_JUMP_FACTOR = 100.0
-"""Multiple of the motor's acceleration up to which a jump of the encoder may be motion."""
+_MAX_ACCELERATION_FACTOR = 100.0
+"""Largest limit of the acceleration, relative to the motor's largest acceleration.
 
-_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+A higher limit would find no jump of the encoder."""
 
-_FIRST_MODE_HZ = 0.1, 100.0
-"""Plausible range of the first mode of the undamped beam."""
+_RIG_NAME = re.compile(r"[^\W_][\w .-]{0,63}")
+"""Pattern of valid names of a rig, which file names contain."""
+
+_FIRST_MODE_BAND_HZ = 0.1, 100.0
+"""Plausible lowest and highest frequency in Hz of the undamped beam's first mode."""
 
 
 _PER_MILLE_LIMIT = 32.767
-"""Largest ratio of torque to rated torque in the 16 bits of object 6071."""
-_ROUNDING = 1e-9
-_PARALLEL = 1e-6
-_MOST_SHOWN = 200
-"""Largest number of displayed characters of a value."""
-_MOST_ITEMS = 12
+"""Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
+_ROUNDING_S = 1e-9
+"""Largest rounding error in seconds of a stated delay."""
+_PARALLEL_TOLERANCE = 1e-6
+"""Squared sine of the angle between two projections below which they count as parallel."""
+_MAX_VALUE_CHARACTERS = 200
+"""Largest number of characters of a value in a message."""
+_MAX_ITEMS = 12
+"""Largest number of items of an array in a message."""
 
 
-def no_source(key: str, source: object) -> str:
+def missing_source_message(key: str, source: object) -> str:
     """Return the message for a number with a missing or invalid source."""
     if source is None:
-        return f"{key} has no source; add source = {_choice(SOURCES)}."
-    return f"{key} has source = {_show(source)}; choose {_choice(SOURCES)}."
+        return f"{key} has no source; add source = {_quoted_choice(SOURCES)}."
+    return f"{key} has source = {_text(source)}; choose {_quoted_choice(SOURCES)}."
 
 
-def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
-    """Return the message for a source "unknown" of a key that has or needs a value."""
+def invalid_unknown_message(key: str, entry: Mapping[str, Any]) -> str:
+    """Return the message for the source "unknown" of a key that has a value or requires one."""
     if key in MAY_BE_UNKNOWN:
         return (
-            f'{key} = {_show(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
-            f"remove the value, or choose {_choice(SOURCES)} as its source."
+            f'{key} = {_text(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
+            f"remove the value, or choose {_quoted_choice(SOURCES)} as its source."
         )
     return (
         f'{key} has source = "unknown", but needs a value; only {", ".join(MAY_BE_UNKNOWN)} may be '
@@ -78,49 +92,50 @@ def not_unknown(key: str, entry: Mapping[str, Any]) -> str:
     )
 
 
-def bare_number(key: str, value: object) -> str:
+def bare_number_message(key: str, value: object) -> str:
     """Return the message for a number without a source."""
     return (
-        f"{key} = {_show(value)}{_unit(key)} does not say where it comes from; write "
-        f'{{ value = {_show(value)}, source = "…" }} with {_choice(SOURCES)}.'
+        f"{key} = {_text(value)}{_unit(key)} does not say where it comes from; write "
+        f'{{ value = {_text(value)}, source = "…" }} with {_quoted_choice(SOURCES)}.'
     )
 
 
-def unusable_sizes(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield numbers in range that are too large or too small for any rig."""
+def implausible_numbers(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for numbers that are within their range but impossible for any rig."""
     for key, value in values.items():
         for number in value if isinstance(value, tuple) else (value,):
             if isinstance(number, int | float) and not is_usable_size(number):
                 yield (
-                    f"{key} = {_show(number)}{_unit(key)} is of no size that a rig can have; check "
+                    f"{key} = {_text(number)}{_unit(key)} is of no size that a rig can have; check "
                     "its unit."
                 )
 
 
 def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for contradictions between values that are in range."""
-    if not _NAME.fullmatch(values["name"]):
+    """Yield messages for values that are within their ranges but contradict each other."""
+    if not _RIG_NAME.fullmatch(values["name"]):
         yield (
-            f"name = {_show(values['name'])} is not fit for file names; take letters, digits, "
+            f"name = {_text(values['name'])} is not fit for file names; take letters, digits, "
             "spaces and . _ - only, at most 64, and begin with a letter or digit."
         )
-    rated, peak = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
-    if peak < rated:
+    rated_nm, peak_nm = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
+    if peak_nm < rated_nm:
         yield (
-            f"motor.peak_torque_nm = {peak:g} N·m is below motor.rated_torque_nm = {rated:g} N·m; "
-            "the peak is at least the rated torque."
+            f"motor.peak_torque_nm = {peak_nm:g} N·m is below motor.rated_torque_nm = "
+            f"{rated_nm:g} N·m; the peak is at least the rated torque."
         )
-    continuous = values["motor.continuous_torque_nm"]
-    if peak >= rated and continuous > peak:
+    continuous_nm = values["motor.continuous_torque_nm"]
+    if peak_nm >= rated_nm and continuous_nm > peak_nm:
         yield (
-            f"motor.continuous_torque_nm = {continuous:g} N·m is above motor.peak_torque_nm = "
-            f"{peak:g} N·m; continuous torque must not exceed peak torque."
+            f"motor.continuous_torque_nm = {continuous_nm:g} N·m is above motor.peak_torque_nm = "
+            f"{peak_nm:g} N·m; continuous torque must not exceed peak torque."
         )
     limit_nm = values["limits.torque_command_nm"]
-    if limit_nm < peak:
+    if limit_nm < peak_nm:
         yield (
-            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = {peak:g} "
-            "N·m, where commands saturate; the controller's command limit must be higher."
+            f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = "
+            f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be "
+            "higher."
         )
     angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
     if stop <= angle:
@@ -128,20 +143,20 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"limits.stop_angle_rad = {stop:g} rad is not above limits.angle_rad = {angle:g} rad; "
             "the shaft could not come to rest before it is stopped by force."
         )
-    yield from _out_of_reach(values)
-    yield from _incompatible_with_drag(values)
-    yield from _hum(values)
-    warning, drift = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
-    if drift < warning:
+    yield from _unreachable_limits(values)
+    yield from _drag_contradictions(values)
+    yield from _hum_contradictions(values)
+    warning, drift_limit_nm = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
+    if drift_limit_nm < warning:
         yield (
-            f"limits.tare_drift_nm = {drift:g} N·m, which ends a session, is below "
+            f"limits.tare_drift_nm = {drift_limit_nm:g} N·m, which ends a session, is below "
             f"session.tare_drift_nm = {warning:g} N·m, which warns; it must be the greater one."
         )
-    yield from first_mode(values)
+    yield from first_mode_contradictions(values)
     if not any(values["sensor.projection"]):
         yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
-    yield from _shear(values)
-    yield from _obstacles(values)
+    yield from _shear_contradictions(values)
+    yield from _obstacle_problems(values)
     for name in values["metadata.required"]:
         try:
             if name not in NOTES:
@@ -158,8 +173,11 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         yield str(error)
 
 
-def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for an implausible beam whose numbers are in range; often a unit is wrong."""
+def first_mode_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message if the beam's first mode has an implausible frequency.
+
+    The reason is often a wrong unit.
+    """
     first_mode_hz = float(
         undamped_frequencies_rad_s(
             Beam(
@@ -170,7 +188,7 @@ def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
             1,
         )[0]
     ) / (2 * pi)
-    low_hz, high_hz = _FIRST_MODE_HZ
+    low_hz, high_hz = _FIRST_MODE_BAND_HZ
     if not low_hz <= first_mode_hz <= high_hz:
         yield (
             f"beam.length_m, beam.density_kg_per_m and beam.bending_stiffness_n_m2 give a first "
@@ -179,8 +197,8 @@ def first_mode(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _incompatible_with_drag(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for settings of the simulated rig that are incompatible with air drag."""
+def _drag_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for settings of a simulated rig that are incompatible with its air drag."""
     if not values.get("simulation.air_drag_m"):
         return
     for name in INCOMPATIBLE_WITH_FORCES:
@@ -191,8 +209,8 @@ def _incompatible_with_drag(values: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _hum(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for the hum of the simulated sensor."""
+def _hum_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message if the simulated sensor's hum has too high a frequency for its rate."""
     rate_hz, hum_hz = values["rig.rate_hz"], values.get("simulation.hum_hz", 0.0)
     per_tick = max(1, round(values.get("ati_serial.stream_hz", rate_hz) / rate_hz))
     if values.get("simulation.hum_nm") and hum_hz >= 0.5 * per_tick * rate_hz:
@@ -203,59 +221,59 @@ def _hum(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _shear(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for the axis of the base shear."""
+def _shear_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message if shear force and torque are measured along the same axis."""
     torque, shear = values["sensor.projection"], values["sensor.shear_projection"]
-    across = sum(a * b for a, b in zip(torque, shear, strict=True)) ** 2
-    lengths = sum(a * a for a in torque) * sum(b * b for b in shear)
-    if lengths > 0 and across > (1 - _PARALLEL) * lengths:
+    projection_product = sum(a * b for a, b in zip(torque, shear, strict=True)) ** 2
+    squared_lengths = sum(a * a for a in torque) * sum(b * b for b in shear)
+    if squared_lengths > 0 and projection_product > (1 - _PARALLEL_TOLERANCE) * squared_lengths:
         yield (
-            f"sensor.shear_projection = {_show(shear)} is a multiple of sensor.projection: shear "
+            f"sensor.shear_projection = {_text(shear)} is a multiple of sensor.projection: shear "
             "and torque could not be told apart; give the row that makes the force across the beam "
             "of the wrench."
         )
 
 
-def _obstacles(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for the obstacles of a simulated rig."""
+def _obstacle_problems(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for invalid or incompatible obstacles of a simulated rig."""
     beam = Beam(
         values["beam.length_m"],
         values["beam.density_kg_per_m"],
         values["beam.bending_stiffness_n_m2"],
     )
-    given = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
+    effects = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
     for text in values.get("simulation.obstacles") or ():
         try:
-            check_obstacles([parse_obstacle(text)], beam, given)
+            check_obstacles([parse_obstacle(text)], beam, effects)
         except ObstacleError as error:
             yield f"simulation.obstacles: {error}"
 
 
-def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for limits that this rig cannot exceed, so that they protect nothing."""
+def _unreachable_limits(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for limits so high that this rig cannot exceed them."""
     angle_rad, inertia_kg_m2 = values["limits.angle_rad"], values["motor.inertia_kg_m2"]
-    most_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
-    room = f"limits.angle_rad = {angle_rad:g} rad to either side"
+    own_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
+    bounds = f"limits.angle_rad = {angle_rad:g} rad to either side"
     error, speed = values["limits.tracking_error_rad"], values["limits.velocity_rad_s"]
     if error >= 2 * angle_rad:
         yield (
             f"limits.tracking_error_rad = {error:g} rad can never be exceeded: reference and angle "
-            f"are within {room}; choose less than {2 * angle_rad:g} rad, some three times the "
+            f"are within {bounds}; choose less than {2 * angle_rad:g} rad, some three times the "
             "error of your excitation."
         )
-    most_rad_s = sqrt(2 * most_rad_s2 * 2 * angle_rad)
-    if speed >= most_rad_s:
+    max_speed_rad_s = sqrt(2 * own_rad_s2 * 2 * angle_rad)
+    if speed >= max_speed_rad_s:
         yield (
             f"limits.velocity_rad_s = {speed:g} rad/s can never be exceeded: the peak torque "
-            f"accelerates the motor alone to {most_rad_s:.4g} rad/s between {room}; choose less, "
-            "some three times the speed of your excitation."
+            f"accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between {bounds}; choose "
+            "less, some three times the speed of your excitation."
         )
-    jump = values["limits.acceleration_rad_s2"]
-    if jump > _JUMP_FACTOR * most_rad_s2:
+    jump_limit = values["limits.acceleration_rad_s2"]
+    if jump_limit > _MAX_ACCELERATION_FACTOR * own_rad_s2:
         yield (
-            f"limits.acceleration_rad_s2 = {jump:g} rad/s² finds no jump of the encoder: it is "
-            f"more than {_JUMP_FACTOR:g} times the {most_rad_s2:.4g} rad/s² that the peak torque "
-            "gives the motor alone; choose some two to five times that."
+            f"limits.acceleration_rad_s2 = {jump_limit:g} rad/s² finds no jump of the encoder: it "
+            f"is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} rad/s² that the "
+            "peak torque gives the motor alone; choose some two to five times that."
         )
     lag = values["limits.recorder_lag_s"]
     if lag >= BUFFERED_S:
@@ -265,48 +283,53 @@ def _out_of_reach(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def missing(absent: list[str], given: Mapping[str, Any]) -> Iterator[str]:
-    """Yield one message for each missing key or section."""
+def missing_key_messages(absent: list[str], values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message for each missing key or section.
+
+    `absent` has the missing keys, `values` the values of the file.
+    """
     reported = set()
     for key in absent:
         section = key.rpartition(".")[0]
-        if section and not any(k.rpartition(".")[0] == section for k in given):
+        if section and not any(k.rpartition(".")[0] == section for k in values):
             if section not in reported:
                 reported.add(section)
                 yield f"section [{section}] is missing."
-        elif key in TEXTS:
+        elif key in TEXT_KEYS:
             yield f'{key} is missing; add {key} = "…" at the top.'
         else:
             yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
 
 
-def unknown(key: str, given: Mapping[str, Any]) -> str:
-    """Return the message for an unknown key: a typing error or another unit."""
+def unknown_key_message(key: str, values: Mapping[str, Any]) -> str:
+    """Return the message for an unknown key, with the key that was probably meant."""
     if key in SECTIONS:
-        return f"{key} = {_show(given[key])} must be a section; write [{key}] and its keys below."
+        return f"{key} = {_text(values[key])} must be a section; write [{key}] and its keys below."
     section = key.rpartition(".")[0]
-    known = [k for k in keys() if k.rpartition(".")[0] == section]
-    if not known:
-        close = difflib.get_close_matches(section or key, SECTIONS, 1)
-        hint = f"did you mean [{close[0]}]?" if close else f"sections are {', '.join(SECTIONS)}."
+    section_keys = [k for k in key_types() if k.rpartition(".")[0] == section]
+    if not section_keys:
+        similar = difflib.get_close_matches(section or key, SECTIONS, 1)
+        hint = (
+            f"did you mean [{similar[0]}]?" if similar else f"sections are {', '.join(SECTIONS)}."
+        )
         return f"{key} is not a key of a profile; {hint}"
-    for candidate in known:
+    for candidate in section_keys:
         suffix = suffix_of(candidate)
-        stem = candidate.removesuffix(suffix)
-        if suffix and key.startswith(stem + "_"):
+        key_without_unit = candidate.removesuffix(suffix)
+        if suffix and key.startswith(key_without_unit + "_"):
             return (
-                f"{key} = {_show(given[key])} has the wrong unit "
-                f"('{key.removeprefix(stem + '_')}'); write {candidate}, the value in "
+                f"{key} = {_text(values[key])} has the wrong unit "
+                f"('{key.removeprefix(key_without_unit + '_')}'); write {candidate}, the value in "
                 f"{UNITS[suffix]}."
             )
-    close = difflib.get_close_matches(key, known, 1)
-    if close:
-        return f"{key} is unknown; did you mean {close[0]}{_unit(close[0], ', in')}?"
-    names = ", ".join(k.rpartition(".")[2] for k in known)
+    similar = difflib.get_close_matches(key, section_keys, 1)
+    if similar:
+        return f"{key} is unknown; did you mean {similar[0]}{_unit(similar[0], ', in')}?"
+    names = ", ".join(k.rpartition(".")[2] for k in section_keys)
     return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names}."
 
 
-_KINDS = {
+_REQUIRED_TYPES = {  # Required value, by the type of pydantic's error
     "float_type": "a number",
     "int_type": "a whole number",
     "string_type": "text in quotes",
@@ -317,7 +340,7 @@ _KINDS = {
     "too_long": "an array of six numbers",
     "string_too_short": "text",
 }
-_RANGES = {
+_BOUND_WORDS = {  # Name of the bound in pydantic's error, and its wording, by the type of the error
     "greater_than": ("gt", "more than"),
     "greater_than_equal": ("ge", "at least"),
     "less_than": ("lt", "less than"),
@@ -325,47 +348,51 @@ _RANGES = {
 }
 
 
-def wrong(detail: ErrorDetails) -> str:
-    """Return the message for a value of the wrong type or out of range."""
+def wrong_value_message(detail: ErrorDetails) -> str:
+    """Return the message for a value of the wrong type or outside its range."""
     key, *position = detail["loc"]
     if detail["type"] == "missing":  # one of the six
         position = []
-    where = f"{key}[{position[0]}]" if position else str(key)
-    what = f"{where} = {_show(detail['input'])}{_unit(str(key))}"
+    item_key = f"{key}[{position[0]}]" if position else str(key)
+    statement = f"{item_key} = {_text(detail['input'])}{_unit(str(key))}"
     if detail["type"] == "literal_error":
         remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
-    elif detail["type"] in _RANGES:
-        name, words = _RANGES[detail["type"]]
-        remedy = f"must be {words} {detail['ctx'][name]:g}"
+    elif detail["type"] in _BOUND_WORDS:
+        name, bound_words = _BOUND_WORDS[detail["type"]]
+        remedy = f"must be {bound_words} {detail['ctx'][name]:g}"
         if str(key).startswith("beam.damping."):
             remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
-    elif detail["type"] == "tuple_type" and not is_number(keys()[str(key)]):
+    elif detail["type"] == "tuple_type" and not is_number(key_types()[str(key)]):
         remedy = "must be an array of texts in quotes"
     else:
-        remedy = f"must be {_KINDS.get(detail['type'], detail['msg'])}"
-    return f"{what} {remedy}."
+        remedy = f"must be {_REQUIRED_TYPES.get(detail['type'], detail['msg'])}"
+    return f"{statement} {remedy}."
 
 
 def _unit(key: str, before: str = "") -> str:
-    """Return the unit of a key for the text after its value, or an empty text."""
-    unit = _UNITS_OF_SIX.get(key) or unit_of(key)
+    """Return the unit of a key with `before` and a space in front of it, or ""."""
+    unit = _AXIS_UNITS.get(key) or unit_of(key)
     return f"{before} {unit}" if unit else ""
 
 
-def _show(value: object) -> str:
+def _text(value: object) -> str:
+    """Return a value as printable text for a message, shortened if necessary."""
     if value is None:
         return "nothing"
     if isinstance(value, str):
-        return f'"{printable(value, _MOST_SHOWN)}"'
+        return f'"{printable(value, _MAX_VALUE_CHARACTERS)}"'
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):
-        shown = [_show(item) for item in value[:_MOST_ITEMS]]
-        return f"[{', '.join(shown)}{', …' if len(value) > _MOST_ITEMS else ''}]"
-    return printable(f"{value:g}" if isinstance(value, float) else str(value), _MOST_SHOWN)
+        shown = [_text(item) for item in value[:_MAX_ITEMS]]
+        return f"[{', '.join(shown)}{', …' if len(value) > _MAX_ITEMS else ''}]"
+    return printable(
+        f"{value:g}" if isinstance(value, float) else str(value), _MAX_VALUE_CHARACTERS
+    )
 
 
-def _choice(words: tuple[str, ...]) -> str:
+def _quoted_choice(words: tuple[str, ...]) -> str:
+    """Return the words in quotes, joined by "or"."""
     return " or ".join(f'"{word}"' for word in words)
 
 
@@ -373,43 +400,44 @@ def _choice(words: tuple[str, ...]) -> str:
 
 
 def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for contradictions between values that are in range."""
-    absent = list(_sections(values))
+    """Yield messages for contradictions in the settings of the devices and their wiring."""
+    absent = list(_section_problems(values))
     yield from absent
     if absent:
         return
     if "acquisition.mode" in values:
-        yield from _acquisition(values)
+        yield from _acquisition_contradictions(values)
     if "cia402.node_id" in values:
-        yield from _drive(values)
+        yield from _drive_contradictions(values)
     if "ati_serial.port" in values:
-        yield from _serial(values)
-    yield from _delays(values)
+        yield from _serial_contradictions(values)
+    yield from _delay_contradictions(values)
 
 
-def _sections(values: Mapping[str, Any]) -> Iterator[str]:
+def _section_problems(values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for missing and for unused sections of the selected devices."""
     drive, sensor = values["devices.drive"], values["devices.sensor"]
-    needed = {*WIRING.get(drive, ()), *WIRING.get(sensor, ())}
-    present = {
+    required = {*DEVICE_SECTIONS.get(drive, ()), *DEVICE_SECTIONS.get(sensor, ())}
+    used_sections = {
         section
-        for section in {name for names in WIRING.values() for name in names}
-        if any(key in values for key, _ in fields_of(section))
+        for section in {name for names in DEVICE_SECTIONS.values() for name in names}
+        if any(key in values for key, _ in section_fields(section))
     }
-    for section in sorted(needed - present):
+    for section in sorted(required - used_sections):
         yield (
             f'section [{section}] is missing, which devices.drive = "{drive}" with '
             f'devices.sensor = "{sensor}" needs.'
         )
     # Any profile may have the noise and offset of a simulated rig.
-    for section in sorted(present - needed - {"simulation"}):
+    for section in sorted(used_sections - required - {"simulation"}):
         yield (
             f'section [{section}] belongs to none of devices.drive = "{drive}" and '
             f'devices.sensor = "{sensor}"; remove it.'
         )
 
 
-def _acquisition(values: Mapping[str, Any]) -> Iterator[str]:
+def _acquisition_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message if the deadline of the replies is longer than a period."""
     period_us = 1e6 / values["rig.rate_hz"]
     deadline_us = values["acquisition.deadline_us"]
     if deadline_us >= period_us:
@@ -419,7 +447,8 @@ def _acquisition(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _drive(values: Mapping[str, Any]) -> Iterator[str]:
+def _drive_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for contradictions in the settings of a CiA 402 drive."""
     if values["cia402.direction"] == 0:
         yield "cia402.direction = 0 must be 1, or -1 where the drive turns the other way round."
     if values["cia402.host_node_id"] == values["cia402.node_id"]:
@@ -440,8 +469,11 @@ def _drive(values: Mapping[str, Any]) -> Iterator[str]:
             f"motor.peak_torque_nm is {ratio:g} times motor.rated_torque_nm; the drive's target "
             f"torque reaches {_PER_MILLE_LIMIT:g} times."
         )
-    for whose in ("", "drive_"):
-        period, timeout = f"cia402.{whose}heartbeat_period_s", f"cia402.{whose}heartbeat_timeout_s"
+    for key_prefix in ("", "drive_"):
+        period, timeout = (
+            f"cia402.{key_prefix}heartbeat_period_s",
+            f"cia402.{key_prefix}heartbeat_timeout_s",
+        )
         for key in (period, timeout):
             if abs(values[key] * 1000 - round(values[key] * 1000)) > 1e-6 or values[key] < 1e-3:
                 yield f"{key} = {values[key]:g} s must be a whole number of milliseconds."
@@ -464,18 +496,19 @@ def _drive(values: Mapping[str, Any]) -> Iterator[str]:
             )
 
 
-def _serial(values: Mapping[str, Any]) -> Iterator[str]:
+def _serial_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for contradictions in the settings of a sensor on a serial line."""
     if values["acquisition.mode"] != "same_tick":
         yield (
             'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
             'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
         )
     baud, stream_hz = values["ati_serial.baud"], values["ati_serial.stream_hz"]
-    most_hz = baud / RECORD_BITS
-    if stream_hz > most_hz:
+    max_records_hz = baud / RECORD_BITS
+    if stream_hz > max_records_hz:
         yield (
             f"ati_serial.stream_hz = {stream_hz:g} Hz does not fit ati_serial.baud = {baud}, which "
-            f"carries {most_hz:.0f} records a second; choose 1250000."
+            f"carries {max_records_hz:.0f} records a second; choose 1250000."
         )
     if stream_hz < values["rig.rate_hz"]:
         yield (
@@ -484,13 +517,13 @@ def _serial(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _delays(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for delays that are shorter than the delay of the protocol."""
+def _delay_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for delays that are shorter than their protocol allows."""
     period_s = 1 / values["rig.rate_hz"]
     reply_s = period_s if values.get("acquisition.mode") == "previous_tick" else 0.0
     wrench_s, wrench_cause = reply_s, "the reply of the previous tick"
     if "ati_serial.port" in values:
-        serial = AtiSerial(**{field: values[key] for key, field in fields_of("ati_serial")})
+        serial = AtiSerial(**{field: values[key] for key, field in section_fields("ati_serial")})
         wrench_s = serial.filter_delay_s(values["rig.rate_hz"])
         wrench_cause = "the filter of the sensor's records"
     delivery_s = period_s if values.get("cia402.torque_delivery") == "at_sync" else 0.0
@@ -500,7 +533,7 @@ def _delays(values: Mapping[str, Any]) -> Iterator[str]:
         ("actuation.delay_s", delivery_s, "a torque that takes effect at the next SYNC"),
     )
     for key, least_s, cause in causes:
-        if values[key] < least_s - _ROUNDING:
+        if values[key] < least_s - _ROUNDING_S:
             yield (
                 f"{key} = {values[key]:g} s is less than {cause} alone: at least {least_s:.6g} s."
             )

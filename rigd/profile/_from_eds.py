@@ -16,26 +16,34 @@ from rigd.devices.cia402.objects import MAX_SPEED_RPM, RATED_TORQUE
 from rigd.devices.cia402.requirements import TORQUE_FEEDBACK, TORQUE_LIMIT, WATCHDOG
 from rigd.devices.eds import Eds
 from rigd.errors import FailureError
-from rigd.profile._load import ProfileError, profile_of
-from rigd.profile._schema import UNKNOWN, Profile, keys
+from rigd.profile._load import ProfileError, profile_from_text
+from rigd.profile._schema import UNKNOWN, Profile, key_types
 from rigd.profile._write import Setting, SettingValue, with_head, with_settings
 
-_ACCEPT = "cia402.accept_without"
-_LIMIT = re.compile(r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE)
-_MAKERS_OWN = range(0x2000, 0x6000)
-_MOST_NAMED = 4
+_ACCEPT_KEY = "cia402.accept_without"
+"""Key of the profile with the missing features of the drive that the operator accepts."""
+_TORQUE_LIMIT_NAME = re.compile(
+    r"(torque|current).*(limit|max)|(limit|max).*(torque|current)", re.IGNORECASE
+)
+"""Pattern of names of objects that may limit the torque."""
+_MANUFACTURER_INDICES = range(0x2000, 0x6000)
+"""Indices of manufacturer-specific CANopen objects."""
+_MAX_NAMED_OBJECTS = 4
+"""Largest number of manufacturer-specific objects that a comment names."""
 
 
 class UnusableDriveError(FailureError, ValueError):
-    """The drive is unsuitable with any profile; the message names the missing features."""
+    """The drive is unsuitable, whatever the profile; the message names the missing features."""
 
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """Question about a required setting that no EDS file states."""
+    """Question to the operator about a required setting that no EDS file states."""
 
     key: str
+    """Dotted key of the setting in the profile."""
     text: str
+    """Question with the unit of the answer."""
 
 
 QUESTIONS = (
@@ -51,9 +59,10 @@ QUESTIONS = (
     Question("motor.inertia_kg_m2", "Inertia of motor and gear at the output shaft, kg·m²"),
     Question("encoder.resolution_rad", "Encoder step at the output shaft, rad"),
 )
-"""Questions about the drive. Friction and delay are measured by rigd identify motor."""
-_OTHER = "The previous value was of another drive."
-_OWN_WATCHDOG = Question(
+"""Questions about every drive, except friction and delay, which rigd identify motor measures."""
+_OTHER_DRIVE_COMMENT = "The previous value was of another drive."
+"""Comment on a setting whose value is reset."""
+_OWN_WATCHDOG_QUESTION = Question(  # Question about drives without a watchdog over CANopen
     "cia402.own_watchdog_s",
     "The drive's own watchdog that removes the torque if this computer stops communicating, s "
     "(0: none)",
@@ -61,16 +70,16 @@ _OWN_WATCHDOG = Question(
 
 
 class Draft:
-    """Draft of a new profile, from the EDS file and the answers of the operator.
+    """Draft of a profile for a new drive, from its EDS file and the operator's answers.
 
     Parameters
     ----------
     base
-        Profile with the initial text and values.
+        Profile whose text and values the draft starts from.
     eds
         Content of the drive's EDS file.
     path
-        Path of the file to write.
+        Path of the profile to be written.
 
     Raises
     ------
@@ -86,16 +95,16 @@ class Draft:
                 f"{base.path}: has no CiA 402 drive to put another in the place of; start from "
                 "antenna_can or antenna_serial."
             )
-        judgement = check_suitability(eds)
-        if judgement.refusals:
+        suitability = check_suitability(eds)
+        if suitability.refusals:
             raise UnusableDriveError(
                 f"{eds.path}: no session could be run with this drive, and no profile was "
-                f"written: {' '.join(judgement.refusals)}"
+                f"written: {' '.join(suitability.refusals)}"
             )
         self._base = base
         self._eds = eds
         self._path = path
-        self._findings = judgement.findings
+        self._findings = suitability.findings
         self._accepted: list[str] = []
         self._settings = {setting.key: setting for setting in self._eds_settings()}
         # The base profile has another motor, gear and encoder: none of their values is used.
@@ -103,24 +112,25 @@ class Draft:
             if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
                 self._settings[question.key] = Setting(question.key, math.nan, UNKNOWN)
 
-    def _value(self, key: str) -> SettingValue:
-        """Return the present value of a key."""
+    def _draft_value(self, key: str) -> SettingValue:
+        """Return the value of a key in the draft."""
         if key in self._settings:
             return self._settings[key].value
         section, _, name = key.rpartition(".")
-        of_section: object = getattr(self._base.rig, section)
-        value: SettingValue = getattr(of_section, name)
+        section_settings: object = getattr(self._base.rig, section)
+        value: SettingValue = getattr(section_settings, name)
         return value
 
     def answer(self, key: str, text: str) -> None:
-        """Set the value of a key from an answer of the operator.
+        """Set the value of a key of the draft from the operator's answer.
 
         Parameters
         ----------
         key
             Dotted key of the profile.
         text
-            The answer. With ``unknown`` the value remains to be filled in, if this is possible.
+            Answer of the operator. After ``unknown`` the value remains to be filled in, if the
+            profile allows this.
 
         Raises
         ------
@@ -130,54 +140,57 @@ class Draft:
         if text == UNKNOWN and key in MAY_BE_UNKNOWN:
             self._settings[key] = Setting(key, math.nan, UNKNOWN)
             return
-        annotation: Any = keys()[key]
+        annotation: Any = key_types()[key]
         try:
             value = TypeAdapter(annotation).validate_strings(text)
         except ValidationError as error:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
-        if value != self._value(key):
+        if value != self._draft_value(key):
             self._settings[key] = Setting(key, value, "datasheet")
 
-    def shown(self, key: str) -> str:
-        """Return the present value of a key as text, or ``unknown``.
+    def value_text(self, key: str) -> str:
+        """Return the draft's value of a key as text, or ``unknown``.
 
         Parameters
         ----------
         key
             Dotted key of the profile.
         """
-        return UNKNOWN if self._is_unknown(key) else str(self._value(key))
+        return UNKNOWN if self._is_unknown(key) else str(self._draft_value(key))
 
     def _is_unknown(self, key: str) -> bool:
+        """Return whether the draft states a key as unknown."""
         return key in self._settings and self._settings[key].source == UNKNOWN
 
-    def unaccepted(self) -> list[SuitabilityFinding]:
-        """Return the missing features of the drive that the profile does not accept.
+    def unaccepted_findings(self) -> list[SuitabilityFinding]:
+        """Return the missing features of the drive for which the draft would be refused.
 
         Raises
         ------
         ProfileError
-            If the present values contradict one another.
+            If the values of the draft contradict one another.
         """
-        accepted = Setting(_ACCEPT, tuple(self._accepted))
+        accepted = Setting(_ACCEPT_KEY, tuple(self._accepted))
         text = with_settings(self._base.text, [*self._settings.values(), accepted])
-        found = check_suitability(self._eds, profile_of(text, self._path).rig).findings
-        return [each for each in found if each.accept and each.grade is Grade.REFUSED]
+        findings = check_suitability(self._eds, profile_from_text(text, self._path).rig).findings
+        return [each for each in findings if each.accept and each.grade is Grade.REFUSED]
 
     def accept(self, name: str) -> None:
-        """Accept a missing feature in the profile, by decision of the operator.
+        """Accept a missing feature of the drive in the draft, as decided by the operator.
 
         Parameters
         ----------
         name
-            One of `unaccepted`.
+            Name of the feature: `accept` of one of the findings that `unaccepted_findings` returns.
         """
         self._accepted.append(name)
 
     @property
-    def doubts(self) -> list[str]:
-        """Return remarks on this drive for the operator, in sentences."""
-        findings = check_suitability(self._eds, profile_of(self._body(), self._path).rig).findings
+    def remarks(self) -> list[str]:
+        """Sentences for the operator on what remains uncertain about this drive."""
+        findings = check_suitability(
+            self._eds, profile_from_text(self._text_without_head(), self._path).rig
+        ).findings
         remarks = [f.sentence for f in findings if f.sentence]
         return remarks + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
@@ -187,72 +200,86 @@ class Draft:
         ]
 
     def questions(self) -> list[Question]:
-        """Return the questions about this drive."""
-        more = (_OWN_WATCHDOG,) if WATCHDOG in self._lacks() else ()
+        """Return all questions to the operator about this drive."""
+        additional_questions = (
+            (_OWN_WATCHDOG_QUESTION,) if WATCHDOG in self._missing_feature_names() else ()
+        )
         absent = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
-        return [each for each in (*QUESTIONS, *more) if each.key not in absent]
+        return [each for each in (*QUESTIONS, *additional_questions) if each.key not in absent]
 
-    def unanswered(self) -> list[Question]:
-        """Return the questions without an answer: unknown, or as in the base profile."""
-        answered = {
+    def unanswered_questions(self) -> list[Question]:
+        """Return the questions whose key is unknown or still has the value of the base profile."""
+        answered_keys = {
             key
             for key, setting in self._settings.items()
-            if setting.reason != _OTHER and setting.source != UNKNOWN
+            if setting.reason != _OTHER_DRIVE_COMMENT and setting.source != UNKNOWN
         }
-        return [each for each in self.questions() if each.key not in answered]
+        return [each for each in self.questions() if each.key not in answered_keys]
 
     def text(self) -> str:
-        """Return the text of the profile.
+        """Return the text of the finished profile.
 
         Raises
         ------
         ProfileError
-            If its values contradict one another.
+            If the values of the draft contradict one another.
         """
-        text = self._body()
-        profile_of(text, self._path)
-        return with_head(text, self._head())
+        text = self._text_without_head()
+        profile_from_text(text, self._path)
+        return with_head(text, self._head_comment())
 
-    def _body(self) -> str:
-        marked = [
+    def _text_without_head(self) -> str:
+        """Return the text of the profile with its settings, but without the new head."""
+        marked_settings = [
             Setting(
                 question.key,
-                self._value(question.key),
+                self._draft_value(question.key),
                 UNKNOWN if self._is_unknown(question.key) else "assumed",
                 reason="TO FILL IN: " + question.text,
             )
-            for question in self.unanswered()
+            for question in self.unanswered_questions()
         ]
-        settings = [*self._settings.values(), *marked, *self._acceptance()]
+        settings = [*self._settings.values(), *marked_settings, *self._acceptance()]
         return with_settings(self._base.text, settings)
 
     def _acceptance(self) -> Iterator[Setting]:
-        """Yield the acceptances of the operator; undecided ones are written as a comment."""
-        left = [finding.accept for finding in self.unaccepted()]
-        own = self._own_limits() if TORQUE_LIMIT in (*left, *self._accepted) else ""
+        """Yield the setting that accepts missing features of the drive, if one is needed.
+
+        If the operator has accepted none yet, the setting is written as a comment.
+        """
+        undecided = [finding.accept for finding in self.unaccepted_findings()]
+        limit_objects = (
+            self._manufacturer_limits() if TORQUE_LIMIT in (*undecided, *self._accepted) else ""
+        )
         hint = (
-            f" For a torque limit of its own see {own}, set by cia402.set_objects." if own else ""
+            f" For a torque limit of its own see {limit_objects}, set by cia402.set_objects."
+            if limit_objects
+            else ""
         )
         if self._accepted:
             why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
-            why += f" Not accepted, so that rigd refuses it: {', '.join(left)}." if left else ""
-            yield Setting(_ACCEPT, tuple(self._accepted), reason=why + hint)
-        elif left:
+            why += (
+                f" Not accepted, so that rigd refuses it: {', '.join(undecided)}."
+                if undecided
+                else ""
+            )
+            yield Setting(_ACCEPT_KEY, tuple(self._accepted), reason=why + hint)
+        elif undecided:
             why = (
                 "TO FILL IN: the drive lacks, by its file, what these names stand for "
                 "(docs/devices.md), and rigd refuses it. Take the # away, and from the list what "
                 "must not be missing."
             )
-            yield Setting(_ACCEPT, tuple(left), reason=why + hint, commented=True)
+            yield Setting(_ACCEPT_KEY, tuple(undecided), reason=why + hint, commented=True)
         elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
-            yield Setting(_ACCEPT, (), reason="The drive has, by its file, all that is needed.")
+            yield Setting(_ACCEPT_KEY, (), reason="The drive has, by its file, all that is needed.")
 
-    def _lacks(self) -> list[str]:
-        """Return the names of the missing features that a profile must accept."""
+    def _missing_feature_names(self) -> list[str]:
+        """Return the names of the drive's missing features that a profile must accept."""
         return [finding.accept for finding in self._findings if finding.accept]
 
     def _eds_settings(self) -> Iterator[Setting]:
-        """Yield the settings from the EDS file and those that follow from missing features."""
+        """Yield the settings that follow from the EDS file and from missing features."""
         eds, path = self._eds, self._path
         product = " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
         yield Setting("name", path.stem)
@@ -271,21 +298,22 @@ class Draft:
         if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
             why = f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
             yield Setting("can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", why)
-        yield from self._of_the_other_drive()
-        yield from self._absent()
+        yield from self._reset_settings()
+        yield from self._missing_object_settings()
 
-    def _of_the_other_drive(self) -> Iterator[Setting]:
-        """Yield the removal of settings that are specific to the drive of the base profile."""
+    def _reset_settings(self) -> Iterator[Setting]:
+        """Yield settings that reset what is specific to the drive of the base profile."""
         drive = self._base.rig.cia402
         assert drive is not None
         if drive.set_objects:
-            yield Setting("cia402.set_objects", (), reason=_OTHER)
+            yield Setting("cia402.set_objects", (), reason=_OTHER_DRIVE_COMMENT)
         if drive.own_watchdog_s:
-            yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER)
+            yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER_DRIVE_COMMENT)
 
-    def _absent(self) -> Iterator[Setting]:
-        lacks = self._lacks()
-        for missing, key, why in (
+    def _missing_object_settings(self) -> Iterator[Setting]:
+        """Yield a setting of 0 for each optional object that the drive lacks."""
+        missing_names = self._missing_feature_names()
+        for is_missing, key, why in (
             (
                 not self._eds.get(MAX_SPEED_RPM),
                 "max_speed_rad_s",
@@ -296,21 +324,25 @@ class Draft:
                 "rated_torque_unit_nm",
                 "6076 (rated torque)",
             ),
-            (TORQUE_FEEDBACK in lacks, "torque_tolerance_percent", "6077 (actual torque)"),
+            (TORQUE_FEEDBACK in missing_names, "torque_tolerance_percent", "6077 (actual torque)"),
         ):
-            if missing:
+            if is_missing:
                 yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
 
-    def _own_limits(self) -> str:
-        """Return the manufacturer-specific objects that may limit the torque."""
-        found = [
+    def _manufacturer_limits(self) -> str:
+        """Return the manufacturer-specific objects that may limit the torque, as text.
+
+        The text is empty if there are none.
+        """
+        object_names = [
             f"{e.index:04X}:{e.sub:X} ({e.name}{'' if e.default is None else f', {e.default}'})"
             for e in self._eds.entries.values()
-            if e.index in _MAKERS_OWN and e.writable and _LIMIT.search(e.name)
+            if e.index in _MANUFACTURER_INDICES and e.writable and _TORQUE_LIMIT_NAME.search(e.name)
         ]
-        return " or ".join(found[:_MOST_NAMED])
+        return " or ".join(object_names[:_MAX_NAMED_OBJECTS])
 
-    def _head(self) -> list[str]:
+    def _head_comment(self) -> list[str]:
+        """Return the lines of the comment at the beginning of the profile."""
         return [
             f"Written by rigd profiles new from {self._eds.path.name} and the profile "
             f"{self._base.name}.",
@@ -327,8 +359,8 @@ class Draft:
             "  assumed    of the profile started from: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(
-                ["", "Of this drive:", *(f"* {doubt}" for doubt in self.doubts)]
-                if self.doubts
+                ["", "Of this drive:", *(f"* {doubt}" for doubt in self.remarks)]
+                if self.remarks
                 else []
             ),
         ]

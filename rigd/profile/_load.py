@@ -28,19 +28,19 @@ from rigd.profile._schema import (
     SOURCES,
     UNKNOWN,
     Profile,
-    defaults,
-    fields_of,
     is_number,
-    keys,
+    key_defaults,
+    key_types,
+    section_fields,
 )
 
 
 class ProfileError(UserError, ValueError):
-    """A profile cannot be used; the message has a line with the remedy for each problem."""
+    """A profile or specimen file cannot be used; the message has a line for each problem."""
 
 
 def load_profile(name_or_path: str | Path) -> Profile:
-    """Read and validate a profile.
+    """Read and validate the profile of a rig.
 
     Parameters
     ----------
@@ -52,6 +52,7 @@ def load_profile(name_or_path: str | Path) -> Profile:
     Returns
     -------
     Profile
+        Validated profile.
 
     Raises
     ------
@@ -66,17 +67,17 @@ def load_profile(name_or_path: str | Path) -> Profile:
     >>> rig.rate_hz, rig.beam.length_m
     (1000.0, 0.98)
     """
-    path = _find(name_or_path)
-    return profile_of(read_text(path), path)
+    path = _find_profile(name_or_path)
+    return profile_from_text(read_text(path), path)
 
 
 def read_text(path: Path) -> str:
-    """Return the text of a file.
+    """Return the text of a profile or specimen file.
 
     Raises
     ------
     ProfileError
-        If it cannot be read, or is not text.
+        If the file cannot be read, or is not text.
     """
     try:
         return documents.read_text(path)
@@ -84,66 +85,66 @@ def read_text(path: Path) -> str:
         raise ProfileError(f"{path}: {error}.") from error
 
 
-def profile_of(text: str, path: Path) -> Profile:
-    """Return the validated profile of a text; `path` is its present or future file.
+def profile_from_text(text: str, path: Path) -> Profile:
+    """Validate the text of a profile and return the profile; `path` is its file, existing or not.
 
     Raises
     ------
     ProfileError
-        As :func:`load_profile`.
+        If the text has mistakes.
     """
-    document = parse(text, path)
+    document = parse_document(text, path)
     problems: list[str] = []
-    values, sources = flatten(document, problems)
+    values, sources = flatten_document(document, problems)
     absent = {
         name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
     }
     unknown = frozenset(key for key, source in sources.items() if source == UNKNOWN)
-    values = validate(values, problems, frozenset(absent), unknown)
+    values = validate_values(values, problems, frozenset(absent), unknown)
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(diagnostics.contradictions(values))
         problems.extend(diagnostics.wiring_contradictions(values))
     if problems:
-        raise complaint(path, problems)
+        raise problems_error(path, problems)
 
-    section = {name: _build(name, values) for name in SECTIONS if name not in absent}
+    sections = {name: _build_section(name, values) for name in SECTIONS if name not in absent}
     return Profile(
         name=values["name"],
         description=values["description"],
         path=path,
         text=text,
         rig=RigParameters(
-            rate_hz=section["rig"].rate_hz,
-            beam=section["beam"].uniform,
-            damping=section["beam.damping"],
-            motor=section["motor"],
-            encoder=section["encoder"],
-            sensor=section["sensor"],
-            actuation=section["actuation"],
-            devices=section["devices"],
-            simulation=section.get("simulation"),
+            rate_hz=sections["rig"].rate_hz,
+            beam=sections["beam"].uniform,
+            damping=sections["beam.damping"],
+            motor=sections["motor"],
+            encoder=sections["encoder"],
+            sensor=sections["sensor"],
+            actuation=sections["actuation"],
+            devices=sections["devices"],
+            simulation=sections.get("simulation"),
             name=values["name"],
-            can=section.get("can"),
-            acquisition=section.get("acquisition"),
-            cia402=section.get("cia402"),
-            ati_can=section.get("ati_can"),
-            ati_serial=section.get("ati_serial"),
+            can=sections.get("can"),
+            acquisition=sections.get("acquisition"),
+            cia402=sections.get("cia402"),
+            ati_can=sections.get("ati_can"),
+            ati_serial=sections.get("ati_serial"),
         ),
-        control=section["control"],
-        limits=section["limits"],
-        session=section["session"],
-        realtime=section["realtime"],
-        metadata=section["metadata"],
-        uncertainty=section["uncertainty"],
+        control=sections["control"],
+        limits=sections["limits"],
+        session=sections["session"],
+        realtime=sections["realtime"],
+        metadata=sections["metadata"],
+        uncertainty=sections["uncertainty"],
         sources=sources,
-        tip_mass_kg=section["beam"].tip_mass_kg,
-        axis_tilt_deg=section["rig"].axis_tilt_deg,
+        tip_mass_kg=sections["beam"].tip_mass_kg,
+        axis_tilt_deg=sections["rig"].axis_tilt_deg,
     )
 
 
-def parse(text: str, path: Path) -> dict[str, Any]:
-    """Return the document of a TOML text.
+def parse_document(text: str, path: Path) -> dict[str, Any]:
+    """Return the TOML document in the text of a file.
 
     Raises
     ------
@@ -156,64 +157,69 @@ def parse(text: str, path: Path) -> dict[str, Any]:
         raise ProfileError(f"{path}: {error}.") from error
 
 
-def complaint(path: Path, problems: Iterable[str]) -> ProfileError:
-    """Return the error for a file, with one line for each problem."""
-    # An array that is too short has one error for each missing number.
+def problems_error(path: Path, problems: Iterable[str]) -> ProfileError:
+    """Return the error to raise for a file, with a line for each problem."""
+    # An array that is too short has an equal problem for each missing number.
     return ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
 
 
-def _find(name_or_path: str | Path) -> Path:
+def _find_profile(name_or_path: str | Path) -> Path:
+    """Return the path of a profile, or raise ProfileError if there is none."""
     if not str(name_or_path):
-        raise ProfileError(f"No profile is named; {_known_profiles()}, or give a .toml file.")
-    given = Path(name_or_path)
-    if given.suffix == ".toml" or given.parent != Path():
-        if given.is_file():
-            return given
-        raise ProfileError(f"{given}: there is no such file; {_known_profiles()}.")
+        raise ProfileError(f"No profile is named; {_known_profiles_text()}, or give a .toml file.")
+    given_path = Path(name_or_path)
+    if given_path.suffix == ".toml" or given_path.parent != Path():
+        if given_path.is_file():
+            return given_path
+        raise ProfileError(f"{given_path}: there is no such file; {_known_profiles_text()}.")
     files = profile_files()
-    if str(given) in files:
-        return files[str(given)][0].path
+    if str(given_path) in files:
+        return files[str(given_path)][0].path
     raise ProfileError(
-        f"There is no profile '{given}'; {_known_profiles()}. Make one of that name by "
-        f"'rigd profiles copy sim {given}', or give the path of a .toml file."
+        f"There is no profile '{given_path}'; {_known_profiles_text()}. Make one of that name by "
+        f"'rigd profiles copy sim {given_path}', or give the path of a .toml file."
     )
 
 
 def known_profiles() -> list[str]:
-    """Return the names of all profiles: of the working folder, of the user, and shipped ones."""
+    """Return the names of all profiles: in the working folder, the user's folder, and shipped."""
     return list(profile_files())
 
 
-def _known_profiles() -> str:
+def _known_profiles_text() -> str:
+    """Return the names of all known profiles as a clause for messages."""
     names = known_profiles()
     return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
 
 
 def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
-    """Make the path of the drive's EDS file absolute; yield a message if the file is missing."""
-    given = values.get("cia402.eds")
-    if not given:
+    """Make the drive's EDS path in `values` absolute; yield a message if there is no file."""
+    eds_name = values.get("cia402.eds")
+    if not eds_name:
         return
-    eds = path.resolve().parent / given
+    eds = path.resolve().parent / eds_name
     values["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
-            f'cia402.eds = "{given}": there is no file {eds}; give its path, relative to the '
+            f'cia402.eds = "{eds_name}": there is no file {eds}; give its path, relative to the '
             "profile's folder, or remove the key."
         )
 
 
-def flatten(
+def flatten_document(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Flatten the document into dotted keys, and separate the sources from the numbers."""
+    """Return the document's values and the numbers' sources, each by dotted keys.
+
+    A message for each missing or invalid source is appended to `problems`.
+    """
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
-    for key, entry in _entries(document, ""):
+    for key, entry in _dotted_entries(document, ""):
         if not isinstance(entry, dict):
             values[key] = entry
             if _is_number(key):
-                problems.append(diagnostics.bare_number(key, entry))
+                problems.append(diagnostics.bare_number_message(key, entry))
             continue
         source = entry.get("source")
         if source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
@@ -222,11 +228,11 @@ def flatten(
             continue
         values[key] = entry.get("value")
         if source == UNKNOWN:
-            problems.append(diagnostics.not_unknown(key, entry))
+            problems.append(diagnostics.invalid_unknown_message(key, entry))
         elif source in SOURCES:
             sources[key] = source
         elif _is_number(key):
-            problems.append(diagnostics.no_source(key, source))
+            problems.append(diagnostics.missing_source_message(key, source))
         problems.extend(
             f"{key} has the unknown part '{other}'; only value and source go there."
             for other in sorted(entry.keys() - {"value", "source"})
@@ -236,71 +242,82 @@ def flatten(
 
 def _is_number(key: str) -> bool:
     """Return whether the value of a key is a number or six numbers; False for unknown keys."""
-    return key in keys() and is_number(keys()[key])
+    return key in key_types() and is_number(key_types()[key])
 
 
-def _entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
-    """Yield dotted keys with their entries; a table with a value outside a section is a number."""
+def _dotted_entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str, Any]]:
+    """Yield the dotted keys of a document with their entries.
+
+    A table that is not a section and has ``value`` or ``source`` is the entry of a number.
+    """
     for key, entry in table.items():
         dotted = prefix + key
         if isinstance(entry, dict) and (
             dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
-            yield from _entries(entry, dotted + ".")
+            yield from _dotted_entries(entry, dotted + ".")
         else:
             yield dotted, entry
 
 
-def validate(
+def validate_values(
     values: Mapping[str, Any],
     problems: list[str],
     absent: frozenset[str],
     unknown: frozenset[str] = frozenset(),
 ) -> dict[str, Any]:
-    """Check types and ranges, and return the values for the dataclasses.
+    """Check types and ranges of all values, and return them with defaults for missing keys.
 
     Parameters
     ----------
     values
-        Values by their dotted keys.
+        Values of the file by dotted keys.
     problems
         List to which a message for each problem is appended.
     absent
-        Sections that the file omits; the top level has an empty name.
+        Names of sections that the file omits; the top level has the empty name.
     unknown
-        Keys without a value; their NaN is not checked.
+        Keys whose value is unknown; their NaN is not checked.
     """
     # TOML has only arrays, and strict validation requires tuples.
-    given = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
-        known = {key: value for key, value in given.items() if key not in unknown}
-        model = _schema(absent, unknown).model_validate(known)
+        known_values = {key: value for key, value in tuple_values.items() if key not in unknown}
+        model = _validation_model(absent, unknown).model_validate(known_values)
     except ValidationError as error:
         details = error.errors(include_url=False)
-        missing = [str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]]
-        problems.extend(diagnostics.missing(missing, given))
+        missing_keys = [
+            str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]
+        ]
+        problems.extend(diagnostics.missing_key_messages(missing_keys, tuple_values))
         for detail in details:
             if detail["type"] == "extra_forbidden":
-                problems.append(diagnostics.unknown(str(detail["loc"][0]), given))
-            elif str(detail["loc"][0]) not in missing:
-                problems.append(diagnostics.wrong(detail))
-        return given
+                problems.append(
+                    diagnostics.unknown_key_message(str(detail["loc"][0]), tuple_values)
+                )
+            elif str(detail["loc"][0]) not in missing_keys:
+                problems.append(diagnostics.wrong_value_message(detail))
+        return tuple_values
     usable: dict[str, Any] = model.model_dump(by_alias=True)
-    problems.extend(diagnostics.unusable_sizes(usable))
+    problems.extend(diagnostics.implausible_numbers(usable))
     return usable | dict.fromkeys(unknown, math.nan)
 
 
 @cache
-def _schema(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
-    """Return one flat model for all keys; one model for each section would be slow to build."""
+def _validation_model(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
+    """Return the pydantic model that validates all keys of a profile at once.
+
+    A model for each section would be slow to build.
+    """
     definitions: dict[str, Any] = {
-        f"key_{index}": (annotation, Field(default=defaults().get(key, ...), alias=key))
-        for index, (key, annotation) in enumerate(keys().items())
+        f"key_{index}": (annotation, Field(default=key_defaults().get(key, ...), alias=key))
+        for index, (key, annotation) in enumerate(key_types().items())
         if key.rpartition(".")[0] not in absent and key not in unknown
     }
     config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
     return create_model("Profile", __config__=config, **definitions)
 
 
-def _build(section: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
-    return SECTIONS[section](**{field: values[key] for key, field in fields_of(section)})
+def _build_section(sections: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+    """Return the dataclass of a section with its validated values."""
+    return SECTIONS[sections](**{field: values[key] for key, field in section_fields(sections)})

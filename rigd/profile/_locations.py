@@ -1,4 +1,4 @@
-"""Locations of profiles and specimens: working folder, user's own folder, shipped files."""
+"""Search for profile and specimen files: working folder, user's own folder, shipped files."""
 
 import os
 from collections.abc import Iterator
@@ -8,15 +8,19 @@ from pathlib import Path
 from typing import Final
 
 WORKING_FOLDER: Final = Path("hw_profiles")
-SPECIMENS_HERE: Final = Path("specimens")
-_PACKAGE: Final = Path(__file__).resolve().parent
-_IN_WHEEL: Final = _PACKAGE / "shipped"
-"""Folder of the project's profiles in a wheel (see pyproject.toml)."""
-_IN_CHECKOUT: Final = _PACKAGE.parents[1] / "hw_profiles"
+"""Folder of profiles, relative to the working folder."""
+SPECIMEN_FOLDER: Final = Path("specimens")
+"""Folder of specimen files, relative to the working folder."""
+_PACKAGE_FOLDER: Final = Path(__file__).resolve().parent
+"""Folder of this package."""
+_WHEEL_FOLDER: Final = _PACKAGE_FOLDER / "shipped"
+"""Folder of the project's profiles in an installed wheel (see pyproject.toml)."""
+_CHECKOUT_FOLDER: Final = _PACKAGE_FOLDER.parents[1] / "hw_profiles"
+"""Folder of the project's profiles in a checkout of the source tree."""
 
 
 class Origin(StrEnum):
-    """Origin of a profile, in the search order."""
+    """Folder in which a profile file was found, in the search order."""
 
     HERE = "working folder"
     USER = "per-user folder"
@@ -32,9 +36,9 @@ class ProfileFile:
     name
         Value of ``--profile``: the file name without ``.toml``.
     path
-        The file.
+        Path of the file.
     origin
-        Origin of the file.
+        Folder in which the file was found.
     """
 
     name: str
@@ -43,49 +47,56 @@ class ProfileFile:
 
 
 def profile_files() -> dict[str, list[ProfileFile]]:
-    """Return the files by name, in alphabetical order.
+    """Return all profile files by their names, in alphabetical order.
 
-    The first file of a name is used and hides the others.
+    If several files have the same name, the first one is used and hides the others.
     """
-    found: dict[str, list[ProfileFile]] = {}
-    for origin, folder in _folders():
+    files_by_name: dict[str, list[ProfileFile]] = {}
+    for origin, folder in _search_folders():
         for path in folder.glob("*.toml"):
-            found.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
-    return dict(sorted(found.items()))
+            files_by_name.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
+    return dict(sorted(files_by_name.items()))
 
 
 def specimen_files() -> dict[str, Path]:
-    """Return the specimen files by name, in alphabetical order.
+    """Return the paths of all specimen files by their names, in alphabetical order.
 
     Files in ``specimens`` of the working folder precede those of the user's own folder
     (``$XDG_CONFIG_HOME/rigd/specimens``).
     """
-    own = user_folder()
-    found: dict[str, Path] = {}
-    for folder in (SPECIMENS_HERE, *([own.with_name("specimens")] if own else [])):
+    profile_folder = user_folder()
+    paths_by_name: dict[str, Path] = {}
+    for folder in (
+        SPECIMEN_FOLDER,
+        *([profile_folder.with_name("specimens")] if profile_folder else []),
+    ):
         for path in folder.glob("*.toml"):
-            found.setdefault(path.stem, path)
-    return dict(sorted(found.items()))
+            paths_by_name.setdefault(path.stem, path)
+    return dict(sorted(paths_by_name.items()))
 
 
 def user_folder() -> Path | None:
-    """Return the user's own folder for profiles, existing or not; None without a home folder."""
-    base = Path(os.environ.get("XDG_CONFIG_HOME", ""))
-    if not base.is_absolute():  # the XDG specification ignores relative paths
+    """Return the user's own folder for profiles, or None if the user has no home folder.
+
+    The folder need not exist.
+    """
+    config_folder = Path(os.environ.get("XDG_CONFIG_HOME", ""))
+    if not config_folder.is_absolute():  # the XDG specification ignores relative paths
         try:
-            base = Path.home() / ".config"
+            config_folder = Path.home() / ".config"
         except RuntimeError:  # for example in a container, with an unknown user id
             return None
-    return base / "rigd" / "profiles"
+    return config_folder / "rigd" / "profiles"
 
 
-def _folders() -> Iterator[tuple[Origin, Path]]:
-    shipped = _IN_WHEEL if _IN_WHEEL.is_dir() else _IN_CHECKOUT
+def _search_folders() -> Iterator[tuple[Origin, Path]]:
+    """Yield the folders that are searched for profiles, in the search order."""
+    shipped = _WHEEL_FOLDER if _WHEEL_FOLDER.is_dir() else _CHECKOUT_FOLDER
     try:
-        in_checkout = WORKING_FOLDER.samefile(shipped)
+        is_checkout_folder = WORKING_FOLDER.samefile(shipped)
     except OSError:  # usually the folder does not exist
-        in_checkout = False
-    if not in_checkout:
+        is_checkout_folder = False
+    if not is_checkout_folder:
         yield Origin.HERE, WORKING_FOLDER
     if user := user_folder():
         yield Origin.USER, user

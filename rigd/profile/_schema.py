@@ -1,4 +1,4 @@
-"""Schema of a profile: its sections, and settings that no other module declares."""
+"""Schema of a profile: sections, keys and sources, and the settings that this module declares."""
 
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
@@ -32,39 +32,40 @@ from rigd.safety.limits import Limits
 
 @dataclass(frozen=True, slots=True)
 class SessionSettings:
-    """Settings before and after a record: tare, return and final check."""
+    """Settings of a session's tare, return and final check, before and after its record."""
 
     tare_s: Annotated[float, Ge(0.5), Le(60)]
-    """Averaging time of the sensor at rest."""
+    """Time for which the sensor is averaged at rest."""
     rest_velocity_rad_s: Annotated[float, Gt(0)]
-    """Largest mean speed during the tare of a rig at rest."""
+    """Largest mean speed during the tare at which the rig counts as at rest."""
     rest_torque_nm: Annotated[float, Gt(0)]
-    """Largest standard deviation of the coupling torque during the tare of a beam at rest; above
-    the noise of the sensor."""
+    """Largest standard deviation of the coupling torque at which the beam counts as at rest.
+
+    It must be above the noise of the sensor."""
     rest_timeout_s: Annotated[float, Ge(0), Le(3600)]
-    """Longest wait for rest before a session refuses to start."""
+    """Longest time that a session waits for rest before it refuses to start."""
     tare_drift_nm: Annotated[float, Gt(0)]
-    """Drift of the coupling torque's zero during a session above which a warning is given."""
+    """Drift of the coupling torque's zero during a session above which there is a warning."""
     return_s: Annotated[float, Gt(0), Le(60)]
     """Duration of the smooth return to the start angle."""
 
 
 @dataclass(frozen=True, slots=True)
 class RealtimeSettings:
-    """Real-time settings that the processes of a rig request from the operating system."""
+    """Real-time settings that the rig's processes request from the operating system."""
 
     priority: Annotated[int, Ge(0), Le(99)]
-    """SCHED_FIFO priority of the control process; 0: ordinary scheduling."""
+    """SCHED_FIFO priority of the control process, or 0 for ordinary scheduling."""
     cpu: Annotated[int, Ge(-1)]
-    """Core of the control process; -1: the last permitted core."""
+    """Number of the processor core for the control process, or -1 for the last permitted core."""
     spin_us: Annotated[float, Ge(0), Le(200)]
-    """Last part of each wait, spent polling the clock instead of sleeping."""
+    """Time at the end of each wait in which the loop polls the clock instead of sleeping."""
     late_us: Annotated[float, Gt(0)]
     """Lateness above which a tick is flagged as late."""
 
     @property
     def supervision_priority(self) -> int:
-        """SCHED_RR priority of supervisor and recorder: a quarter of the loop's.
+        """SCHED_RR priority of supervisor and recorder, a quarter of the loop's priority.
 
         This is above every ordinary program, and below the loop and the kernel threads (50 for
         interrupts on a real-time kernel).
@@ -77,27 +78,27 @@ _RelativePercent = Annotated[float, Ge(0), Le(50)]
 
 @dataclass(frozen=True, slots=True)
 class ScaleUncertainty:
-    """Relative standard uncertainties (k = 1) that are common to all sessions of a rig.
+    """Relative standard uncertainties (k = 1) of scales that all sessions of a rig have in common.
 
     They do not average out and are not observable in a session, so an analysis adds them to its
-    statistical intervals. Zero means not stated, except for the uniformity, where it means a
-    uniform beam.
+    statistical intervals. Zero means that the uncertainty is not stated; for the uniformity it
+    means a uniform beam.
     """
 
     torque_scale_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Scale of the torque relative to the angle: calibration and mounting of the sensor."""
+    """Uncertainty of the torque's scale, from calibration and mounting of the sensor."""
     length_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Length of the beam."""
+    """Uncertainty of the beam's length."""
     density_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Mass per length of the beam, for example from weighing."""
+    """Uncertainty of the beam's mass per length, for example from weighing."""
     tip_mass_percent: _RelativePercent = field(default=0.0, metadata=OPTIONAL)
-    """Mass at the tip of the beam, from the balance."""
+    """Uncertainty of the mass at the beam's tip, from the balance."""
     uniformity_percent: Annotated[float, Ge(0), Le(10)] = field(default=0.1, metadata=OPTIONAL)
-    """Frequency of each mode relative to that of a uniform beam."""
+    """Standard deviation of each mode's frequency relative to that of a uniform beam."""
 
     @property
     def stated(self) -> dict[str, float]:
-        """Uncertainties that the profile states, by the names of the fields."""
+        """Uncertainties in per cent that are not zero, by field name, without the uniformity."""
         return {
             each.name: value
             for each in fields(self)
@@ -107,10 +108,10 @@ class ScaleUncertainty:
 
 @dataclass(frozen=True, slots=True)
 class MetadataSettings:
-    """Metadata of the sessions."""
+    """Metadata that the sessions of a rig must have."""
 
     required: tuple[str, ...] = field(default=(), metadata=OPTIONAL)
-    """Required metadata of each session: their names, ``operator``, ``specimen`` or ``note``."""
+    """Names of metadata required for each session; also ``operator``, ``specimen`` or ``note``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,20 +121,21 @@ class RigSection:
     rate_hz: Annotated[float, Ge(100), Le(20_000)]
     """Rate of the loop; slower loops would check the other processes too seldom."""
     axis_tilt_deg: Annotated[float, Ge(-90), Le(90)] | None = field(default=None, metadata=OPTIONAL)
-    """Inclination of the plane of motion along the beam at rest, positive where the tip is lower
-    than the motor's axis: gravity acts along the beam with its sine; None: not measured."""
+    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+
+    It is positive if the tip is lower than the motor's axis; gravity then pulls along the beam."""
 
 
 @dataclass(frozen=True, slots=True)
 class BeamSection(Beam):
-    """Section of the beam: the uniform beam and the mass at its tip."""
+    """Section ``[beam]`` of a profile: the uniform beam and the mass at its tip."""
 
     tip_mass_kg: Annotated[float, Ge(0)] | None = field(default=None, metadata=OPTIONAL)
-    """Point mass at the tip; None: not known."""
+    """Point mass at the beam's tip, or None if it is unknown."""
 
     @property
     def uniform(self) -> Beam:
-        """The beam alone."""
+        """Uniform beam without the tip mass."""
         return Beam(self.length_m, self.density_kg_per_m, self.bending_stiffness_n_m2)
 
 
@@ -159,36 +161,42 @@ SECTIONS: dict[str, type] = {
     "simulation": Simulation,
     "uncertainty": ScaleUncertainty,
 }
-WIRING = {
+"""Map from a section's name to the dataclass of its keys."""
+DEVICE_SECTIONS = {
     "cia402": ("can", "acquisition", "cia402"),
     "ati_can": ("can", "acquisition", "ati_can"),
     "ati_serial": ("acquisition", "ati_serial"),
     "sim": ("simulation",),
 }
-"""Sections that are required only by certain devices of ``[devices]``."""
-OPTIONAL_SECTIONS = tuple(dict.fromkeys(name for names in WIRING.values() for name in names))
-TEXTS = ("name", "description")
+"""Map from a device of ``[devices]`` to the sections that it requires."""
+OPTIONAL_SECTIONS = tuple(
+    dict.fromkeys(name for names in DEVICE_SECTIONS.values() for name in names)
+)
+"""Sections that only some devices require."""
+TEXT_KEYS = ("name", "description")
+"""Keys outside any section, whose values are texts."""
 SOURCES = ("paper", "datasheet", "measured", "assumed")
+"""Valid sources of a number in a profile."""
 UNKNOWN = "unknown"
 """Source of a number without a value, which is NaN in the parameters (see `MAY_BE_UNKNOWN`)."""
 
 
 @cache
-def keys() -> dict[str, Any]:
-    """Return all dotted keys of a profile with the annotated types of their values.
+def key_types() -> dict[str, Any]:
+    """Return the type of each key's value, by the dotted keys of a profile.
 
-    A profile must have all keys except those of :func:`defaults`.
+    A profile must have all keys except those of :func:`key_defaults`.
     """
-    types: dict[str, Any] = dict.fromkeys(TEXTS, Annotated[str, MinLen(1)])
+    types: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
     for section, cls in SECTIONS.items():
         hints = get_type_hints(cls, include_extras=True)
-        types |= {key: hints[field] for key, field in fields_of(section)}
+        types |= {key: hints[field] for key, field in section_fields(section)}
     return types
 
 
 @cache
-def defaults() -> dict[str, Any]:
-    """Return the optional keys of a profile with their default values.
+def key_defaults() -> dict[str, Any]:
+    """Return the default value of each optional key, by the dotted keys of a profile.
 
     Other defaults of the dataclasses are not used: for example, a delay that is not stated is
     unknown and not zero.
@@ -202,7 +210,7 @@ def defaults() -> dict[str, Any]:
 
 
 def is_number(annotation: Any) -> bool:  # noqa: ANN401
-    """Return whether a value of this type is a number or six numbers, which need a source."""
+    """Return whether values of a type are numbers, alone or as a tuple, which need a source."""
     if get_origin(annotation) is Annotated:
         annotation = get_args(annotation)[0]
     if get_origin(annotation) is tuple:
@@ -210,8 +218,8 @@ def is_number(annotation: Any) -> bool:  # noqa: ANN401
     return annotation not in (str, bool) and get_origin(annotation) is not Literal
 
 
-def fields_of(section: str) -> list[tuple[str, str]]:
-    """Return pairs of dotted key and field of a section's dataclass."""
+def section_fields(section: str) -> list[tuple[str, str]]:
+    """Return each dotted key of a section with the name of its dataclass field."""
     # A trailing underscore distinguishes the name of a field from a Python keyword.
     names = [field.name for field in fields(SECTIONS[section])]
     return [(f"{section}.{name.rstrip('_')}", name) for name in names]
@@ -219,48 +227,48 @@ def fields_of(section: str) -> list[tuple[str, str]]:
 
 @dataclass(frozen=True, slots=True)
 class Specimen:
-    """A specimen with its own file."""
+    """Specimen that is described by its own file."""
 
     name: str
     """File name without ``.toml``, which is the name of the specimen in sessions."""
     path: Path
-    """The file."""
+    """Path of the specimen's file."""
     text: str
-    """Content of the file."""
+    """Content of the specimen's file."""
     beam: Beam
-    """Beam of the specimen."""
+    """Uniform beam of the specimen."""
     damping: Damping | None
-    """Nominal damping; None: that of the profile."""
+    """Nominal damping of the specimen, or None if that of the profile applies."""
     uncertainty: ScaleUncertainty
-    """Uncertainties of length and density; that of the torque scale belongs to the rig."""
+    """Uncertainties of the specimen's length and density, without the rig's torque scale."""
     note: str
-    """Free text."""
+    """Free text on the specimen."""
     tip_mass_kg: float | None = None
-    """Point mass at the tip; None: not known."""
+    """Point mass at the specimen's tip, or None if it is unknown."""
 
 
-_BREAKAWAY = 5.0
+_BREAKAWAY_TO_COULOMB = 5.0
 """Assumed ratio of breakaway torque to the stated Coulomb friction, for a cold gear."""
-_LEAST_BREAKAWAY = 0.05
+_MIN_BREAKAWAY_FRACTION = 0.05
 """Smallest breakaway torque, as a fraction of the peak torque."""
 
 
 class UnknownValueError(UserError):
-    """The profile states a required value as unknown."""
+    """A value that is needed is stated as unknown in the profile."""
 
 
 @dataclass(frozen=True, slots=True)
 class Profile:
-    """Validated profile of a rig."""
+    """Validated profile of a rig: all its parameters and settings."""
 
     name: str
     """Name of the rig."""
     description: str
-    """Description in one line."""
+    """Description of the rig in one line."""
     path: Path
-    """The file."""
+    """Path of the profile's file."""
     text: str
-    """Content of the file."""
+    """Content of the profile's file."""
     rig: RigParameters
     """Parameters of the rig and its drivers."""
     control: ControlSettings
@@ -268,7 +276,7 @@ class Profile:
     limits: Limits
     """Limits that end a session."""
     session: SessionSettings
-    """Settings before and after a record."""
+    """Settings of a session's tare, return and final check."""
     realtime: RealtimeSettings
     """Real-time settings of the processes."""
     metadata: MetadataSettings
@@ -276,39 +284,40 @@ class Profile:
     uncertainty: ScaleUncertainty
     """Uncertainties of the scales that are not observable in a session."""
     sources: Mapping[str, str]
-    """Where each number comes from: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
+    """Source of each number by its dotted key: ``sources["motor.inertia_kg_m2"] == "assumed"``."""
     design_motor: Motor | None = None
-    """Motor for the design of the controller, if it differs from that of the rig."""
+    """Motor for which the controller is designed, or None if it is the motor of the rig."""
     tip_mass_kg: float | None = None
-    """Measured point mass at the tip of the beam; None: not known."""
+    """Measured point mass at the beam's tip, or None if it is unknown."""
     axis_tilt_deg: float | None = None
-    """Inclination of the plane of motion along the beam at rest, positive where the tip is lower;
-    None: not measured."""
+    """Inclination of the resting beam in the plane of motion, or None if it was not measured.
+
+    It is positive if the tip is lower than the motor's axis."""
     specimen: Specimen | None = None
-    """Mounted specimen with its own file, whose beam is then that of the rig; else None."""
+    """Mounted specimen whose file has replaced the profile's beam, or None."""
     specimen_in_words: str = ""
-    """Description of the specimen and its differences from the profile, for the operator."""
+    """Sentence for the operator on the specimen and its differences from the profile."""
 
     @property
     def standstill_torque_nm(self) -> float:
-        """Net torque above the largest friction of the shaft."""
+        """Net torque in N·m on the shaft that exceeds its largest friction."""
         motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
         return stated_nm or max(
-            _BREAKAWAY * motor.coulomb_nm, _LEAST_BREAKAWAY * motor.peak_torque_nm
+            _BREAKAWAY_TO_COULOMB * motor.coulomb_nm, _MIN_BREAKAWAY_FRACTION * motor.peak_torque_nm
         )
 
     @property
     def control_motor(self) -> Motor:
-        """Motor for the design of the controller."""
+        """Motor for which the controller is designed."""
         return self.design_motor or self.rig.motor
 
     def loop_model(self) -> LoopModel:
-        """Return the loop model of this rig, for the design and prediction of the closed loop.
+        """Return the model of this rig's closed loop, for its design and prediction.
 
         Raises
         ------
         UnknownValueError
-            If values of the profile are unknown: names each one and where to find it.
+            If values of the profile are unknown; the message names each one and where to find it.
         """
         rig = self.rig
         if unknown := describe_unknown_values(rig):

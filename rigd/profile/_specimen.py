@@ -1,4 +1,4 @@
-"""Specimens in their own files ``specimens/NAME.toml``, with the beam section of a profile."""
+"""Loader of specimen files ``specimens/NAME.toml``, whose beam replaces that of a profile."""
 
 from dataclasses import fields, replace
 from pathlib import Path
@@ -7,7 +7,14 @@ from typing import Final
 from rigd.beam import Beam, Damping
 from rigd.devices import ActuationTarget, actuation_target
 from rigd.profile import _diagnostics as diagnostics
-from rigd.profile._load import ProfileError, complaint, flatten, parse, read_text, validate
+from rigd.profile._load import (
+    ProfileError,
+    flatten_document,
+    parse_document,
+    problems_error,
+    read_text,
+    validate_values,
+)
 from rigd.profile._locations import specimen_files
 from rigd.profile._schema import (
     SECTIONS,
@@ -15,17 +22,22 @@ from rigd.profile._schema import (
     Profile,
     ScaleUncertainty,
     Specimen,
-    fields_of,
+    section_fields,
 )
 from rigd.units import suffix_of, unit_of
 
-_BEAM: Final = "beam"
-_DAMPING: Final = "beam.damping"
-_UNCERTAINTY: Final = "uncertainty"
-_OF_THE_RIG: Final = "uncertainty.torque_scale_percent"
-_NOTE: Final = "note"
-_MOST_BYTES: Final = 16_384
-"""Largest file; each session sends it through a pipe to the recorder."""
+_BEAM_SECTION: Final = "beam"
+"""Name of the section with the beam."""
+_DAMPING_SECTION: Final = "beam.damping"
+"""Name of the section with the beam's damping."""
+_UNCERTAINTY_SECTION: Final = "uncertainty"
+"""Name of the section with the uncertainties."""
+_RIG_UNCERTAINTY_KEY: Final = "uncertainty.torque_scale_percent"
+"""Key of the uncertainties that belongs to the rig and not to a specimen."""
+_NOTE_KEY: Final = "note"
+"""Key of the free text."""
+_MAX_BYTES: Final = 16_384
+"""Largest size of a specimen file in bytes, which each session sends through a pipe."""
 
 
 def load_specimen(path: Path) -> Specimen:
@@ -37,11 +49,12 @@ def load_specimen(path: Path) -> Specimen:
     Parameters
     ----------
     path
-        The file.
+        Path of the specimen file.
 
     Returns
     -------
     Specimen
+        Validated values of the file.
 
     Raises
     ------
@@ -50,56 +63,63 @@ def load_specimen(path: Path) -> Specimen:
         unit and remedy.
     """
     text = read_text(path)
-    if len(text.encode()) > _MOST_BYTES:
-        raise ProfileError(f"{path}: is longer than {_MOST_BYTES} bytes; shorten its notes.")
+    if len(text.encode()) > _MAX_BYTES:
+        raise ProfileError(f"{path}: is longer than {_MAX_BYTES} bytes; shorten its notes.")
     problems: list[str] = []
-    values, _ = flatten(parse(text, path), problems)
-    note = values.pop(_NOTE, "")
+    values, _ = flatten_document(parse_document(text, path), problems)
+    note = values.pop(_NOTE_KEY, "")
     if not isinstance(note, str):
-        problems.append(f"{_NOTE} = {note!r} must be text in quotes.")
-    own = (f"{_BEAM}.", f"{_UNCERTAINTY}.")
-    for key in [key for key in values if not key.startswith(own) or key == _OF_THE_RIG]:
+        problems.append(f"{_NOTE_KEY} = {note!r} must be text in quotes.")
+    valid_prefixes = (f"{_BEAM_SECTION}.", f"{_UNCERTAINTY_SECTION}.")
+    for key in [
+        key for key in values if not key.startswith(valid_prefixes) or key == _RIG_UNCERTAINTY_KEY
+    ]:
         del values[key]
         problems.append(
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
-            f"[uncertainty] all but {_OF_THE_RIG.partition('.')[2]}, and note; remove it."
+            f"[uncertainty] all but {_RIG_UNCERTAINTY_KEY.partition('.')[2]}, and note; remove it."
         )
-    sections = {_BEAM, _UNCERTAINTY}
-    sections |= {_DAMPING for key in values if key.startswith(f"{_DAMPING}.")}
-    values = validate(values, problems, frozenset({"", *SECTIONS} - sections))
+    sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
+    sections |= {_DAMPING_SECTION for key in values if key.startswith(f"{_DAMPING_SECTION}.")}
+    values = validate_values(values, problems, frozenset({"", *SECTIONS} - sections))
     if not problems:
-        problems.extend(diagnostics.first_mode(values))
+        problems.extend(diagnostics.first_mode_contradictions(values))
     if problems:
-        raise complaint(path, problems)
-    beam = BeamSection(**{field: values[key] for key, field in fields_of(_BEAM)})
+        raise problems_error(path, problems)
+    beam = BeamSection(**{field: values[key] for key, field in section_fields(_BEAM_SECTION)})
     damping = None
-    if _DAMPING in sections:
-        damping = Damping(**{field: values[key] for key, field in fields_of(_DAMPING)})
-    uncertainty = ScaleUncertainty(**{field: values[key] for key, field in fields_of(_UNCERTAINTY)})
+    if _DAMPING_SECTION in sections:
+        damping = Damping(**{field: values[key] for key, field in section_fields(_DAMPING_SECTION)})
+    uncertainty = ScaleUncertainty(
+        **{field: values[key] for key, field in section_fields(_UNCERTAINTY_SECTION)}
+    )
     return Specimen(
         path.stem, path, text, beam.uniform, damping, uncertainty, note, beam.tip_mass_kg
     )
 
 
 def with_specimen(profile: Profile, name: str) -> Profile:
-    """Return a profile with a mounted specimen, whose beam replaces that of the profile.
+    """Return the profile of a rig on which a specimen is mounted.
+
+    The beam of the specimen's file replaces that of the profile.
 
     Parameters
     ----------
     profile
         Profile of the rig.
     name
-        Name of the specimen in a session. Without a file of that name it is only a label, and the
-        profile is unchanged.
+        Name of the specimen in a session. If there is no file of that name, it is only a label and
+        the profile is returned unchanged.
 
     Returns
     -------
     Profile
+        Profile with the beam, the damping and the uncertainties of the specimen.
 
     Raises
     ------
     ProfileError
-        If the file of that name cannot be used.
+        If the specimen's file cannot be used.
     """
     path = specimen_files().get(name.strip())
     if path is None:
@@ -113,25 +133,27 @@ def with_specimen(profile: Profile, name: str) -> Profile:
         uncertainty=replace(specimen.uncertainty, torque_scale_percent=scale_percent),
         tip_mass_kg=specimen.tip_mass_kg,
         specimen=specimen,
-        specimen_in_words=_in_words(profile, specimen),
+        specimen_in_words=_describe_specimen(profile, specimen),
     )
 
 
-def _in_words(profile: Profile, specimen: Specimen) -> str:
-    head = f"Specimen {specimen.name} ({specimen.path}): "
-    different = [
+def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
+    """Return a sentence on the specimen's differences from the profile, for the operator."""
+    prefix = f"Specimen {specimen.name} ({specimen.path}): "
+    differences = [
         f"{name.removesuffix(suffix_of(name)).replace('_', ' ')} "
-        f"{own:g} {unit_of(name)} (profile: {its:g})"
+        f"{specimen_value:g} {unit_of(name)} (profile: {its:g})"
         for name in (each.name for each in fields(Beam))
-        if (own := getattr(specimen.beam, name)) != (its := getattr(profile.rig.beam, name))
+        if (specimen_value := getattr(specimen.beam, name))
+        != (its := getattr(profile.rig.beam, name))
     ]
     if specimen.tip_mass_kg is not None:
-        different.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
+        differences.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
     if specimen.damping not in (None, profile.rig.damping):
-        different.append("nominal damping of its own")
-    if not different:
-        return f"{head}beam as in the profile."
-    words = f"{head}{', '.join(different)}; for prediction, nominal model and file."
+        differences.append("nominal damping of its own")
+    if not differences:
+        return f"{prefix}beam as in the profile."
+    sentence = f"{prefix}{', '.join(differences)}; for prediction, nominal model and file."
     if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
-        words += " The simulated rig keeps the beam of the profile."
-    return words
+        sentence += " The simulated rig keeps the beam of the profile."
+    return sentence

@@ -1,4 +1,4 @@
-"""Writing of a profile from the text of another, with new values, sources and comments."""
+"""Writing of a profile from another profile's text, with new values, sources and comments."""
 
 import json
 import re
@@ -7,40 +7,46 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.profile._load import ProfileError, profile_of
-from rigd.profile._schema import UNKNOWN, Profile, is_number, keys
+from rigd.profile._load import ProfileError, profile_from_text
+from rigd.profile._schema import UNKNOWN, Profile, is_number, key_types
 
 SettingValue = bool | int | float | str | tuple[str, ...]
+"""Type of the value of a profile's key."""
 
-_WIDTH = 100
+_COMMENT_WIDTH = 100
+"""Largest length of a comment's lines, in characters."""
 
 
 @dataclass(frozen=True, slots=True)
 class Setting:
-    """New value of a key of a profile."""
+    """Change of a profile: key, new value, its source, and a comment."""
 
     key: str
     """Dotted key, such as ``cia402.node_id``."""
     value: SettingValue
+    """New value of the key."""
     source: str = "assumed"
-    """Source of a number, as in a profile. With "unknown" no value is written."""
+    """Source of the value if it is a number; if it is "unknown", no value is written."""
     reason: str = ""
-    """Text of a comment above the value."""
+    """Text of the comment above the key, or an empty string for no comment."""
     hexadecimal: bool = False
+    """Whether an integer is written as a hexadecimal number."""
     commented: bool = False
-    """Write the setting as a comment only, for a later decision; the key has its default."""
+    """Whether the setting is only written as a comment, for a later decision."""
 
 
 def with_settings(text: str, settings: Iterable[Setting]) -> str:
-    """Return the text of a profile with new values and unchanged comments.
+    """Return the text of a profile after the values of some keys are replaced.
+
+    Other comments and values are unchanged.
 
     Parameters
     ----------
     text
         Text of a valid profile.
     settings
-        New values. A missing key replaces the comment that shows it, or becomes the first key of
-        its section.
+        Changes. A key that the profile does not have replaces the comment that shows it, or becomes
+        the first key of its section.
 
     Raises
     ------
@@ -50,31 +56,34 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     lines = text.splitlines()
     for setting in settings:
         indices = _line_indices(lines)
-        line = _line(setting)
-        new = [*_comment(setting.reason), f"# {line}" if setting.commented else line]
+        line = _setting_line(setting)
+        new_lines = [*_comment_lines(setting.reason), f"# {line}" if setting.commented else line]
         if setting.key in indices:
             index = indices[setting.key]
-            lines[index : index + 1] = new
+            lines[index : index + 1] = new_lines
         else:
             index = indices[setting.key.rpartition(".")[0]] + 1
-            lines[index:index] = new
+            lines[index:index] = new_lines
     return "\n".join(lines) + "\n"
 
 
 def with_head(text: str, head: Sequence[str]) -> str:
-    """Return the text of a profile with other comments before its first key."""
+    """Return the text of a profile after the comments before its first key are replaced.
+
+    `head` has the lines of the new comments.
+    """
     lines = text.splitlines()
     first = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
     return (
         "\n".join(
-            [*(each for line in head for each in _comment(line) or ["#"]), "", *lines[first:]]
+            [*(each for line in head for each in _comment_lines(line) or ["#"]), "", *lines[first:]]
         )
         + "\n"
     )
 
 
 def check_new(path: Path) -> None:
-    """Raise if a new profile could not be written to a path, or not be found by its name.
+    """Raise ProfileError if a new profile cannot be written to a path, or has an invalid name.
 
     Raises
     ------
@@ -84,18 +93,18 @@ def check_new(path: Path) -> None:
     if path.suffix != ".toml":
         raise ProfileError(f"{path}: the name of a profile ends in .toml.")
     if path.exists() or path.is_symlink():
-        raise _taken(path)
+        raise _exists_error(path)
     if not path.parent.is_dir():
         raise ProfileError(f"{path}: there is no folder {path.parent}; create it first.")
 
 
 def write_new(path: Path, text: str) -> None:
-    """Write a new file.
+    """Write the text of a profile to a new file.
 
     Parameters
     ----------
     path
-        The new file.
+        Path of the new file.
     text
         Text of the file.
 
@@ -108,7 +117,7 @@ def write_new(path: Path, text: str) -> None:
         with path.open("x", encoding="utf-8") as file:
             file.write(text)
     except FileExistsError as error:
-        raise _taken(path) from error
+        raise _exists_error(path) from error
     except OSError as error:
         raise ProfileError(f"{path}: cannot be written ({error.strerror}).") from error
 
@@ -123,7 +132,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
     path
         Path of the copy.
     name
-        Name of the rig in the copy; None: unchanged.
+        Name of the rig in the copy, or None if it is unchanged.
 
     Raises
     ------
@@ -143,7 +152,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
                 f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
                 "under its [section], so that no changed copy can be made; copy the file, edit it."
             ) from None
-        profile_of(text, path)
+        profile_from_text(text, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -152,43 +161,45 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
     write_new(path, text)
 
 
-def _taken(path: Path) -> ProfileError:
+def _exists_error(path: Path) -> ProfileError:
+    """Return the error to raise if a file exists already."""
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
 def _line_indices(lines: Sequence[str]) -> dict[str, int]:
-    """Return the line index of each section and key of a profile.
+    """Return the index of the line of each section and each key of a profile.
 
-    A key that occurs only in a comment has the index of the comment.
+    If a key occurs only in a comment, it is the index of the comment.
     """
     indices: dict[str, int] = {}
-    shown: dict[str, int] = {}
+    value_text: dict[str, int] = {}
     section = ""
     for index, line in enumerate(lines):
-        if title := re.match(r"\[([^\]]+)\]", line):
-            indices[title[1]] = index
-            section = title[1] + "."
+        if section_title := re.match(r"\[([^\]]+)\]", line):
+            indices[section_title[1]] = index
+            section = section_title[1] + "."
         elif key := re.match(r"(\w+)\s*=", line):
             indices[section + key[1]] = index
-        elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in keys():
-            shown[section + key[1]] = index
-    return shown | indices
+        elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in key_types():
+            value_text[section + key[1]] = index
+    return value_text | indices
 
 
-def _comment(text: str) -> list[str]:
-    """Return a text as comment lines."""
-    return textwrap.wrap(text, _WIDTH, initial_indent="# ", subsequent_indent="# ")
+def _comment_lines(text: str) -> list[str]:
+    """Return a text wrapped into lines of a comment."""
+    return textwrap.wrap(text, _COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
-def _line(setting: Setting) -> str:
+def _setting_line(setting: Setting) -> str:
+    """Return the line of a profile for a setting."""
     name = setting.key.rpartition(".")[2]
     value = setting.value
     # Texts and booleans have the same syntax in JSON and TOML.
-    shown = json.dumps(value, ensure_ascii=False)
-    if not is_number(keys()[setting.key]):
-        return f"{name} = {shown}"
+    value_text = json.dumps(value, ensure_ascii=False)
+    if not is_number(key_types()[setting.key]):
+        return f"{name} = {value_text}"
     if setting.source == UNKNOWN:
         return f'{name} = {{ source = "{UNKNOWN}" }}'
     if setting.hexadecimal and isinstance(value, int):
-        shown = f"0x{value:08X}"
-    return f'{name} = {{ value = {shown}, source = "{setting.source}" }}'
+        value_text = f"0x{value:08X}"
+    return f'{name} = {{ value = {value_text}, source = "{setting.source}" }}'

@@ -25,54 +25,66 @@ from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
 from rigd.safety.limits import BY_NAME, Violation
 
 ENCODER_FAILURE_S = 0.004
-"""Time after which large net torque on an encoder at rest is a fault."""
-_WINDOWS_S = ENCODER_FAILURE_S, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
-"""Durations over which torques are averaged: short ones within half a period of any excitation,
-long ones in which noise averages out."""
+"""Time in seconds for which the net torque may be large while the encoder shows no movement."""
+_AVERAGING_WINDOWS_S = ENCODER_FAILURE_S, 0.008, 0.016, 0.032, 0.064, 0.128, 0.256, 0.512
+"""Durations in seconds over which torques are averaged.
+
+The short ones are within half a period of any excitation; in the long ones noise averages out."""
 _STANDSTILL_S = 0.016
-"""Time without an encoder step after which the coupling torque is compared."""
-_SIGNIFICANT = 5.0
-"""Standard deviations of the mean of the noise above which the beam pulls."""
-_LEAST_PULL = 0.005
-"""The same for a sensor without noise, as a fraction of the breakaway torque."""
-_MODEL_ERROR = 0.5
-"""Error of the prediction, as a fraction of the coupling torque's rms: beams differ from their
-models. The error vibrates: a mean over more than half a period of the first mode has a lower
-one."""
-_VIBRATION_S = 0.25
-"""Time constant of that rms."""
-_RAMP_S = 0.02
-"""Time in which the torque of a test rises by the breakaway torque."""
-_RAMP_LIMIT = 2.0
-"""Torque, in breakaway torques, at which a test starts again in the other direction."""
-_ANSWER_STEPS = 1.5
-"""Encoder steps that answer a test."""
-_PAUSE_S = 0.5
-"""Time after an answer without a further test."""
-_TORQUE_ERROR = 0.25
+"""Time in seconds without an encoder step after which the coupling torque is compared."""
+_SIGNIFICANT_STDS = 5.0
+"""Standard deviations of the averaged noise above which a torque of the beam is significant."""
+_MIN_SIGNIFICANT_FRACTION = 0.005
+"""Smallest significant torque of the beam, as a fraction of the breakaway torque.
+
+It applies to sensors without noise."""
+_MODEL_ERROR_FRACTION = 0.5
+"""Error of the predicted coupling torque, as a fraction of the coupling torque's rms.
+
+Beams differ from their models. The error vibrates, so its mean over more than half a period of the
+first mode is smaller."""
+_RMS_TIME_CONSTANT_S = 0.25
+"""Time constant in seconds of the coupling torque's rms."""
+_TEST_RAMP_S = 0.02
+"""Time in seconds in which the test torque rises by the breakaway torque."""
+_MAX_TEST_BREAKAWAY_TORQUES = 2.0
+"""Test torque at which the test starts again in the other direction, in breakaway torques."""
+_PASSED_TEST_STEPS = 1.5
+"""Movement of the shaft, in encoder steps, that proves during a test that the encoder works."""
+_TEST_PAUSE_S = 0.5
+"""Shortest time in seconds between a passed test and the next one."""
+_TORQUE_RELATIVE_ERROR = 0.25
 """Relative error of the motor's torque that is not a fault."""
-_MOMENTUM = 0.5
-"""Fraction of the shaft's momentum that needs an explanation: inertias are known to a quarter."""
-_STOP_TICKS = 2
-_STOP_STEPS = 4.0
-"""Speed, in encoder steps a tick over `SPEED_TICKS`, from which a stop is examined."""
-_SCALE_STEPS = 3.0
-"""Encoder steps within `SPEED_TICKS` from which a speed counts for the scales."""
-_MOST_REPEATS = 6
-_REPEAT_TICKS = 32
-_REPEAT_STEPS = 3.5
-"""Least encoder steps before and after a repeated reading."""
+_MIN_MOMENTUM_FRACTION = 0.5
+"""Fraction of the shaft's momentum that the measured torques must explain when the shaft stops.
+
+Inertias are known to a quarter."""
+_STANDSTILL_TICKS_AT_STOP = 2
+"""Ticks without an encoder step after which a sudden stop is checked."""
+_MIN_STEPS_PER_TICK_AT_STOP = 4.0
+"""Speed before a stop from which the stop is checked, in encoder steps per tick."""
+_MIN_SCALE_STEPS = 3.0
+"""Smallest movement within `SPEED_TICKS` that the scale comparison uses, in encoder steps."""
+_MAX_REPEATS = 6
+"""Number of repeated readings within `_REPEAT_WINDOW_TICKS` that is a fault."""
+_REPEAT_WINDOW_TICKS = 32
+"""Ticks within which repeated readings are counted."""
+_MIN_REPEAT_STEPS = 3.5
+"""Smallest movement per tick before and after a repeated reading, in encoder steps."""
 
 
 class EncoderWatch:
-    """Compares the encoder with the torques on the shaft, in every tick with torque.
+    """Compares the encoder's readings with the torques on the shaft to detect a failed encoder.
+
+    It runs in every tick in which the motor may exert torque.
 
     Parameters
     ----------
     prediction
-        Coupling torque of the beam at the measured angle; None: the rig has no beam.
+        Prediction of the beam's coupling torque at the measured angle, or None if the rig has no
+        beam.
     rate_hz
-        Ticks a second.
+        Loop rate in ticks per second.
     resolution_rad
         Resolution of the encoder.
     inertia_kg_m2
@@ -80,16 +92,16 @@ class EncoderWatch:
     breakaway_nm
         Net torque that exceeds any friction of the shaft.
     delay_ticks
-        Ticks from a command to its torque.
+        Ticks from a torque command to the torque.
     scales
-        Comparison of the readings' scales; None: none.
+        Check of the scales of encoder and motor, or None to omit it.
 
     Attributes
     ----------
     test_nm
-        Torque to add to the next command, for a test of the encoder.
+        Torque to add to the next command to test the encoder.
     tests
-        Number of tests that the encoder has answered.
+        Number of tests that the encoder has passed.
     """
 
     __slots__ = (
@@ -98,23 +110,23 @@ class EncoderWatch:
         "_count",
         "_coupling_nm2",
         "_decay",
-        "_errors",
+        "_delayed_commands_nm",
+        "_error_sums",
+        "_half_period_ticks",
         "_inertia_kg_m2",
-        "_long",
+        "_irregular_ticks",
+        "_min_test_ticks",
+        "_next_test_tick",
         "_noise_nm",
-        "_pause",
-        "_pending",
         "_prediction",
         "_rate_hz",
-        "_repeats",
+        "_repeat_ticks",
         "_resolution_rad",
-        "_scales",
-        "_standing",
-        "_standstill",
+        "_scale_watch",
+        "_standstill_count",
         "_test_start_rad",
         "_test_step_nm",
-        "_torques",
-        "_uneven",
+        "_torque_history",
         "_windows",
         "test_nm",
         "tests",
@@ -132,26 +144,30 @@ class EncoderWatch:
         scales: ScaleWatch | None = None,
     ) -> None:
         self._prediction = prediction
-        self._scales = scales
+        self._scale_watch = scales
         self._rate_hz = rate_hz
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
         self._breakaway_nm = breakaway_nm
-        lengths = [max(_STOP_TICKS + 1, round(w * rate_hz)) for w in _WINDOWS_S]
-        # Within an encoder step the shaft may reverse, with at most `8 step/T²`.
+        lengths = [
+            max(_STANDSTILL_TICKS_AT_STOP + 1, round(w * rate_hz)) for w in _AVERAGING_WINDOWS_S
+        ]
+        # Within an encoder step the shaft may reverse, with an acceleration of at most `8 step/T²`.
         turn_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
         self._windows = [(ticks, turn_nm / ticks**2) for ticks in lengths]
-        self._standstill = max(lengths[0], round(_STANDSTILL_S * rate_hz))
+        self._min_test_ticks = max(lengths[0], round(_STANDSTILL_S * rate_hz))
         # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
-        self._long = inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
-        self._decay = 1.0 / (_VIBRATION_S * rate_hz)
-        longest = lengths[-1] + 2
-        # Cumulative sums, of which two give the mean over a window.
-        self._torques: deque[tuple[float, float]] = deque(maxlen=longest)
-        self._errors: deque[float] = deque(maxlen=longest)
+        self._half_period_ticks = (
+            inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
+        )
+        self._decay = 1.0 / (_RMS_TIME_CONSTANT_S * rate_hz)
+        history_ticks = lengths[-1] + 2
+        # Cumulative sums: the difference of two gives the mean over a window.
+        self._torque_history: deque[tuple[float, float]] = deque(maxlen=history_ticks)
+        self._error_sums: deque[float] = deque(maxlen=history_ticks)
         self._angles: deque[float] = deque(maxlen=SPEED_TICKS + WINDOW_TICKS + 1)
-        self._repeats: deque[int] = deque(maxlen=_MOST_REPEATS)
-        self._pending: deque[float] = deque(maxlen=delay_ticks)
+        self._repeat_ticks: deque[int] = deque(maxlen=_MAX_REPEATS)
+        self._delayed_commands_nm: deque[float] = deque(maxlen=delay_ticks)
         self.test_nm = 0.0
         self._test_step_nm = 0.0
         self._test_start_rad = 0.0
@@ -159,7 +175,7 @@ class EncoderWatch:
         self.reset(0.0, 0.0)
 
     def reset(self, angle_rad: float, noise_nm: float) -> None:
-        """Start from rest.
+        """Forget all readings and start again with the shaft at rest.
 
         Parameters
         ----------
@@ -171,92 +187,100 @@ class EncoderWatch:
         if self._prediction is not None:
             self._prediction.reset(angle_rad)
         self._noise_nm = noise_nm
-        for history in (self._torques, self._errors, self._angles, self._repeats, self._pending):
+        for history in (
+            self._torque_history,
+            self._error_sums,
+            self._angles,
+            self._repeat_ticks,
+            self._delayed_commands_nm,
+        ):
             history.clear()
-        self._torques.extend([(0.0, 0.0)] * 2)
-        self._errors.append(0.0)
+        self._torque_history.extend([(0.0, 0.0)] * 2)
+        self._error_sums.append(0.0)
         self._angles.append(angle_rad)
-        self._pending.extend([0.0] * (self._pending.maxlen or 0))
+        self._delayed_commands_nm.extend([0.0] * (self._delayed_commands_nm.maxlen or 0))
         self._coupling_nm2 = 0.0
-        if self._scales is not None:
-            self._scales.reset()
-        self._standing = self._count = self._pause = 0
-        self._uneven = 0
+        if self._scale_watch is not None:
+            self._scale_watch.reset()
+        self._standstill_count = self._count = self._next_test_tick = 0
+        self._irregular_ticks = 0
         self.tests = 0
         self._end_test()
 
     def step(
         self, angle_rad: float, coupling_nm: float, sent_nm: float, *, fresh: bool = True
     ) -> Violation | None:
-        """Compare the readings of a tick.
+        """Check the readings of one tick for signs of a failed encoder.
 
         Parameters
         ----------
         angle_rad, coupling_nm
-            Angle and coupling torque.
+            Measured angle and coupling torque.
         sent_nm
-            Torque that was commanded in the tick before.
+            Torque that was commanded in the previous tick.
         fresh
-            Whether both readings are of this tick.
+            Whether angle and coupling torque were measured in this tick.
 
         Returns
         -------
         Violation or None
-            Evidence of a failed encoder; `test_nm` is then to be ignored.
+            Evidence of a failed encoder, or None. With a violation `test_nm` must be ignored.
         """
         prediction = self._prediction
-        pending = self._pending
+        pending = self._delayed_commands_nm
         pending.append(sent_nm)
         motor_nm = pending[0]
         if not fresh:
             self.skip(1, angle_rad)
             return None
         error_nm = 0.0 if prediction is None else prediction.step(angle_rad, coupling_nm)
-        net, motor = self._torques[-1]
-        self._torques.append((net + motor_nm - coupling_nm, motor + motor_nm))
-        self._errors.append(self._errors[-1] + error_nm)
+        net_sum, motor_sum = self._torque_history[-1]
+        self._torque_history.append((net_sum + motor_nm - coupling_nm, motor_sum + motor_nm))
+        self._error_sums.append(self._error_sums[-1] + error_nm)
         self._coupling_nm2 += self._decay * (coupling_nm * coupling_nm - self._coupling_nm2)
         self._count += 1
         angles = self._angles
-        standing = self._standing
+        standstill_ticks = self._standstill_count
         moved_rad = angle_rad - angles[-1]
         angles.append(angle_rad)
-        if self._uneven:
-            self._uneven -= 1
-        elif self._count % WINDOW_TICKS == 0 and self._scales is not None:
-            violation = self._compare_scales(self._scales)
+        if self._irregular_ticks:
+            self._irregular_ticks -= 1
+        elif self._count % WINDOW_TICKS == 0 and self._scale_watch is not None:
+            violation = self._compare_scales(self._scale_watch)
             if violation is not None:
                 return violation
         if moved_rad:
-            self._standing = 0
-            if standing == 1 and not self._uneven:
+            self._standstill_count = 0
+            if standstill_ticks == 1 and not self._irregular_ticks:
                 return self._check_repeats(moved_rad)
             if self._test_step_nm:
-                answer_rad = _ANSWER_STEPS * self._resolution_rad
-                if abs(angle_rad - self._test_start_rad) > answer_rad:
+                passed_rad = _PASSED_TEST_STEPS * self._resolution_rad
+                if abs(angle_rad - self._test_start_rad) > passed_rad:
                     self._end_test()
                     self.tests += 1
-                    self._pause = self._count + round(_PAUSE_S * self._rate_hz)
+                    self._next_test_tick = self._count + round(_TEST_PAUSE_S * self._rate_hz)
                     return None
         else:
-            self._standing = standing = standing + 1
-            if standing == _STOP_TICKS and not self._uneven:
+            self._standstill_count = standstill_ticks = standstill_ticks + 1
+            if standstill_ticks == _STANDSTILL_TICKS_AT_STOP and not self._irregular_ticks:
                 violation = self._check_momentum()
                 if violation is not None:
                     return violation
-            violation = self._check_standstill(standing)
+            violation = self._check_standstill(standstill_ticks)
             if violation is not None:
                 return violation
         if self._test_step_nm:
             self.test_nm += self._test_step_nm
-            if abs(self.test_nm) > _RAMP_LIMIT * self._breakaway_nm:
+            if abs(self.test_nm) > _MAX_TEST_BREAKAWAY_TORQUES * self._breakaway_nm:
                 # The controller has cancelled the torque, since its reference moves the other way.
                 self._test_step_nm = -self._test_step_nm
                 self.test_nm = 0.0
         return None
 
     def skip(self, ticks: int, angle_rad: float) -> None:
-        """Step over ticks that were missed or have old readings; the torque was held.
+        """Advance over ticks that were missed or have only old readings.
+
+        The torque was constant in these ticks.
 
         Parameters
         ----------
@@ -265,135 +289,160 @@ class EncoderWatch:
         angle_rad
             Last angle that was read.
         """
-        net, motor = self._torques[-1]
-        error = self._errors[-1]
+        net_sum, motor_sum = self._torque_history[-1]
+        error_sum = self._error_sums[-1]
         for _ in range(ticks):
             if self._prediction is not None:
                 self._prediction.skip(angle_rad)
-            self._torques.append((net, motor))
-            self._errors.append(error)
-        self._standing = 0
-        self._uneven = self._angles.maxlen or 0
+            self._torque_history.append((net_sum, motor_sum))
+            self._error_sums.append(error_sum)
+        self._standstill_count = 0
+        self._irregular_ticks = self._angles.maxlen or 0
 
-    def _check_standstill(self, standing: int) -> Violation | None:
-        """Check a shaft that seems to be at rest for some ticks.
+    def _check_standstill(self, standstill_ticks: int) -> Violation | None:
+        """Check the torques on a shaft whose encoder has not moved for `standstill_ticks` ticks.
 
         The shortest window is checked in every tick, the others in turn.
         """
         windows = self._windows
-        ticks, turn_nm = windows[0]
-        if standing < ticks:
+        ticks, max_turning_nm = windows[0]
+        if standstill_ticks < ticks:
             return None
-        violation = self._check_net_torque(ticks, turn_nm)
-        ticks, turn_nm = windows[1 + self._count % (len(windows) - 1)]
-        if violation is not None or standing < ticks:
+        violation = self._check_net_torque(ticks, max_turning_nm)
+        ticks, max_turning_nm = windows[1 + self._count % (len(windows) - 1)]
+        if violation is not None or standstill_ticks < ticks:
             return violation
-        violation = self._check_net_torque(ticks, turn_nm)
+        violation = self._check_net_torque(ticks, max_turning_nm)
         if (
             violation is None
-            and standing >= self._standstill
+            and standstill_ticks >= self._min_test_ticks
             and not self._test_step_nm
-            and self._count >= self._pause
+            and self._count >= self._next_test_tick
         ):
             self._compare_coupling_torque(ticks)
         return violation
 
     def _check_momentum(self) -> Violation | None:
-        """Check a stop within `_STOP_TICKS` against the impulse that it requires."""
+        """Return a violation if the torques cannot have stopped the shaft so suddenly."""
         angles = self._angles
-        before = -1 - _STOP_TICKS
-        if len(angles) < SPEED_TICKS - before:
+        index_before_stop = -1 - _STANDSTILL_TICKS_AT_STOP
+        if len(angles) < SPEED_TICKS - index_before_stop:
             return None
-        moved_rad = angles[before] - angles[before - SPEED_TICKS]
-        if abs(moved_rad) < _STOP_STEPS * SPEED_TICKS * self._resolution_rad or not moved_rad:
+        moved_rad = angles[index_before_stop] - angles[index_before_stop - SPEED_TICKS]
+        if (
+            abs(moved_rad) < _MIN_STEPS_PER_TICK_AT_STOP * SPEED_TICKS * self._resolution_rad
+            or not moved_rad
+        ):
             return None
-        ticks = min(SPEED_TICKS + _STOP_TICKS, len(self._torques) - 2)
-        net, motor = self._over(ticks)
-        per_tick_nm = _MOMENTUM * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
-        needed_nm = per_tick_nm * self._rate_hz**2 / _STOP_TICKS
-        braking_nm = max(0.0, -net if moved_rad > 0 else net)
+        ticks = min(SPEED_TICKS + _STANDSTILL_TICKS_AT_STOP, len(self._torque_history) - 2)
+        net_sum, motor_sum = self._torque_sums(ticks)
+        per_tick_nm = _MIN_MOMENTUM_FRACTION * self._inertia_kg_m2 * abs(moved_rad) / SPEED_TICKS
+        needed_nm = per_tick_nm * self._rate_hz**2 / _STANDSTILL_TICKS_AT_STOP
+        braking_nm = max(0.0, -net_sum if moved_rad > 0 else net_sum)
         allowed_nm = (
             self._breakaway_nm
-            + ((1.0 + _TORQUE_ERROR) * braking_nm + _TORQUE_ERROR * abs(motor)) / _STOP_TICKS
+            + (
+                (1.0 + _TORQUE_RELATIVE_ERROR) * braking_nm
+                + _TORQUE_RELATIVE_ERROR * abs(motor_sum)
+            )
+            / _STANDSTILL_TICKS_AT_STOP
         )
         if needed_nm <= allowed_nm:
             return None
         return BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
 
-    def _check_net_torque(self, ticks: int, turn_nm: float) -> Violation | None:
-        """Check the mean net torque on a shaft that seems to be at rest."""
-        net, motor = self._over(ticks)
-        net_nm, coupling_nm = net / ticks, (motor - net) / ticks
-        limit_nm = self._breakaway_nm + _TORQUE_ERROR * abs(coupling_nm) + turn_nm
+    def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
+        """Return a violation if the mean net torque should have turned a shaft that seems at rest.
+
+        `max_turning_nm` is the torque that may turn the shaft within an encoder step in this time.
+        """
+        net_sum, motor_sum = self._torque_sums(ticks)
+        net_nm, coupling_nm = net_sum / ticks, (motor_sum - net_sum) / ticks
+        limit_nm = self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
         if -limit_nm < net_nm < limit_nm:
             return None
         return BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
 
     def _compare_coupling_torque(self, ticks: int) -> None:
-        """Start a test of the encoder if the beam pulls at a shaft that seems to be at rest."""
-        errors, noise_nm = self._errors, self._noise_nm
+        """Start a test of the encoder if the beam's torque differs from its prediction."""
+        errors, noise_nm = self._error_sums, self._noise_nm
         error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
-        level_nm = max(
-            _LEAST_PULL * self._breakaway_nm,
-            _SIGNIFICANT * noise_nm / sqrt(ticks),
-            _MODEL_ERROR * vibration_nm * min(1.0, self._long / ticks),
+        significant_nm = max(
+            _MIN_SIGNIFICANT_FRACTION * self._breakaway_nm,
+            _SIGNIFICANT_STDS * noise_nm / sqrt(ticks),
+            _MODEL_ERROR_FRACTION * vibration_nm * min(1.0, self._half_period_ticks / ticks),
         )
-        if -level_nm < error_nm < level_nm:
+        if -significant_nm < error_nm < significant_nm:
             return
-        # Against the pull, which brakes a runaway shaft; or in the shorter direction.
-        net_nm = self._over(ticks)[0] / ticks
-        shorter = abs(net_nm) > 0.5 * self._breakaway_nm
-        ramp_nm = self._breakaway_nm / (_RAMP_S * self._rate_hz)
-        self._test_step_nm = copysign(ramp_nm, net_nm if shorter else -error_nm)
+        # The test torque acts against the beam's torque, which brakes a runaway shaft, or in the
+        # direction in which the breakaway torque is reached sooner.
+        net_nm = self._torque_sums(ticks)[0] / ticks
+        near_breakaway = abs(net_nm) > 0.5 * self._breakaway_nm
+        ramp_nm = self._breakaway_nm / (_TEST_RAMP_S * self._rate_hz)
+        self._test_step_nm = copysign(ramp_nm, net_nm if near_breakaway else -error_nm)
         self._test_start_rad = self._angles[-1]
 
     def _check_repeats(self, moved_rad: float) -> Violation | None:
-        """Check a tick without movement between two in which the shaft moved the same way."""
+        """Return a violation if the encoder repeats readings too often while the shaft moves.
+
+        The last tick showed no movement between two ticks with movement in the same direction.
+        """
         angles = self._angles
         if len(angles) < SPEED_TICKS:
             return None
-        before_rad = angles[-3] - angles[-4]
-        least_rad = _REPEAT_STEPS * self._resolution_rad
-        if moved_rad * before_rad <= 0.0 or min(abs(moved_rad), abs(before_rad)) < least_rad:
+        previous_movement_rad = angles[-3] - angles[-4]
+        least_rad = _MIN_REPEAT_STEPS * self._resolution_rad
+        if (
+            moved_rad * previous_movement_rad <= 0.0
+            or min(abs(moved_rad), abs(previous_movement_rad)) < least_rad
+        ):
             return None
-        repeats = self._repeats
+        repeats = self._repeat_ticks
         repeats.append(self._count)
-        if len(repeats) < _MOST_REPEATS or self._count - repeats[0] >= _REPEAT_TICKS:
+        if len(repeats) < _MAX_REPEATS or self._count - repeats[0] >= _REPEAT_WINDOW_TICKS:
             return None
-        return BY_NAME["repeated angle"].violated(len(repeats), _MOST_REPEATS - 1)
+        return BY_NAME["repeated angle"].violated(len(repeats), _MAX_REPEATS - 1)
 
     def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
-        """Compare the acceleration over the last `WINDOW_TICKS` with the net torque."""
-        angles, torques = self._angles, self._torques
+        """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
+        angles, torques = self._angles, self._torque_history
         n = WINDOW_TICKS
         if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 3:
             return None
-        now_rad = angles[-1] - angles[-1 - SPEED_TICKS]
-        before_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
-        least_rad = _SCALE_STEPS * self._resolution_rad
-        if now_rad * before_rad <= 0.0 or min(abs(now_rad), abs(before_rad)) < least_rad:
+        recent_movement_rad = angles[-1] - angles[-1 - SPEED_TICKS]
+        previous_movement_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
+        least_rad = _MIN_SCALE_STEPS * self._resolution_rad
+        if (
+            recent_movement_rad * previous_movement_rad <= 0.0
+            or min(abs(recent_movement_rad), abs(previous_movement_rad)) < least_rad
+        ):
             return None
-        # Weighting like the difference of two mean speeds gives the torque of that acceleration.
-        net = motor = 0.0
+        # Weighted like the difference of two mean speeds, the torques match the acceleration.
+        net_nm = motor_nm = 0.0
         for j in range(1, SPEED_TICKS + 1):
-            for last in (torques[-1 - j], torques[-2 - j]):
-                net, motor = net + last[0], motor + last[1]
-            for first in (torques[-1 - j - n], torques[-2 - j - n]):
-                net, motor = net - first[0], motor - first[1]
-        net, motor = net / (2 * SPEED_TICKS * n), motor / (2 * SPEED_TICKS * n)
-        acceleration_rad_s2 = (now_rad - before_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
-        speed_rad_s = (now_rad + before_rad) * self._rate_hz / (2 * SPEED_TICKS)
-        return scales.add(acceleration_rad_s2, speed_rad_s, motor - net, net)
+            for window_end in (torques[-1 - j], torques[-2 - j]):
+                net_nm, motor_nm = net_nm + window_end[0], motor_nm + window_end[1]
+            for window_start in (torques[-1 - j - n], torques[-2 - j - n]):
+                net_nm, motor_nm = net_nm - window_start[0], motor_nm - window_start[1]
+        net_nm, motor_nm = net_nm / (2 * SPEED_TICKS * n), motor_nm / (2 * SPEED_TICKS * n)
+        acceleration_rad_s2 = (
+            (recent_movement_rad - previous_movement_rad) * self._rate_hz**2 / (SPEED_TICKS * n)
+        )
+        speed_rad_s = (
+            (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
+        )
+        return scales.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
 
-    def _over(self, ticks: int) -> tuple[float, float]:
-        """Return the sums of net torque and motor torque over the ticks that the angle shows.
+    def _torque_sums(self, ticks: int) -> tuple[float, float]:
+        """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.
 
-        The torque of this tick turns the shaft from now on.
+        The present tick is excluded: its torque turns the shaft from now on.
         """
-        net, motor = self._torques[-2]
-        net_before, motor_before = self._torques[-2 - ticks]
-        return net - net_before, motor - motor_before
+        net_sum, motor_sum = self._torque_history[-2]
+        earlier_net_sum, earlier_motor_sum = self._torque_history[-2 - ticks]
+        return net_sum - earlier_net_sum, motor_sum - earlier_motor_sum
 
     def _end_test(self) -> None:
+        """Stop the test of the encoder and remove its torque."""
         self.test_nm = self._test_step_nm = 0.0

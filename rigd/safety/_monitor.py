@@ -1,4 +1,4 @@
-"""Limit monitor: the checks of the loop in every tick, and warnings near a limit."""
+"""Limit monitor: the loop's checks of every tick against the rig's limits, with warnings."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -7,29 +7,36 @@ from math import exp, inf, isfinite, sqrt
 from rigd.safety.limits import BY_NAME, OVERLOADED, Limits, Violation
 
 SLOW_CHECK_TICKS = 64
-"""Ticks between two checks of slowly changing quantities."""
+"""Number of ticks from one check of slowly changing quantities to the next."""
 
 FRACTION_WINDOW_S = 10.0
-"""Missed ticks and old readings are counted over at least this time, so that one early burst is not
-a fault."""
+"""Shortest time in seconds that the fractions of missed ticks and old readings refer to.
 
-REARM_S = 1.0
-"""Time for which a channel has to stay clear of its limit before the next warning."""
+With a shorter time one early burst would be a fault."""
 
-_UNSURE_TICKS = 3
-"""After missed ticks the next latches are irregular, and do not show a jump of the angle."""
+WARNING_REARM_S = 1.0
+"""Time in seconds for which a channel must be below its warning level before the next warning."""
 
-_BLAMED_S = 0.005
-"""A stall of the loop this long explains a limit that is exceeded right after it."""
+_NO_JUMP_CHECK_TICKS = 3
+"""Number of ticks after missed ticks in which no jump of the angle is checked.
+
+The encoder is latched at irregular times then."""
+
+_MIN_STALL_S = 0.005
+"""Shortest stall of the loop in seconds that is reported as the cause of a later violation."""
 
 _AXES = ("fx", "fy", "fz", "tx", "ty", "tz")
-_FORCES = 3
-_Reading = tuple[str, str, str, float, float, float]
-"""Name of the interlock, channel, unit, value, limit, level of the warning."""
+"""Names of the force-torque sensor's axes in messages."""
+_FORCE_AXES = 3
+"""Number of axes that measure a force; they come before the torques."""
+_CheckedValue = tuple[str, str, str, float, float, float]
+"""Checked value: name of the interlock, channel, unit, value, limit and warning level.
+
+If channel or unit is empty, that of the interlock applies."""
 
 
 class LimitWatch:
-    """Checks of every tick, and of missed ticks.
+    """Compares the readings of every tick with the limits of the rig.
 
     Without a value near its limit a tick costs a few comparisons; only if these fail are details
     computed. A reading that is not a number fails every comparison.
@@ -37,11 +44,11 @@ class LimitWatch:
     Parameters
     ----------
     limits
-        The limits of the profile.
+        Limits of the rig's profile.
     sensor_range
-        Range of fx, fy, fz (N), tx, ty, tz (N·m).
+        Measuring range of the sensor's axes fx, fy, fz (N), tx, ty, tz (N·m).
     rate_hz
-        Ticks a second.
+        Loop rate in ticks per second.
     resolution_rad
         Resolution of the encoder.
     peak_torque_nm
@@ -49,50 +56,50 @@ class LimitWatch:
     continuous_torque_nm, thermal_time_constant_s
         Continuous (rms) torque rating of the motor and its thermal time constant.
     tare_warning_nm
-        Drift of the coupling torque's zero from which there is a warning.
+        Drift of the coupling torque's zero that causes a warning.
 
     Attributes
     ----------
     warning
-        Whether a value is near its limit, as of the last tick.
+        Whether a value was near its limit in the last tick.
     tared_nm
-        Coupling torque of the last tare, to which the next one is compared; None: none since the
-        rig was connected.
+        Coupling torque at the last tare, with which the next tare is compared, or None if there was
+        no tare since the rig was connected.
     """
 
     __slots__ = (
         "_angle_warning",
-        "_before_that_rad",
         "_continuous_nm",
-        "_elapsed",
+        "_elapsed_ticks",
         "_error_warning",
         "_fraction_near",
         "_fraction_window",
         "_heat_nm2",
         "_jump_rad",
         "_jump_warning",
+        "_last_missed_check",
         "_last_slow_check_ns",
+        "_last_warnings",
         "_limits",
-        "_missed_at_check",
-        "_missed_lately",
         "_notices",
         "_peak_nm",
         "_per_tick2_rad",
         "_previous_angle_rad",
-        "_previous_elapsed",
+        "_previous_elapsed_ticks",
         "_previous_moved_rad",
         "_rate_hz",
         "_rearm_checks",
-        "_saturated",
+        "_recently_missed",
+        "_saturated_ticks",
+        "_second_last_moved_rad",
         "_slow_checks",
-        "_slowly_near",
+        "_slow_value_near",
         "_stale_angles",
         "_stale_wrenches",
         "_step_warning",
         "_tare_warning_nm",
+        "_ticks_without_jump_check",
         "_time_constant_s",
-        "_unsure",
-        "_warned",
         "_wrench_limits",
         "_wrench_warnings",
         "tared_nm",
@@ -117,28 +124,35 @@ class LimitWatch:
         self._continuous_nm = continuous_torque_nm
         self._time_constant_s = thermal_time_constant_s
         self._tare_warning_nm = tare_warning_nm
-        self._angle_warning = _part("angle") * limits.angle_rad
-        self._error_warning = _part("tracking error") * limits.tracking_error_rad
-        self._step_warning = _part("velocity") * limits.velocity_rad_s / rate_hz
+        self._angle_warning = _warning_fraction("angle") * limits.angle_rad
+        self._error_warning = _warning_fraction("tracking error") * limits.tracking_error_rad
+        self._step_warning = _warning_fraction("velocity") * limits.velocity_rad_s / rate_hz
         self._per_tick2_rad = limits.acceleration_rad_s2 / rate_hz**2
         # A difference of two movements contains four readings, each wrong by half a step.
         self._jump_rad = 2.0 * resolution_rad
-        self._jump_warning = _part("encoder jump") * (self._per_tick2_rad + self._jump_rad)
+        self._jump_warning = _warning_fraction("encoder jump") * (
+            self._per_tick2_rad + self._jump_rad
+        )
         self._wrench_limits = tuple(limits.sensor_range_percent / 100 * r for r in sensor_range)
-        self._wrench_warnings = tuple(_part("wrench range") * w for w in self._wrench_limits)
+        self._wrench_warnings = tuple(
+            _warning_fraction("wrench range") * w for w in self._wrench_limits
+        )
         self._fraction_window = FRACTION_WINDOW_S * rate_hz
-        self._rearm_checks = max(1, round(REARM_S * rate_hz / SLOW_CHECK_TICKS))
+        self._rearm_checks = max(1, round(WARNING_REARM_S * rate_hz / SLOW_CHECK_TICKS))
         self._heat_nm2 = 0.0
         self._last_slow_check_ns: int | None = None
         self._slow_checks = 0
-        self._warned: dict[str, int] = {}
+        self._last_warnings: dict[str, int] = {}
         self._notices: list[str] = []
         self.tared_nm: float | None = None
         self.reset(0.0)
 
     @property
     def heat_nm2(self) -> float:
-        """Mean square of the motor's torque over its thermal time constant, at the last check."""
+        """Mean square of the motor's torque in (N·m)², a measure of its temperature.
+
+        It is averaged over the motor's thermal time constant, up to the last slow check.
+        """
         return self._heat_nm2
 
     @heat_nm2.setter
@@ -146,37 +160,40 @@ class LimitWatch:
         self._heat_nm2 = heat_nm2
 
     def reset(self, angle_rad: float) -> None:
-        """Start from rest at ``angle_rad``; the motor's temperature is unchanged."""
+        """Forget all readings and start again with the shaft at rest at ``angle_rad``.
+
+        The estimate of the motor's temperature is retained.
+        """
         self._previous_angle_rad = angle_rad
-        self._previous_moved_rad = self._before_that_rad = 0.0
-        self._previous_elapsed = self._elapsed = 1
+        self._previous_moved_rad = self._second_last_moved_rad = 0.0
+        self._previous_elapsed_ticks = self._elapsed_ticks = 1
         self._stale_angles = 0
         self._stale_wrenches = 0
-        self._saturated = 0
-        self._unsure = 0
-        self._missed_lately = self._missed_at_check = 0
+        self._saturated_ticks = 0
+        self._ticks_without_jump_check = 0
+        self._recently_missed = self._last_missed_check = 0
         self._fraction_near = False
-        self._slowly_near = False
+        self._slow_value_near = False
         self.warning = False
 
     def skip(self, missed: int) -> None:
-        """Pass the number of missed ticks to the next check, which takes the speed over them."""
-        self._elapsed += missed
+        """Register missed ticks, over which the next check computes the speed."""
+        self._elapsed_ticks += missed
         if missed:
-            self._missed_lately = missed + (self._missed_lately if self.after_missed else 0)
-            self._missed_at_check = self._slow_checks
+            self._recently_missed = missed + (self._recently_missed if self.after_missed else 0)
+            self._last_missed_check = self._slow_checks
 
     @property
     def after_missed(self) -> str:
-        """Return how many ticks were missed just before, in words; or nothing.
+        """Sentence for the operator on ticks that were missed just before, or an empty string.
 
-        Just before means within the last 64 to 128 ticks.
+        It counts ticks missed within the last 64 to 128 ticks.
         """
-        missed = self._missed_lately
-        if not missed or self._slow_checks - self._missed_at_check > 1:
+        missed = self._recently_missed
+        if not missed or self._slow_checks - self._last_missed_check > 1:
             return ""
         ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
-        if missed < _BLAMED_S * self._rate_hz:
+        if missed < _MIN_STALL_S * self._rate_hz:
             return f"It came after {ticks}."
         return f"It came after {ticks}. {OVERLOADED}"
 
@@ -188,23 +205,24 @@ class LimitWatch:
         *,
         angle_stale: bool = False,
     ) -> Violation | None:
-        """Check one tick's readings before their use.
+        """Check the readings of one tick before the controller uses them.
 
         Parameters
         ----------
         reference_rad, angle_rad
-            Relative to the rig's zero.
+            Reference and measured angle, relative to the rig's zero.
         wrench
-            fx, fy, fz (N), tx, ty, tz (N·m).
+            Force-torque reading fx, fy, fz (N), tx, ty, tz (N·m).
         angle_stale
-            Whether the angle is an old one, which gives no speed.
+            Whether the angle is not of this tick; it then gives no speed.
 
         Returns
         -------
         Violation or None
-            The worst violation; `warning` is set if a value is near its limit.
+            Violation furthest beyond its limit, or None. `warning` is set if a value is near its
+            limit.
         """
-        moved, before = angle_rad - self._previous_angle_rad, self._previous_moved_rad
+        moved, previous_moved_rad = angle_rad - self._previous_angle_rad, self._previous_moved_rad
         a, e, v, j = (
             self._angle_warning,
             self._error_warning,
@@ -214,11 +232,11 @@ class LimitWatch:
         w0, w1, w2, w3, w4, w5 = self._wrench_warnings
         fx, fy, fz, tx, ty, tz = wrench
         if (
-            self._elapsed == 1
+            self._elapsed_ticks == 1
             and -a < angle_rad < a
             and -e < reference_rad - angle_rad < e
             and -v < moved < v
-            and -j < moved - before < j
+            and -j < moved - previous_moved_rad < j
             and -w0 < fx < w0
             and -w1 < fy < w1
             and -w2 < fz < w2
@@ -228,79 +246,92 @@ class LimitWatch:
             and not angle_stale
         ):
             self._previous_angle_rad = angle_rad
-            self._before_that_rad = before
+            self._second_last_moved_rad = previous_moved_rad
             self._previous_moved_rad = moved
-            self._previous_elapsed = 1
-            self._unsure = 0
-            self.warning = self._slowly_near
+            self._previous_elapsed_ticks = 1
+            self._ticks_without_jump_check = 0
+            self.warning = self._slow_value_near
             return None
-        return self._check_closely(reference_rad, angle_rad, wrench, angle_stale)
+        return self._check_in_detail(reference_rad, angle_rad, wrench, angle_stale)
 
-    def _check_closely(
+    def _check_in_detail(
         self,
         reference_rad: float,
         angle_rad: float,
         wrench: Sequence[float],
         angle_stale: bool,
     ) -> Violation | None:
-        self.warning = self._slowly_near or self._fraction_near
+        """Return the worst violation in a tick in which a value may be near or beyond its limit."""
+        self.warning = self._slow_value_near or self._fraction_near
         self._fraction_near = False
         limits = self._limits
         error_rad = reference_rad - angle_rad
-        readings: list[_Reading] = [
+        checked_values: list[_CheckedValue] = [
             ("angle", "", "", angle_rad, limits.angle_rad, self._angle_warning),
             ("tracking error", "", "", error_rad, limits.tracking_error_rad, self._error_warning),
         ]
-        readings += (
-            ("wrench range", f"sensor's {axis}", "N" if i < _FORCES else "N·m", value, limit, near)
-            for i, (axis, value, limit, near) in enumerate(
+        checked_values += (
+            (
+                "wrench range",
+                f"sensor's {axis}",
+                "N" if i < _FORCE_AXES else "N·m",
+                value,
+                limit,
+                warning_level,
+            )
+            for i, (axis, value, limit, warning_level) in enumerate(
                 zip(_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
             )
         )
         if angle_stale:
             # The movement of the next new angle includes this tick.
-            self._elapsed += 1
+            self._elapsed_ticks += 1
         else:
-            readings += self._movement(angle_rad)
-        return self._assess(readings)
+            checked_values += self._speed_and_jump(angle_rad)
+        return self._assess_values(checked_values)
 
-    def _movement(self, angle_rad: float) -> list[_Reading]:
-        """Return speed and jump over the ticks since the last new angle; this is the new one."""
-        elapsed, before_rad = self._elapsed, self._previous_moved_rad
+    def _speed_and_jump(self, angle_rad: float) -> list[_CheckedValue]:
+        """Return the shaft's speed, and the jump of the angle, since the last new angle.
+
+        `angle_rad` is the new angle, with which the next one is compared.
+        """
+        elapsed, before_rad = self._elapsed_ticks, self._previous_moved_rad
         moved_rad = angle_rad - self._previous_angle_rad
         speed_rad_s = moved_rad * self._rate_hz / elapsed
-        # A latch may be late by most of a period, and the next one is not: the shaft then moves for
-        # that much longer or shorter.
-        possible_rad = (
-            self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed) / 2
+        # One latch of the encoder may be late by most of a period and the next one not: the time
+        # between them is longer or shorter by that much.
+        max_jump_rad = (
+            self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed_ticks) / 2
             + self._jump_rad
             + abs(before_rad)
-            + abs(self._before_that_rad)
+            + abs(self._second_last_moved_rad)
         )
         jump_rad = moved_rad - elapsed * before_rad
         if elapsed > 1:
-            self._unsure = _UNSURE_TICKS
-        elif self._unsure:
-            self._unsure -= 1
+            self._ticks_without_jump_check = _NO_JUMP_CHECK_TICKS
+        elif self._ticks_without_jump_check:
+            self._ticks_without_jump_check -= 1
         self._previous_angle_rad = angle_rad
-        self._before_that_rad, self._previous_moved_rad = before_rad, moved_rad / elapsed
-        self._previous_elapsed, self._elapsed = elapsed, 1
+        self._second_last_moved_rad, self._previous_moved_rad = before_rad, moved_rad / elapsed
+        self._previous_elapsed_ticks, self._elapsed_ticks = elapsed, 1
         limit_rad_s = self._limits.velocity_rad_s
-        near_rad_s = _part("velocity") * limit_rad_s
-        readings: list[_Reading] = [("velocity", "", "", speed_rad_s, limit_rad_s, near_rad_s)]
-        if not self._unsure:
-            near_rad = _part("encoder jump") * possible_rad
-            readings.append(("encoder jump", "", "", jump_rad, possible_rad, near_rad))
-        return readings
+        near_rad_s = _warning_fraction("velocity") * limit_rad_s
+        checked_values: list[_CheckedValue] = [
+            ("velocity", "", "", speed_rad_s, limit_rad_s, near_rad_s)
+        ]
+        if not self._ticks_without_jump_check:
+            near_rad = _warning_fraction("encoder jump") * max_jump_rad
+            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, near_rad))
+        return checked_values
 
     def check_stale(
         self, angle_stale: bool, wrench_stale: bool, saturated: bool = False
     ) -> Violation | None:
-        """Check the time for which readings are missing or at the end of the sensor's range.
+        """Check how long readings are missing, or at the end of the sensor's range.
 
-        Called in every tick with such a reading, and in the next. A controller that uses an old
-        angle turns the motor without limit, and neither speed nor tracking error would show it.
-
+        It is called in every tick with such a reading, and in the next one. A controller that uses
+        an old angle turns the motor without limit, and neither speed nor tracking error would show
+        it.
 
         Parameters
         ----------
@@ -311,71 +342,85 @@ class LimitWatch:
         """
         self._stale_angles = self._stale_angles + 1 if angle_stale else 0
         self._stale_wrenches = self._stale_wrenches + 1 if wrench_stale else 0
-        self._saturated = self._saturated + 1 if saturated else 0
-        if self._fraction_near:  # by a wrench alone, which the angle's check does not include
+        self._saturated_ticks = self._saturated_ticks + 1 if saturated else 0
+        if self._fraction_near:  # set by an old wrench, for which `_check_in_detail` is not called
             self._fraction_near, self.warning = False, True
         limits = self._limits
-        return self._assess(
+        return self._assess_values(
             (
-                _reading("stale angle", self._stale_angles, limits.stale_ticks_in_a_row),
-                _reading("stale wrench", self._stale_wrenches, limits.stale_ticks_in_a_row),
-                _reading("gauge saturation", self._saturated, limits.saturated_ticks_in_a_row),
+                _checked_value("stale angle", self._stale_angles, limits.stale_ticks_in_a_row),
+                _checked_value("stale wrench", self._stale_wrenches, limits.stale_ticks_in_a_row),
+                _checked_value(
+                    "gauge saturation", self._saturated_ticks, limits.saturated_ticks_in_a_row
+                ),
             )
         )
 
     def check_torque(self, requested_nm: float) -> Violation | None:
-        """Check the controller's request before it is limited and commanded."""
+        """Check the torque that the controller requests, before it is limited and commanded."""
         limit_nm = self._limits.torque_command_nm
-        return self._assess((("torque command", "", "", requested_nm, limit_nm, self._peak_nm),))
+        return self._assess_values(
+            (("torque command", "", "", requested_nm, limit_nm, self._peak_nm),)
+        )
 
     def check_missed(self, missed: int, missed_so_far: int, scheduled: int) -> Violation | None:
-        """Check missed ticks; the next speed is then taken over them too.
+        """Check the number and the percentage of missed ticks.
+
+        The next speed is computed over the missed ticks, too.
 
         Parameters
         ----------
         missed
-            Ticks missed in a row just now.
+            Number of consecutive ticks missed just now.
         missed_so_far, scheduled
-            Ticks missed and ticks scheduled since the record's first.
+            Numbers of missed and of scheduled ticks since the record's first.
         """
         self.skip(missed)
         limits = self._limits
         return self._assess_fraction(
-            _reading("missed ticks", missed, limits.missed_ticks_in_a_row),
-            _reading(
-                "missed share", self._percent(missed_so_far, scheduled), limits.missed_percent
+            _checked_value("missed ticks", missed, limits.missed_ticks_in_a_row),
+            _checked_value(
+                "missed share", self._percentage(missed_so_far, scheduled), limits.missed_percent
             ),
         )
 
     def check_stale_fraction(
         self, stale_angles: int, stale_wrenches: int, scheduled: int
     ) -> Violation | None:
-        """Check the fraction of missing readings, after a tick with one.
+        """Check the percentages of ticks without a new angle and without a new wrench.
 
-        Their runs may be short: a drive that answers every third SYNC has none of more than two
-        ticks, yet the loop uses old angles and the record is useless.
+        It is called after a tick with an old reading. The runs of old readings may be short: a
+        drive that answers every third SYNC never misses more than two in a row, yet the loop uses
+        old angles and the record is useless.
 
         Parameters
         ----------
         stale_angles, stale_wrenches, scheduled
-            Ticks with an old angle, ticks with an old wrench, and ticks scheduled, since the
-            record's first.
+            Numbers of ticks with an old angle, of ticks with an old wrench, and of scheduled ticks,
+            since the record's first.
         """
         limit = self._limits.stale_percent
         return self._assess_fraction(
-            _reading("stale angle share", self._percent(stale_angles, scheduled), limit),
-            _reading("stale wrench share", self._percent(stale_wrenches, scheduled), limit),
+            _checked_value("stale angle share", self._percentage(stale_angles, scheduled), limit),
+            _checked_value(
+                "stale wrench share", self._percentage(stale_wrenches, scheduled), limit
+            ),
         )
 
-    def _percent(self, ticks: int, scheduled: int) -> float:
+    def _percentage(self, ticks: int, scheduled: int) -> float:
+        """Return the percentage of ticks in the scheduled ones, of at least ten seconds."""
         return 100.0 * ticks / max(scheduled, self._fraction_window)
 
-    def _assess_fraction(self, *readings: _Reading) -> Violation | None:
-        before, self.warning = self.warning, False
-        violation = self._assess(readings)
+    def _assess_fraction(self, *checked_values: _CheckedValue) -> Violation | None:
+        """Return the worst violation by a percentage.
+
+        The next sample is flagged if a percentage is near its limit.
+        """
+        previous_warning, self.warning = self.warning, False
+        violation = self._assess_values(checked_values)
         # The next sample is flagged.
         self._fraction_near = self._fraction_near or self.warning
-        self.warning = before or self.warning
+        self.warning = previous_warning or self.warning
         return violation
 
     def check_slow(
@@ -385,12 +430,14 @@ class LimitWatch:
         recorder_lag_s: float = 0.0,
         disk_free_mb: float = inf,
     ) -> Violation | None:
-        """Check slowly changing quantities; called every `SLOW_CHECK_TICKS` ticks, at rest too.
+        """Check the motor's load, the recorder's lag and the free disk space.
+
+        It is called every `SLOW_CHECK_TICKS` ticks, also at rest.
 
         Parameters
         ----------
         due_ns
-            Time at which the present tick was due.
+            Scheduled time of the present tick.
         torque_squares_nm2
             Sum of the squared torques over the ticks since the last call.
         recorder_lag_s
@@ -399,9 +446,11 @@ class LimitWatch:
             Free space on the disk that holds the session file.
         """
         self._slow_checks += 1
-        if self._warned:
-            gone = self._slow_checks - self._rearm_checks
-            self._warned = {name: last for name, last in self._warned.items() if last >= gone}
+        if self._last_warnings:
+            oldest_check = self._slow_checks - self._rearm_checks
+            self._last_warnings = {
+                name: last for name, last in self._last_warnings.items() if last >= oldest_check
+            }
         elapsed_s = (
             0.0 if self._last_slow_check_ns is None else (due_ns - self._last_slow_check_ns) * 1e-9
         )
@@ -409,79 +458,86 @@ class LimitWatch:
         self._heat_nm2 = self._heat_nm2 * exp(
             -max(0.0, elapsed_s) / self._time_constant_s
         ) + torque_squares_nm2 / (self._rate_hz * self._time_constant_s)
-        before, self.warning = self.warning, False
-        violation = self._assess(
+        previous_warning, self.warning = self.warning, False
+        violation = self._assess_values(
             (
-                _reading("i²t", sqrt(self._heat_nm2), self._continuous_nm),
-                _reading("recorder lag", recorder_lag_s, self._limits.recorder_lag_s),
-                _reading("disk space", disk_free_mb, self._limits.disk_free_mb),
+                _checked_value("i²t", sqrt(self._heat_nm2), self._continuous_nm),
+                _checked_value("recorder lag", recorder_lag_s, self._limits.recorder_lag_s),
+                _checked_value("disk space", disk_free_mb, self._limits.disk_free_mb),
             )
         )
-        self._slowly_near, self.warning = self.warning, before or self.warning
+        self._slow_value_near, self.warning = self.warning, previous_warning or self.warning
         return violation
 
     def check_tare(self, drift_nm: float) -> Violation | None:
-        """Check the change of the coupling torque's zero since the previous tare."""
+        """Return a violation if the coupling torque's zero drifted too far since the last tare."""
         limit_nm = self._limits.tare_drift_nm
-        return self._assess((("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),))
+        return self._assess_values(
+            (("tare drift", "", "", drift_nm, limit_nm, self._tare_warning_nm),)
+        )
 
     def take_notices(self) -> list[str]:
-        """Return the channels that came near their limits since the last call, in words.
+        """Return and clear the warnings on channels that came near their limits.
 
         A channel that stays near its limit, or returns to it repeatedly, is reported once.
         """
         notices, self._notices = self._notices, []
         return notices
 
-    def _assess(self, readings: Sequence[_Reading]) -> Violation | None:
-        """Return the reading furthest beyond its limit; one that is not a number is furthest."""
+    def _assess_values(self, checked_values: Sequence[_CheckedValue]) -> Violation | None:
+        """Return the violation furthest beyond its limit, and register warnings.
+
+        A value that is not a number counts as infinitely far beyond its limit.
+        """
         worst, worst_ratio = None, 1.0
-        near = []
-        for reading in readings:
-            name, _, _, value, limit, warning = reading
+        near_limit = []
+        for checked in checked_values:
+            name, _, _, value, limit, warning = checked
             if BY_NAME[name].below:
                 ratio, is_near = limit / value if value > 0.0 else inf, value <= warning
             else:
                 size = abs(value) if isfinite(value) else inf
                 ratio, is_near = size / limit, size >= warning
             if ratio > worst_ratio:
-                worst, worst_ratio = reading, ratio
+                worst, worst_ratio = checked, ratio
             elif is_near:
-                near.append(reading)
+                near_limit.append(checked)
         if worst is not None:
             self.warning = True
-            return self._left(worst)
-        for reading in near:
+            return self._violation_with_cause(worst)
+        for checked in near_limit:
             self.warning = True
-            channel = reading[1] or reading[0]
-            if channel not in self._warned:
-                self._notices.append(str(_violation(reading, warns=True)))
-            self._warned[channel] = self._slow_checks
+            channel = checked[1] or checked[0]
+            if channel not in self._last_warnings:
+                self._notices.append(str(_make_violation(checked, warns=True)))
+            self._last_warnings[channel] = self._slow_checks
         return None
 
-    def _left(self, reading: _Reading) -> Violation:
-        """Return the violation, with the computer's stall as its cause if there was one."""
-        violation, missed = _violation(reading, warns=False), self.after_missed
-        if not missed or not BY_NAME[reading[0]].follows_missed_ticks:
+    def _violation_with_cause(self, checked: _CheckedValue) -> Violation:
+        """Return the violation of a limit, with advice that mentions ticks missed just before."""
+        violation, missed = _make_violation(checked, warns=False), self.after_missed
+        if not missed or not BY_NAME[checked[0]].follows_missed_ticks:
             return violation
         if OVERLOADED not in missed:
             missed = f"{missed} {violation.remedy}"
         return replace(violation, remedy=missed)
 
 
-def _part(name: str) -> float:
-    """Return the fraction of its limit at which an interlock begins to warn."""
-    part = BY_NAME[name].warning
-    assert isinstance(part, float)
-    return part
+def _warning_fraction(name: str) -> float:
+    """Return the warning level of an interlock as a fraction of its limit."""
+    fraction = BY_NAME[name].warning
+    assert isinstance(fraction, float)
+    return fraction
 
 
-def _reading(name: str, value: float, limit: float) -> _Reading:
-    return name, "", "", value, limit, _part(name) * limit
+def _checked_value(name: str, value: float, limit: float) -> _CheckedValue:
+    """Return a value to check, with the channel, unit and warning level of its interlock."""
+    return name, "", "", value, limit, _warning_fraction(name) * limit
 
 
-def _violation(reading: _Reading, *, warns: bool) -> Violation:
-    name, channel, unit, value, limit, warning = reading
+def _make_violation(checked: _CheckedValue, *, warns: bool) -> Violation:
+    """Return a reading's violation of its limit, or with `warns` of its warning level."""
+    name, channel, unit, value, limit, warning = checked
     row = BY_NAME[name]
     return Violation(
         channel or row.channel,

@@ -17,36 +17,45 @@ import numpy as np
 from rigd.safety.limits import BY_NAME, Violation
 
 WINDOW_TICKS = 8
-"""Ticks from one mean speed to the next."""
+"""Length of a window in ticks, from the first mean speed to the second one.
+
+The difference of the two gives the acceleration."""
 SPEED_TICKS = 4
-"""Ticks over which a mean speed is computed."""
-_TORQUE_ERROR = 0.25
-_MEMORY = 0.995
-"""Weight of a window relative to the next one."""
-_LEAST_WINDOWS = 60.0
-_NOISE_NM = 2e-3
-"""Least standard deviation of a window's torques."""
-_LEAST_NM = 2e-2
-"""Rms torque of the acceleration below which the encoder's steps distort the ratio."""
-_FRICTION_SPREAD = 1.0
+"""Number of ticks over which a mean speed is computed."""
+_TORQUE_ERROR_STD = 0.25
+"""Expected standard deviation of the relative error of the motor's torque."""
+_FORGETTING_FACTOR = 0.995
+"""Weight of a window relative to the next window."""
+_MIN_WINDOWS = 60.0
+"""Smallest number of windows from which the ratio is checked."""
+_MIN_TORQUE_STD_NM = 2e-3
+"""Smallest standard deviation that is assumed of a window's mean torques, in N·m."""
+_MIN_INERTIA_TORQUE_RMS_NM = 2e-2
+"""Smallest rms of inertia times acceleration in N·m for an estimate.
+
+Below it the encoder's steps distort the ratio."""
+_FRICTION_PRIOR_PRECISION = 1.0
 """Inverse variance of the prior of viscous friction, in (rad/(N·m·s))²."""
-_SURE = 4.0
-"""Standard deviations by which the ratio has to exceed its limit."""
+_SIGNIFICANT_STDS = 4.0
+"""Standard deviations by which the ratio has to exceed its limit to be a fault."""
 _CHECK_WINDOWS = 8
+"""Number of windows from one check of the ratio to the next."""
 
 
 class ScaleWatch:
-    """Estimates the ratio from windows of `WINDOW_TICKS`, and compares it with its limit.
+    """Estimates the ratio of net torque to inertia times acceleration, and checks its limit.
+
+    The estimate uses windows of `WINDOW_TICKS` ticks.
 
     Parameters
     ----------
     inertia_kg_m2
         Inertia of the motor.
     limit
-        Ratio, or inverse ratio, that is a fault; infinite: none.
+        Ratio, or inverse ratio, above which there is a fault; infinite to check nothing.
     """
 
-    __slots__ = ("_inertia_kg_m2", "_limit", "_normal", "_windows")
+    __slots__ = ("_inertia_kg_m2", "_limit", "_moments", "_windows")
 
     def __init__(self, inertia_kg_m2: float, limit: float) -> None:
         self._inertia_kg_m2 = inertia_kg_m2
@@ -54,58 +63,74 @@ class ScaleWatch:
         self.reset()
 
     def reset(self) -> None:
-        """Start over."""
+        """Forget all windows."""
         # Sums of the products of [J θ'', Γ, sign(θ'), θ', u - Γ].
-        self._normal = np.zeros((5, 5))
+        self._moments = np.zeros((5, 5))
         self._windows = 0
 
     def add(
         self, acceleration_rad_s2: float, speed_rad_s: float, coupling_nm: float, net_nm: float
     ) -> Violation | None:
-        """Add a window, and check the ratio after every few of them.
+        """Add a window's means to the estimate, and check the ratio from time to time.
 
         Parameters
         ----------
         acceleration_rad_s2, speed_rad_s
-            Mean acceleration and speed, as measured.
+            Measured mean acceleration and speed.
         coupling_nm, net_nm
-            Means of the coupling torque, and of motor minus coupling torque.
+            Mean coupling torque, and mean of motor minus coupling torque.
+
+        Returns
+        -------
+        Violation or None
+            Violation if the ratio is beyond its limit.
         """
         inertia_nm = self._inertia_kg_m2 * acceleration_rad_s2
         row = np.array((inertia_nm, coupling_nm, copysign(1.0, speed_rad_s), speed_rad_s, net_nm))
-        self._normal *= _MEMORY
-        self._normal += row[:, None] * row
+        self._moments *= _FORGETTING_FACTOR
+        self._moments += row[:, None] * row
         self._windows += 1
-        if self._windows < _LEAST_WINDOWS or self._windows % _CHECK_WINDOWS:
+        if self._windows < _MIN_WINDOWS or self._windows % _CHECK_WINDOWS:
             return None
-        return self._check()
+        return self._check_ratio()
 
     def estimate(self) -> tuple[float, float]:
-        """Return the ratio and its standard deviation, infinite without information."""
-        normal = self._normal
-        weight = float(normal[2, 2])
-        if normal[0, 0] < weight * _LEAST_NM**2:
+        """Return the estimated ratio and its standard deviation.
+
+        The standard deviation is infinite if the windows do not determine the ratio.
+        """
+        moments = self._moments
+        weight = float(moments[2, 2])
+        if moments[0, 0] < weight * _MIN_INERTIA_TORQUE_RMS_NM**2:
             return 1.0, inf
-        variance_nm2 = _NOISE_NM**2
+        variance_nm2 = _MIN_TORQUE_STD_NM**2
         ratio = deviation = inf
         for _ in range(2):
-            left = normal[:4, :4] / variance_nm2
-            left[1, 1] += 1.0 / _TORQUE_ERROR**2
-            left[3, 3] += _FRICTION_SPREAD
-            covariance = np.linalg.inv(left)
-            found = covariance @ (normal[:4, 4] / variance_nm2)
-            squares = normal[4, 4] - 2 * found @ normal[:4, 4] + found @ normal[:4, :4] @ found
-            ratio, deviation = float(found[0]), sqrt(max(0.0, float(covariance[0, 0])))
-            variance_nm2 = max(_NOISE_NM**2, float(squares) / weight)
+            information = moments[:4, :4] / variance_nm2
+            information[1, 1] += 1.0 / _TORQUE_ERROR_STD**2
+            information[3, 3] += _FRICTION_PRIOR_PRECISION
+            covariance = np.linalg.inv(information)
+            solution = covariance @ (moments[:4, 4] / variance_nm2)
+            squares = (
+                moments[4, 4]
+                - 2 * solution @ moments[:4, 4]
+                + solution @ moments[:4, :4] @ solution
+            )
+            ratio, deviation = float(solution[0]), sqrt(max(0.0, float(covariance[0, 0])))
+            variance_nm2 = max(_MIN_TORQUE_STD_NM**2, float(squares) / weight)
         return ratio, deviation
 
-    def _check(self) -> Violation | None:
+    def _check_ratio(self) -> Violation | None:
+        """Return a violation if the ratio is significantly beyond its limit."""
         ratio, deviation = self.estimate()
         row = BY_NAME["scales"]
-        low, high = ratio - _SURE * deviation, ratio + _SURE * deviation
+        lower_bound, upper_bound = (
+            ratio - _SIGNIFICANT_STDS * deviation,
+            ratio + _SIGNIFICANT_STDS * deviation,
+        )
         limit = self._limit
-        if low > limit:
+        if lower_bound > limit:
             return row.violated(ratio, limit)
-        if high < 1.0 / limit:
+        if upper_bound < 1.0 / limit:
             return row.violated(ratio, 1.0 / limit, below=True)
         return None

@@ -12,106 +12,125 @@ from operator import eq
 
 from rigd.safety.limits import BY_NAME, Violation
 
-_FROZEN_S = 0.02
-_FROZEN_READINGS = 3
-"""Least duration and number of identical readings of a fault."""
-_CHANNEL_FACTOR = 3
-"""A single channel causes a warning at its limit, and a fault after this many times as long."""
-_CHANCE = 1e-12
-"""Probability of a run of repeated readings that counts as impossible."""
-_QUIET = 0.98
-"""Fraction of repeated readings at the tare above which repetitions mean nothing."""
-_COUNTED = 256
-"""Ticks over which repeated readings are counted."""
-_LEAST_FRACTION = 0.1
-_SIGNIFICANT = 8.0
-_LARGEST_FRACTION = 0.45
-"""Fraction of repeated readings above which the sensor repeats them: an absolute margin, and so
-many standard deviations, above that at the tare. Above the largest, a sensor that repeats every
-second reading cannot be detected."""
-_LEARNED = 100
-"""Number of readings at the tare from which the fractions are known."""
+_MIN_FROZEN_S = 0.02
+"""Shortest duration in seconds of identical readings that is a fault."""
+_MIN_FROZEN_READINGS = 3
+"""Smallest number of identical readings that is a fault."""
+_FAULT_TO_WARNING_FACTOR = 3
+"""Length of a single channel's run that is a fault, relative to the run that causes a warning."""
+_MIN_RUN_PROBABILITY = 1e-12
+"""Probability of a run of identical readings below which the run counts as a fault."""
+_NO_NOISE_FRACTION = 0.98
+"""Fraction of repeated readings at the tare above which a channel shows no noise."""
+_COUNT_TICKS = 256
+"""Number of ticks over which the fraction of repeated readings is computed."""
+_MIN_EXCESS_FRACTION = 0.1
+"""Smallest excess of the fraction of repeated readings over that at the tare that is a fault."""
+_SIGNIFICANT_STDS = 8.0
+"""Excess of the fraction of repeated readings over that at the tare that is a fault.
+
+It is in standard deviations of a fraction that is counted over `_COUNT_TICKS`."""
+_MAX_FRACTION_LIMIT = 0.45
+"""Largest limit of the fraction of repeated readings that is checked.
+
+Above it, a sensor that repeats every second reading cannot be detected."""
+_MIN_LEARNED_READINGS = 100
+"""Smallest number of readings at the tare that determines the fractions of repeated readings."""
 
 
 class SensorWatch:
-    """Compares each reading of the sensor with the previous one.
+    """Compares each reading of the force-torque sensor with the previous one to detect failures.
 
     Parameters
     ----------
     channels
-        Names of the channels for messages.
+        Names of the sensor's channels in messages.
     noisy
-        Whether each channel has noise; a simulated one may have none.
+        Whether each channel has noise; a simulated channel may have none.
     rate_hz
-        Ticks a second.
+        Loop rate in ticks per second.
     """
 
     __slots__ = (
-        "_before",
+        "_any_run",
         "_channels",
-        "_counted",
-        "_fractions",
-        "_learned",
+        "_counted_ticks",
+        "_fraction_limits",
+        "_has_noise",
+        "_learned_readings",
         "_limits",
-        "_noisy",
         "_notices",
+        "_previous_reading",
         "_rate_hz",
-        "_repeated",
-        "_running",
+        "_repeat_counts",
         "_runs",
-        "_warned",
+        "_warned_channels",
     )
 
     def __init__(self, channels: Sequence[str], noisy: Sequence[bool], rate_hz: float) -> None:
         self._channels = (*channels, "")
-        self._noisy = (*noisy, all(noisy))
+        self._has_noise = (*noisy, all(noisy))
         self._rate_hz = rate_hz
         self._notices: list[str] = []
         self.learn()
 
     def learn(self) -> None:
-        """Start over: the next readings, at rest, give the frequency of repetitions."""
+        """Forget all readings, and learn from the next ones how often working channels repeat.
+
+        The rig is at rest meanwhile.
+        """
         n = len(self._channels)
-        self._before: tuple[float, ...] = ()
-        self._learned = self._counted = 0
-        # For each channel, and last for all together.
-        self._repeated = [0] * n
+        self._previous_reading: tuple[float, ...] = ()
+        self._learned_readings = self._counted_ticks = 0
+        # One entry for each channel, and last one for all channels together.
+        self._repeat_counts = [0] * n
         self._runs = [0] * n
-        self._running = False
+        self._any_run = False
         self._limits: list[int] | None = None
-        self._fractions: list[float] = []
-        self._warned: set[str] = set()
+        self._fraction_limits: list[float] = []
+        self._warned_channels: set[str] = set()
 
     def finish_learning(self) -> Violation | None:
-        """End learning: derive the limits of the runs, and check the readings at rest."""
-        n = max(1, self._learned)
-        if n < _LEARNED:
+        """Derive the limits of identical readings from the readings at rest, and check the sensor.
+
+        Returns
+        -------
+        Violation or None
+            Violation if the sensor shows no noise at rest.
+        """
+        n = max(1, self._learned_readings)
+        if n < _MIN_LEARNED_READINGS:
             return None
-        fractions = [repeated / n for repeated in self._repeated]
-        least = max(_FROZEN_READINGS, ceil(_FROZEN_S * self._rate_hz)) - 1
-        never = 2**62
+        fractions = [count / n for count in self._repeat_counts]
+        min_run = max(_MIN_FROZEN_READINGS, ceil(_MIN_FROZEN_S * self._rate_hz)) - 1
+        unlimited = 2**62
         self._limits = []
-        for fraction, noisy in zip(fractions, self._noisy, strict=True):
-            if not noisy or fraction > _QUIET:
-                self._limits.append(never)
+        for fraction, noisy in zip(fractions, self._has_noise, strict=True):
+            if not noisy or fraction > _NO_NOISE_FRACTION:
+                self._limits.append(unlimited)
             else:
-                chance = max(fraction, 1.0 / n)
-                self._limits.append(max(least, ceil(log(_CHANCE) / log(chance))))
-        self._fractions = [
+                repeat_probability = max(fraction, 1.0 / n)
+                self._limits.append(
+                    max(min_run, ceil(log(_MIN_RUN_PROBABILITY) / log(repeat_probability)))
+                )
+        self._fraction_limits = [
             fraction
-            + max(_LEAST_FRACTION, _SIGNIFICANT * sqrt(fraction * (1.0 - fraction) / _COUNTED))
+            + max(
+                _MIN_EXCESS_FRACTION,
+                _SIGNIFICANT_STDS * sqrt(fraction * (1.0 - fraction) / _COUNT_TICKS),
+            )
             if noisy
             else 1.0
-            for fraction, noisy in zip(fractions, self._noisy, strict=True)
+            for fraction, noisy in zip(fractions, self._has_noise, strict=True)
         ]
-        self._repeated = [0] * len(fractions)
-        self._counted = 0
-        if self._noisy[-1] and fractions[-1] > _QUIET:
-            return BY_NAME["frozen sensor"].violated(self._runs[-1], least)
+        self._repeat_counts = [0] * len(fractions)
+        self._counted_ticks = 0
+        if self._has_noise[-1] and fractions[-1] > _NO_NOISE_FRACTION:
+            return BY_NAME["frozen sensor"].violated(self._runs[-1], min_run)
         for channel, fraction, noisy in zip(
-            self._channels[:-1], fractions, self._noisy, strict=False
+            self._channels[:-1], fractions, self._has_noise, strict=False
         ):
-            if noisy and fraction > _QUIET:
+            if noisy and fraction > _NO_NOISE_FRACTION:
                 self._notices.append(
                     f"The sensor's {channel} shows no noise at rest: a broken gauge or cable is "
                     "not detected there. Check the sensor."
@@ -119,55 +138,64 @@ class SensorWatch:
         return None
 
     def step(self, reading: tuple[float, ...]) -> Violation | None:
-        """Compare a new reading with the previous one."""
-        before, self._before = self._before, reading
-        if not before:
+        """Return a violation if a new reading continues an improbable run of identical readings."""
+        previous, self._previous_reading = self._previous_reading, reading
+        if not previous:
             return None
-        self._learned += 1
-        if self._running or any(map(eq, reading, before)):
-            runs, repeated = self._runs, self._repeated
-            same = [*map(eq, reading, before), reading == before]
-            for number, repeats in enumerate(same):
+        self._learned_readings += 1
+        if self._any_run or any(map(eq, reading, previous)):
+            runs, repeat_counts = self._runs, self._repeat_counts
+            repeated = [*map(eq, reading, previous), reading == previous]
+            for channel_index, repeats in enumerate(repeated):
                 if repeats:
-                    runs[number] += 1
-                    repeated[number] += 1
+                    runs[channel_index] += 1
+                    repeat_counts[channel_index] += 1
                 else:
-                    runs[number] = 0
-            self._running = any(same)
-        elif self._limits is None or self._counted + 1 < _COUNTED:
-            self._counted += 1
+                    runs[channel_index] = 0
+            self._any_run = any(repeated)
+        elif self._limits is None or self._counted_ticks + 1 < _COUNT_TICKS:
+            self._counted_ticks += 1
             return None
-        return None if self._limits is None else self._check()
+        return None if self._limits is None else self._check_repeats()
 
-    def _check(self) -> Violation | None:
+    def _check_repeats(self) -> Violation | None:
+        """Compare the runs and the fraction of repeated readings with their limits."""
         runs, limits = self._runs, self._limits
         assert limits is not None
         if runs[-1] > limits[-1]:
             return BY_NAME["frozen sensor"].violated(runs[-1], limits[-1])
-        self._counted += 1
-        if self._counted >= _COUNTED:
-            repeated, self._repeated, self._counted = self._repeated, [0] * len(runs), 0
-            for number, count in enumerate(repeated):
-                fraction, limit = count / _COUNTED, self._fractions[number]
+        self._counted_ticks += 1
+        if self._counted_ticks >= _COUNT_TICKS:
+            repeat_counts, self._repeat_counts, self._counted_ticks = (
+                self._repeat_counts,
+                [0] * len(runs),
+                0,
+            )
+            for channel_index, count in enumerate(repeat_counts):
+                fraction, limit = count / _COUNT_TICKS, self._fraction_limits[channel_index]
                 if (
                     limit < fraction
-                    and limit < _LARGEST_FRACTION
-                    and runs[number] <= limits[number]
+                    and limit < _MAX_FRACTION_LIMIT
+                    and runs[channel_index] <= limits[channel_index]
                 ):
-                    together = 2 * repeated[-1] > count
-                    part = "whole wrench" if together else self._channels[number]
+                    all_channels = 2 * repeat_counts[-1] > count
+                    repeated_part = (
+                        "whole wrench" if all_channels else self._channels[channel_index]
+                    )
                     return BY_NAME["repeated wrench"].violated(
-                        100.0 * fraction, 100.0 * limit, part
+                        100.0 * fraction, 100.0 * limit, repeated_part
                     )
         if max(runs) <= min(limits):
             return None
         for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):
             if run <= limit:
                 continue
-            if run > _CHANNEL_FACTOR * limit:
-                return BY_NAME["frozen channel"].violated(run, _CHANNEL_FACTOR * limit, channel)
-            if channel not in self._warned:
-                self._warned.add(channel)
+            if run > _FAULT_TO_WARNING_FACTOR * limit:
+                return BY_NAME["frozen channel"].violated(
+                    run, _FAULT_TO_WARNING_FACTOR * limit, channel
+                )
+            if channel not in self._warned_channels:
+                self._warned_channels.add(channel)
                 self._notices.append(
                     f"The sensor's {channel} has not changed for {run} ticks. "
                     f"{BY_NAME['frozen channel'].remedy}"
@@ -175,6 +203,6 @@ class SensorWatch:
         return None
 
     def take_notices(self) -> list[str]:
-        """Return the warnings since the last call."""
+        """Return and clear the warnings on channels since the last call."""
         notices, self._notices = self._notices, []
         return notices

@@ -14,81 +14,94 @@ from annotated_types import Ge, Gt, Le, Lt
 from rigd.beam.tip import SMALL_SLOPE_RAD
 
 Positive = Annotated[float, Gt(0)]
-BelowAll = Annotated[float, Gt(0), Lt(100)]
-"""Per cent; a fraction is never more than the whole."""
+"""Type of a number above 0."""
+PercentageBelow100 = Annotated[float, Gt(0), Lt(100)]
+"""Type of a percentage above 0 and below 100."""
 
 BUFFERED_S = 16.0
-"""Time that shared memory buffers for the recorder: no stall of a disk loses a sample."""
+"""Seconds of samples that shared memory buffers, so that no stall of the disk loses a sample."""
 
 
 @dataclass(frozen=True, slots=True)
 class Limits:
-    """Levels that end a session; the table states the fraction from which there is a warning.
+    """Limits of the rig that end a session when they are exceeded.
 
-    The angle is relative to the rig's zero; all but the free space of the disk are magnitudes that
-    must not be exceeded.
+    The angle is relative to the rig's zero. All limits are largest magnitudes, except the free
+    space of the disk. `INTERLOCKS` has the levels of the warnings.
     """
 
     angle_rad: Positive
-    """Angle from the zero, either way."""
+    """Largest angle of the motor on either side of the rig's zero."""
     stop_angle_rad: Positive
-    """Angle of the mechanical stop, or at which something tears. No check in a session uses it, but
-    the rig has to come to rest by itself between `angle_rad` and this angle."""
+    """Angle of the mechanical stop, or the angle at which a part tears.
+
+    No check in a session uses it, but the rig has to come to rest by itself between `angle_rad` and
+    this angle."""
     velocity_rad_s: Positive
-    """Speed of the output shaft, either way."""
+    """Largest speed of the output shaft in either direction."""
     acceleration_rad_s2: Positive
-    """More than the motor can cause: an angle that shows more has jumped."""
+    """Largest plausible acceleration, above any that the motor can cause.
+
+    An angle that shows a larger acceleration has jumped."""
     tracking_error_rad: Positive
-    """Reference minus measured angle."""
+    """Largest difference between reference and measured angle."""
     torque_command_nm: Positive
-    """Request of the controller, before it is limited to the motor's peak torque."""
+    """Largest torque that the controller may request, before the motor's peak torque limits it."""
     sensor_range_percent: Annotated[float, Gt(0), Le(200)]
-    """Percentage of the range of each sensor axis; above 100 a clipped reading ends nothing (it is
-    flagged in its sample)."""
+    """Largest reading of each sensor axis, as a percentage of its measuring range.
+
+    Above 100 a clipped reading does not end the session; it is flagged in its sample."""
     saturated_ticks_in_a_row: Annotated[int, Ge(1)]
-    """Ticks for which the sensor may report an axis or a gauge at the end of its range."""
+    """Consecutive ticks for which a sensor axis or gauge may be at the end of its range."""
     stale_ticks_in_a_row: Annotated[int, Ge(1)]
-    """Ticks for which an old angle or wrench may replace a missing one."""
+    """Consecutive ticks for which an old angle or wrench may replace a missing one."""
     missed_ticks_in_a_row: Annotated[int, Ge(1)]
     """Consecutive ticks that the loop may miss."""
-    missed_percent: BelowAll
-    """Percentage of all ticks scheduled so far, of at least ten seconds."""
+    missed_percent: PercentageBelow100
+    """Largest percentage of missed ticks in the ticks scheduled so far, of at least ten seconds."""
     tare_drift_nm: Positive
-    """Change of the coupling torque's zero over a session, or since the previous one."""
+    """Largest change of the coupling torque's zero in a session, or since the previous session."""
     recorder_lag_s: Positive
-    """Delay of the recorder behind the loop, less than shared memory holds."""
+    """Longest delay of the recorder behind the loop, less than shared memory buffers."""
     disk_free_mb: Positive
-    """Free space of the session's disk, below which it ends; 1 MB is 10⁶ bytes."""
+    """Free space on the session's disk below which the session ends; 1 MB is 10⁶ bytes."""
     standstill_torque_nm: Annotated[float, Ge(0)] = field(default=0.0, metadata={"optional": True})
-    """Net torque on the shaft, motor minus coupling torque, that exceeds any friction: an encoder
-    at rest has then failed. 0: five times ``motor.coulomb_nm``."""
+    """Net torque on the shaft (motor minus coupling torque) that exceeds any friction.
+
+    An encoder that shows no movement at a larger net torque has failed. 0 means five times
+    ``motor.coulomb_nm``."""
     torque_ratio: Annotated[float, Gt(1)] = field(default=2.0, metadata={"optional": True})
-    """Ratio of the net torque on the shaft to its inertia times its measured acceleration, or its
-    inverse: 1 if all scales of encoder and motor are right."""
-    stale_percent: BelowAll = field(default=1.0, metadata={"optional": True})
-    """Percentage of stale angles, and of stale wrenches, in all ticks scheduled so far, counted as
-    for `missed_percent`. ``analyze`` accepts no record with more than 1 %."""
+    """Largest ratio of the net torque on the shaft to its inertia times measured acceleration.
+
+    The inverse ratio has the same limit. The ratio is 1 if all scales of encoder and motor are
+    right."""
+    stale_percent: PercentageBelow100 = field(default=1.0, metadata={"optional": True})
+    """Largest percentage of old angles, and of old wrenches, in the ticks scheduled so far.
+
+    It is counted as for `missed_percent`. ``analyze`` accepts no record with more than 1 %."""
     tip_slope_rad: Positive = field(default=SMALL_SLOPE_RAD, metadata={"optional": True})
-    """Largest slope of the antenna's tip that an identification may be predicted to reach; checked
-    before the session, not in it. Beyond the default the linear model is not exact."""
+    """Largest slope of the antenna's tip that an identification may cause.
+
+    The predicted slope is checked before the session. Above the default the linear model is not
+    exact."""
 
 
 @dataclass(frozen=True, slots=True)
 class Violation:
-    """A limit that is exceeded or near.
+    """A quantity that exceeds its limit or is near it, with the message for the operator.
 
     Attributes
     ----------
     channel, value, limit, unit
-        Quantity, its value, and the limit that it exceeds.
+        Monitored quantity, its value, its limit, and their unit.
     remedy
-        Advice for the operator, a sentence; may be empty.
+        Advice for the operator, a sentence, or an empty string.
     key
-        Key of the limit in the profile; may be empty.
+        Key of the limit in the profile, or an empty string.
     below
         Whether the value must not fall below the limit, instead of exceeding it.
     warning
-        Level of the warning, if the limit itself is not exceeded.
+        Level of the warning if the limit itself is not exceeded, otherwise None.
 
     Examples
     --------
@@ -107,7 +120,7 @@ class Violation:
     warning: float | None = None
 
     def __str__(self) -> str:
-        """Return one or two sentences for the operator."""
+        """Return the message for the operator, one or two sentences."""
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
         remedy = f" {self.remedy}" if self.remedy else ""
@@ -115,21 +128,21 @@ class Violation:
         value, limit = (f"{number:.4g} {self.unit}".rstrip() for number in (self.value, self.limit))
         if self.warning is not None:
             side = "below" if self.below else "above"
-            where = f", {self.key}" if self.key else ""
+            key_text = f", {self.key}" if self.key else ""
             return (
                 f"{channel} {value} {side} warning level {self.warning:.4g} {self.unit} "
-                f"(limit {self.limit:.4g}{where}).{remedy}"
+                f"(limit {self.limit:.4g}{key_text}).{remedy}"
             )
         how = "below" if self.below else "exceeds"
-        where = f" ({self.key})" if self.key else ""
-        return f"{channel} {value} {how} limit {limit}{where}.{remedy}"
+        key_text = f" ({self.key})" if self.key else ""
+        return f"{channel} {value} {how} limit {limit}{key_text}.{remedy}"
 
 
 # Table of interlocks
 
 
 class Checked(Enum):
-    """Process and time of an interlock's check."""
+    """Process that checks an interlock, and the times of its checks."""
 
     TICK = "loop, every tick"
     SLOW_CHECK = "loop, every 64 ticks"
@@ -138,7 +151,7 @@ class Checked(Enum):
 
 
 class Action(Enum):
-    """Consequence of an exceeded limit."""
+    """Consequence of an interlock's violation for the session."""
 
     FAULT = "torque off, session ends as fault"
     STOP = "torque off, session ends as stopped"
@@ -146,26 +159,26 @@ class Action(Enum):
 
 @dataclass(frozen=True, slots=True)
 class Interlock:
-    """One row of the table.
+    """One row of the table of interlocks: monitored quantity, limit, check and consequence.
 
     Attributes
     ----------
     name
         Name of the interlock.
     channel
-        Monitored quantity, as messages name it.
+        Name of the monitored quantity in messages.
     unit
-        Unit of value and limit; empty where nothing is measured.
+        Unit of value and limit, or an empty string if nothing is measured.
     limit
-        Key of the profile with the level that ends a session; empty where nothing is measured.
+        Key of the limit in the profile, or an empty string if nothing is measured.
     warning
-        Level of the warning: a fraction of the limit, or a key of the profile; None: no warning.
+        Level of the warning: a fraction of the limit, or a key of the profile. None for no warning.
     checked, action
-        Where it is checked, and the consequence.
+        Process that checks the interlock, and the consequence of a violation.
     remedy
         Advice for the operator.
     below
-        Whether the limit is the least allowed value.
+        Whether the limit is the smallest allowed value, not the largest.
     follows_missed_ticks
         Whether a stalled loop can trigger it although the rig is sound: meanwhile the drive
         continues to exert the last torque.
@@ -185,14 +198,14 @@ class Interlock:
     def violated(
         self, value: float, limit: float, part: str = "", *, below: bool = False
     ) -> Violation:
-        """Return the violation of this interlock by a value.
+        """Return the violation of this interlock by a measured value.
 
         Parameters
         ----------
         value, limit
-            The value, and the limit that it exceeds.
+            Measured value, and the limit that it exceeds.
         part
-            Part of the channel, where the table leaves it open.
+            Text that replaces ``{channel}`` in the name of the quantity.
         below
             Whether the value is below the limit.
         """
@@ -201,15 +214,15 @@ class Interlock:
 
 
 OVERLOADED: Final = "The computer is overloaded: close other programs."
-"""Remedy for every violation caused by a busy computer."""
+"""Advice for the operator on a violation caused by a busy computer."""
 
-_ENCODER_FAILED: Final = (
+_ENCODER_FAILED: Final = (  # Advice for the operator on a failed encoder.
     "The encoder does not follow the torque: check the encoder, its cable and its coupling to the "
     "shaft, and that nothing blocks the shaft or the motor; then reset the rig and set the zero "
     "again."
 )
 
-_SENSOR_FAILED: Final = (
+_SENSOR_FAILED: Final = (  # Advice for the operator on a failed force-torque sensor.
     "Readings of a working sensor differ by their noise: check the sensor, its cable and its box."
 )
 
@@ -507,4 +520,7 @@ INTERLOCKS: Final = (
     ),
 )
 
+"""Table of interlocks, in the order of docs/safety.md."""
+
 BY_NAME: Final = {row.name: row for row in INTERLOCKS}
+"""Map from an interlock's name to its row of `INTERLOCKS`."""

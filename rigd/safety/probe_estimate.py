@@ -12,28 +12,38 @@ from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 Real = NDArray[np.float64]
 
 RATIO_BAND = (0.7, 1.42)
-"""Accepted ratios: half-way between 25 %, which is usual, and 50 % too much or too little."""
+"""Smallest and largest accepted ratio of a measured scale or inertia to the profile's value.
+
+They are half-way between 25 %, which is usual, and 50 % too much or too little."""
 WARNING_BAND = (0.8, 1.25)
-"""Ratios beyond which there is a warning."""
+"""Ratios of a measured scale or inertia to the profile's value outside of which there is a warning.
+"""
 
 _FREQUENCY_FACTORS = tuple(float(x) for x in np.linspace(0.9, 1.1, 21))
-"""Candidate factors on the beam's frequencies: a stiffer beam must not count as a wrong scale."""
-_SMOOTH_S = 0.008
-"""Standard deviation of the window that smooths all signals."""
-_LEAST_SPEED_PART = 0.1
-"""Fraction of the largest speed below which friction has no certain sign."""
-_LEAST_SAMPLES = 50
-_TOP_HZ = 100.0
-"""Frequency above which that window passes nothing."""
-_DECAY = 12.0
-_WORST_CONDITION = 1e6
-_LARGEST_STD = 0.1
-"""Relative uncertainty of a ratio beyond which it counts as unknown."""
-_SAME_FACTOR = 1.3
-"""Factor up to which two ratios count as the same."""
-_NOTHING = 0.15
-"""Fraction of the beam's torque below which the sensor counts as showing none."""
-_REMEDY = (
+"""Candidate factors by which the beam's frequencies are multiplied in the estimate.
+
+Without them a stiffer beam would count as a wrong scale."""
+_WINDOW_STD_S = 0.008
+"""Standard deviation in seconds of the Gaussian window that smooths all signals."""
+_MIN_SPEED_FRACTION = 0.1
+"""Fraction of the largest speed below which the sign of the friction is uncertain."""
+_MIN_SAMPLES = 50
+"""Smallest number of samples of an estimate; the motor's equation requires twice as many."""
+_WINDOW_CUTOFF_HZ = 100.0
+"""Frequency in Hz above which the smoothing window passes nothing."""
+_DECAY_EXPONENT = 12.0
+"""Exponent of the decay of the weighting by which the angle is multiplied before its FFT.
+
+The weighting suppresses the wrap-around."""
+_MAX_CONDITION_NUMBER = 1e6
+"""Largest condition number of the normal equations that gives an estimate."""
+_MAX_RELATIVE_STD = 0.1
+"""Relative standard deviation of a ratio above which it counts as unknown."""
+_SAME_RATIO_FACTOR = 1.3
+"""Factor by which two ratios may differ and still count as the same."""
+_NO_TORQUE_RATIO = 0.15
+"""Ratio of the measured torque to the beam's torque below which the sensor shows no torque."""
+_ADVICE = (
     "Correct the profile or the rig. A value that was measured by other means and is marked "
     'source = "measured" (docs/safety.md) is not probed.'
 )
@@ -41,47 +51,56 @@ _REMEDY = (
 
 @dataclass(frozen=True, slots=True)
 class ProbeEstimate:
-    """Scales and friction estimated from a probing move, in the profile's units."""
+    """Scales and friction estimated from a probing move, relative to the profile's values."""
 
     coupling_ratio: float | None
-    """Coupling torque over that of the profile's beam at the measured angle; None: unknown."""
+    """Ratio of the measured coupling torque to that of the profile's beam at the measured angle.
+
+    None if it is unknown."""
     coupling_std: float | None
-    """Its standard deviation."""
+    """Standard deviation of `coupling_ratio`, or None if it is unknown."""
     torque_ratio: float | None
-    """Torque of the motor, relative to the sensor, over the torque commanded; None: unknown."""
+    """Ratio of the motor's torque, on the sensor's scale, to the commanded torque.
+
+    None if it is unknown."""
     torque_std: float | None
-    """Its standard deviation."""
+    """Standard deviation of `torque_ratio`, or None if it is unknown."""
     inertia_ratio: float | None
-    """Inertia that this torque accelerates, over the profile's; None: unknown."""
+    """Ratio of the motor's inertia to that of the profile, or None if it is unknown."""
     inertia_std: float | None
-    """Its standard deviation."""
+    """Standard deviation of `inertia_ratio`, or None if it is unknown."""
     coulomb_nm: float | None
-    """Coulomb friction."""
+    """Coulomb friction of the motor, or None if it is unknown."""
     viscous_nm_s_per_rad: float | None
-    """Viscous friction."""
+    """Viscous friction of the motor, or None if it is unknown."""
     travel_rad: float
-    """Range of the measured angle."""
+    """Range of the angle measured in the move."""
     speed_rad_s: float
-    """Largest measured speed."""
+    """Largest speed measured in the move."""
 
     def as_dict(self) -> dict[str, float | None]:
-        """Return the numbers by name for documents."""
+        """Return the fields of the estimate by name, for a JSON document."""
         return asdict(self)
 
 
 def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
-    """Estimate the ratios and the friction from the record of a move.
+    """Estimate scales and friction of a rig from the record of its probing move.
 
     Parameters
     ----------
     rig
-        Data of the profile.
+        Values of the profile that the move verifies.
     move
-        The move, after its end.
+        Probing move that has ended.
+
+    Returns
+    -------
+    ProbeEstimate
+        Ratios of the measured values to those of the profile, and friction.
     """
     angle = np.array(move.angles_rad)
-    window = _window(rig.rate_hz)
-    if angle.size < window.size + _LEAST_SAMPLES:
+    window = _smoothing_window(rig.rate_hz)
+    if angle.size < window.size + _MIN_SAMPLES:
         return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle)), speed_rad_s=0.0)
 
     def smooth(signal: Real) -> Real:
@@ -89,20 +108,22 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
 
     speed = np.gradient(smooth(angle)) * rig.rate_hz
     acceleration = np.gradient(speed) * rig.rate_hz
-    fastest = float(np.max(np.abs(speed)))
+    max_speed = float(np.max(np.abs(speed)))
     ratio, ratio_std, beam_nm = _coupling_ratio(
         rig, angle, smooth(np.array(move.coupling_nm)), window
     )
-    late = max(0, round(rig.command_delay_s * rig.rate_hz))
-    command = np.concatenate([np.zeros(late), move.torques_nm])[: angle.size]
-    moving: NDArray[np.bool_] = np.abs(speed) > _LEAST_SPEED_PART * fastest
-    found = _motor(smooth(command), acceleration, speed, beam_nm, moving, window.size)
-    scale, scale_std, inertia, inertia_std, coulomb, viscous = found
+    delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
+    command = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle.size]
+    is_moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
+    motor_fit = _fit_motor_equation(
+        smooth(command), acceleration, speed, beam_nm, is_moving, window.size
+    )
+    scale, scale_std, inertia, inertia_std, coulomb, viscous = motor_fit
     if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
         # Both uncertainties enter the fitted torque of the beam.
-        part = ratio_std / ratio
-        scale_std = hypot(scale_std, part * scale)
-        inertia_std = hypot(inertia_std, part * inertia)
+        relative_std = ratio_std / ratio
+        scale_std = hypot(scale_std, relative_std * scale)
+        inertia_std = hypot(inertia_std, relative_std * inertia)
     return ProbeEstimate(
         ratio,
         ratio_std,
@@ -113,13 +134,13 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
         coulomb,
         viscous,
         float(np.ptp(angle)),
-        fastest,
+        max_speed,
     )
 
 
-def _window(rate_hz: float) -> Real:
-    """Return a window of unit sum and odd length, at least three ticks wide."""
-    spread = max(1.0, _SMOOTH_S * rate_hz)
+def _smoothing_window(rate_hz: float) -> Real:
+    """Return the Gaussian smoothing window, of unit sum, odd length and at least three ticks."""
+    spread = max(1.0, _WINDOW_STD_S * rate_hz)
     half = int(3.0 * spread)
     weights: Real = np.exp(-0.5 * (np.arange(-half, half + 1) / spread) ** 2)
     weights /= weights.sum()
@@ -129,90 +150,93 @@ def _window(rate_hz: float) -> Real:
 def _coupling_ratio(
     rig: ProbedRig, angle: Real, measured: Real, window: Real
 ) -> tuple[float | None, float | None, Real]:
-    """Fit the coupling torque by that of the beam at the measured angle.
+    """Fit the measured coupling torque by that of the beam at the measured angle.
 
     Returns the ratio, its standard deviation, and the fitted coupling torque without noise.
     """
-    best: tuple[float, float, float, Real] | None = None
+    best_fit: tuple[float, float, float, Real] | None = None
     for beam_nm in _beam_torques(rig, angle):
         expected = np.convolve(beam_nm, window, "valid")
         squares = float(expected @ expected)
         if squares == 0.0:
             continue
         ratio = float(expected @ measured) / squares
-        left = float(np.sum((measured - ratio * expected) ** 2))
-        if best is None or left < best[0]:
+        residual = float(np.sum((measured - ratio * expected) ** 2))
+        if best_fit is None or residual < best_fit[0]:
             # Smoothed samples within a window are not independent.
-            variance = left / expected.size * _correlated(window) / squares
-            best = left, ratio, sqrt(variance), ratio * expected
-    return (None, None, np.zeros_like(measured)) if best is None else best[1:]
+            variance = residual / expected.size * _samples_per_independent_one(window) / squares
+            best_fit = residual, ratio, sqrt(variance), ratio * expected
+    return (None, None, np.zeros_like(measured)) if best_fit is None else best_fit[1:]
 
 
-def _correlated(window: Real) -> float:
-    """Return the number of smoothed samples of white noise that count as one."""
+def _samples_per_independent_one(window: Real) -> float:
+    """Return the number of smoothed samples that count as one independent sample of white noise."""
     return 1.0 / float(window @ window)
 
 
 def _beam_torques(rig: ProbedRig, angle: Real) -> Real:
-    """Return the exact beam's torque at the measured angle, for each frequency factor: (f, n)."""
+    """Return the exact beam's torque in N·m at the measured angle, shape (factors, n).
+
+    There is a row for each candidate factor of the beam's frequencies.
+    """
     n = angle.size
     padded = 1 << (2 * n - 1).bit_length()
     # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY * rig.rate_hz / padded
+    sigma = _DECAY_EXPONENT * rig.rate_hz / padded
     frequency_hz = np.fft.rfftfreq(padded, 1.0 / rig.rate_hz)
-    inside = frequency_hz <= _TOP_HZ
-    s = sigma + 2j * pi * frequency_hz[inside]
+    within_window_band = frequency_hz <= _WINDOW_CUTOFF_HZ
+    s = sigma + 2j * pi * frequency_hz[within_window_band]
     growth = np.exp(sigma * np.arange(padded) / rig.rate_hz)
-    held = np.full(padded, angle[-1])
-    held[:n] = angle
-    turned = np.fft.rfft(held / growth)[inside]
+    extended_angle = np.full(padded, angle[-1])
+    extended_angle[:n] = angle
+    angle_spectrum = np.fft.rfft(extended_angle / growth)[within_window_band]
     result = np.empty((len(_FREQUENCY_FACTORS), n))
     spectrum = np.zeros(frequency_hz.size, dtype=np.complex128)
     for row, factor in zip(result, _FREQUENCY_FACTORS, strict=True):
         stiffness = rig.beam.bending_stiffness_n_m2 * factor**2
         beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
         response = transfer(s, beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
-        spectrum[inside] = response * turned
+        spectrum[within_window_band] = response * angle_spectrum
         row[:] = (np.fft.irfft(spectrum, padded) * growth)[:n]
     return result
 
 
-def _motor(
+def _fit_motor_equation(
     command: Real,
     acceleration: Real,
     speed: Real,
     beam_nm: Real,
-    moving: NDArray[np.bool_],
-    width: float,
+    is_moving: NDArray[np.bool_],
+    window_ticks: float,
 ) -> tuple[float | None, ...]:
-    """Fit the motor's equation to the samples in which the shaft moves.
+    """Fit the motor's equation of motion to the samples in which the shaft moves.
 
-    Returns torque scale, inertia, each with its standard deviation, Coulomb and viscous friction;
-    None: unknown.
+    Returns the torque scale and its standard deviation, the inertia and its standard deviation,
+    Coulomb and viscous friction. All are None if they cannot be estimated.
     """
-    columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[moving]
+    columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[is_moving]
     size = np.linalg.norm(columns, axis=0)
-    if len(columns) < 2 * _LEAST_SAMPLES or not size.all():
+    if len(columns) < 2 * _MIN_SAMPLES or not size.all():
         return (None,) * 6
     columns = columns / size
     normal = columns.T @ columns
-    if np.linalg.cond(normal) > _WORST_CONDITION:
+    if np.linalg.cond(normal) > _MAX_CONDITION_NUMBER:
         return (None,) * 6
     inverse = np.linalg.inv(normal)
-    solution = inverse @ (columns.T @ command[moving])
-    left = command[moving] - columns @ solution
-    variance = float(left @ left) / len(left) * width * np.diag(inverse)
+    solution = inverse @ (columns.T @ command[is_moving])
+    residual = command[is_moving] - columns @ solution
+    variance = float(residual @ residual) / len(residual) * window_ticks * np.diag(inverse)
     per_scale, inertia, coulomb, viscous = (solution / size).tolist()
     per_scale_std, inertia_std = (np.sqrt(variance) / size)[:2].tolist()
     if per_scale <= 0.0:
         return (None,) * 6
     scale = 1.0 / per_scale
-    part = per_scale_std * scale
+    relative_std = per_scale_std * scale
     return (
         scale,
-        part * scale,
+        relative_std * scale,
         inertia * scale,
-        scale * sqrt(inertia_std**2 + (inertia * part) ** 2),
+        scale * sqrt(inertia_std**2 + (inertia * relative_std) ** 2),
         coulomb * scale,
         viscous * scale,
     )
@@ -224,58 +248,69 @@ def _motor(
 def contradiction(
     rig: ProbedRig, end: ProbeEnd | None, estimate: ProbeEstimate, *, motor: bool = True
 ) -> str:
-    """Return a contradiction in a probing move, for the operator; empty if there is none.
+    """Describe a contradiction between a probing move and the profile, for the operator.
 
     Parameters
     ----------
     rig
-        Data of the profile.
+        Values of the profile that the move verifies.
     end
         Reason for the end of the move.
     estimate
-        From `estimate_probe`.
+        Estimate from the record of the move, as returned by `estimate_probe`.
     motor
         Whether to check the motor's torque and inertia too, not only the quantities on which the
         bounds of travel and speed depend.
+
+    Returns
+    -------
+    str
+        Message with advice, or an empty string if there is no contradiction.
     """
-    found = _of_motion(rig, end)
-    if not found and (end is ProbeEnd.PULLED or not _accepted(estimate.coupling_ratio)):
-        found = _of_coupling(estimate, motor=motor)
-    if not found and motor:
-        found = _of_motor(estimate)
-    if not found and end is ProbeEnd.AWAY and motor:
-        found = (
+    message = _motion_contradiction(rig, end)
+    if not message and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
+        message = _coupling_contradiction(estimate, motor=motor)
+    if not message and motor:
+        message = _motor_contradiction(estimate)
+    if not message and end is ProbeEnd.AWAY and motor:
+        message = (
             f"The shaft left the bounds of the probing move after {estimate.travel_rad:.2g} rad at "
             f"up to {estimate.speed_rad_s:.2g} rad/s: check motor.inertia_kg_m2, "
             "motor.rated_torque_nm and encoder.resolution_rad."
         )
-    return f"Probing move: {found} {_REMEDY}" if found else ""
+    return f"Probing move: {message} {_ADVICE}" if message else ""
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
-    """Return a warning for each accepted but unusual ratio."""
-    low, high = WARNING_BAND
+    """Return a warning for each ratio of a probing move that is accepted but unusual."""
+    lowest_ratio, highest_ratio = WARNING_BAND
     return [
-        f"Probing move: {what} is {ratio:.2f} times what the profile states ({keys})."
-        for what, ratio, keys in (
-            ("the beam's torque at the measured angle", estimate.coupling_ratio, _SCALES),
+        f"Probing move: {quantity} is {ratio:.2f} times what the profile states ({keys})."
+        for quantity, ratio, keys in (
+            (
+                "the beam's torque at the measured angle",
+                estimate.coupling_ratio,
+                _COUPLING_RATIO_KEYS,
+            ),
             ("the motor's torque", estimate.torque_ratio, "motor.rated_torque_nm"),
             ("the motor's inertia", estimate.inertia_ratio, "motor.inertia_kg_m2"),
         )
-        if ratio is not None and not low <= ratio <= high
+        if ratio is not None and not lowest_ratio <= ratio <= highest_ratio
     ]
 
 
-_SCALES = "encoder.resolution_rad, sensor.projection and calibration, [beam]"
+_COUPLING_RATIO_KEYS = "encoder.resolution_rad, sensor.projection and calibration, [beam]"
+"""Keys of the profile on which the ratio of the coupling torques depends, for messages."""
 
 
-def _accepted(ratio: float | None) -> bool:
-    low, high = RATIO_BAND
-    return ratio is not None and low <= ratio <= high
+def _is_accepted(ratio: float | None) -> bool:
+    """Return whether a ratio is known and within `RATIO_BAND`."""
+    lowest_ratio, highest_ratio = RATIO_BAND
+    return ratio is not None and lowest_ratio <= ratio <= highest_ratio
 
 
-def _of_motion(rig: ProbedRig, end: ProbeEnd | None) -> str:
-    """Describe a shaft that moves the wrong way or, as measured, not at all."""
+def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
+    """Describe a shaft that moves in the wrong direction or shows no motion, or return ""."""
     if end is ProbeEnd.REVERSED:
         return (
             "the encoder counts against the torque: one of both has the wrong sign. Check "
@@ -296,11 +331,14 @@ def _of_motion(rig: ProbedRig, end: ProbeEnd | None) -> str:
     return ""
 
 
-def _of_coupling(estimate: ProbeEstimate, *, motor: bool) -> str:
+def _coupling_contradiction(estimate: ProbeEstimate, *, motor: bool) -> str:
+    """Describe a coupling torque that contradicts the profile's beam, or return ""."""
     ratio, std = estimate.coupling_ratio, estimate.coupling_std
     if ratio is None or std is None:
-        return f"the coupling torque is not the beam's at the measured angle ({_SCALES})."
-    if abs(ratio) < _NOTHING:
+        return (
+            f"the coupling torque is not the beam's at the measured angle ({_COUPLING_RATIO_KEYS})."
+        )
+    if abs(ratio) < _NO_TORQUE_RATIO:
         if not motor:
             return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
@@ -323,25 +361,27 @@ def _of_coupling(estimate: ProbeEstimate, *, motor: bool) -> str:
 
 
 def _likely_cause(estimate: ProbeEstimate, ratio: float) -> str:
+    """Describe the probable cause of a wrong ratio of the coupling torques."""
     scale, inertia = estimate.torque_ratio, estimate.inertia_ratio
     if scale is None or inertia is None:
-        return f"one of {_SCALES} is wrong by that ratio"
-    if _same(scale, 1.0) and _same(inertia, ratio):
+        return f"one of {_COUPLING_RATIO_KEYS} is wrong by that ratio"
+    if _is_same_ratio(scale, 1.0) and _is_same_ratio(inertia, ratio):
         return (
             "the motor's inertia shows the same ratio, so encoder.resolution_rad is probably too "
             f"{'small' if ratio > 1.0 else 'large'} by it"
         )
-    if _same(scale, ratio):
+    if _is_same_ratio(scale, ratio):
         return (
             "the motor's torque shows the same ratio, so the sensor's calibration or "
             "sensor.projection is probably wrong by it"
         )
-    if _same(scale, 1.0) and _same(inertia, 1.0):
+    if _is_same_ratio(scale, 1.0) and _is_same_ratio(inertia, 1.0):
         return "the motor agrees, so the data of the beam are probably wrong by it"
-    return f"one of {_SCALES} is wrong by that ratio"
+    return f"one of {_COUPLING_RATIO_KEYS} is wrong by that ratio"
 
 
-def _of_motor(estimate: ProbeEstimate) -> str:
+def _motor_contradiction(estimate: ProbeEstimate) -> str:
+    """Describe a torque or inertia of the motor that contradicts the profile, or return ""."""
     rows = (
         ("the motor exerts", estimate.torque_ratio, estimate.torque_std,
          "the torque commanded (motor.rated_torque_nm, or the drive's rated torque)"),
@@ -349,17 +389,18 @@ def _of_motor(estimate: ProbeEstimate) -> str:
          "the inertia of the profile (motor.inertia_kg_m2)"),
     )  # fmt: skip
     unknown = []
-    for verb, ratio, std, what in rows:
+    for clause, ratio, std, quantity in rows:
         if ratio is None or std is None:
-            unknown.append(what)
-        elif not _accepted(ratio):
-            return f"{verb} {ratio:.2g} ± {std:.1g} times {what}."
-        elif std > _LARGEST_STD * ratio:
-            unknown.append(what)
+            unknown.append(quantity)
+        elif not _is_accepted(ratio):
+            return f"{clause} {ratio:.2g} ± {std:.1g} times {quantity}."
+        elif std > _MAX_RELATIVE_STD * ratio:
+            unknown.append(quantity)
     if unknown:
         return f"it could not be determined how far the motor agrees with {' and '.join(unknown)}."
     return ""
 
 
-def _same(first: float, second: float) -> bool:
-    return first > 0.0 < second and abs(log(first / second)) < log(_SAME_FACTOR)
+def _is_same_ratio(first: float, second: float) -> bool:
+    """Return whether two ratios are positive and differ by less than `_SAME_RATIO_FACTOR`."""
+    return first > 0.0 < second and abs(log(first / second)) < log(_SAME_RATIO_FACTOR)

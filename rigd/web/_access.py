@@ -1,6 +1,6 @@
-"""Access to the page: permissions to read and to act, and protection against other pages.
+"""Access control of the page: permissions to read and to act, and protection from other pages.
 
-Any user of the port may read; acting needs the token of the printed address. Any page on the
+Any user of the port may read; acting requires the token of the printed address. Any page on the
 internet can resolve its own name to loopback (DNS rebinding) and send requests there. Requests
 therefore need a name of this computer as Host, the same origin, and a header that no form can send,
 and there are no cross-origin permissions.
@@ -24,22 +24,26 @@ if TYPE_CHECKING:
 Handler = Callable[[web.Request], Awaitable[web.StreamResponse]]
 
 LIVE: Final = "/api/live"
-"""Path of the live messages, with a limit on the open pages."""
+"""Path of the WebSocket with the live messages."""
 ICON: Final = "/favicon.ico"
-"""Path of the icon, which any page may load."""
-_OWN_NAMES: Final = frozenset({"127.0.0.1", "localhost"})
-_OWN_HEADER: Final = "X-Rigd"
-_FREE_COMMANDS: Final = frozenset({"stop", "predict"})
+"""Path of the page's icon, which any page may load."""
+_PERMITTED_HOSTS: Final = frozenset({"127.0.0.1", "localhost"})
+"""Host names under which the page may be requested."""
+_ACTION_HEADER: Final = "X-Rigd"
+"""HTTP header that the page sends with every request that acts."""
+_COMMANDS_WITHOUT_TOKEN: Final = frozenset({"stop", "predict"})
 """Commands without a token: any observer may stop the rig, and a prediction moves nothing."""
 
-_READ_S: Final = 5.0
-"""Timeout of a request's body."""
-_SILENT_S: Final = 10.0
-"""Timeout of a connection's first request."""
-_POLL_S: Final = 0.5
-_MOST_CONNECTIONS: Final = 96
+_BODY_TIMEOUT_S: Final = 5.0
+"""Timeout in seconds for the body of a request."""
+_FIRST_REQUEST_TIMEOUT_S: Final = 10.0
+"""Timeout in seconds for the first request of a connection."""
+_POLL_PERIOD_S: Final = 0.5
+"""Period in seconds in which silent connections are closed."""
+_MAX_CONNECTIONS: Final = 96
+"""Largest number of connections; beyond it the oldest ones without an open page are closed."""
 
-_POLICY: Final = "; ".join(
+_PAGE_POLICY: Final = "; ".join(  # Content security policy of the page
     (
         "default-src 'self'",
         "object-src 'none'",
@@ -59,9 +63,11 @@ REPORT_POLICY: Final = "; ".join(
         "sandbox allow-popups allow-downloads",
     )
 )
-"""Policy of reports, which are single files with inline style: no scripts, and no origin."""
-_HEADERS: Final = {
-    "Content-Security-Policy": _POLICY,
+"""Content security policy of reports, which are files with inline style.
+
+It permits no scripts, and gives reports no origin."""
+_SECURITY_HEADERS: Final = {  # Security headers of all responses
+    "Content-Security-Policy": _PAGE_POLICY,
     "X-Content-Type-Options": "nosniff",
     "Referrer-Policy": "no-referrer",
     "Cross-Origin-Resource-Policy": "same-origin",
@@ -71,63 +77,64 @@ _HEADERS: Final = {
 
 
 class WebAccess:
-    """Access control, which checks each request first.
+    """Checks the origin of each request and its permission to act.
 
     Parameters
     ----------
     token
-        Secret needed to act.
+        Secret that a request must contain to act.
     """
 
     def __init__(self, token: str) -> None:
         self._token = token.encode()
 
     @web.middleware
-    async def guard(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Handle a permitted request; return refusals and errors as JSON."""
+    async def check_and_respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Return the response of a permitted request, or a refusal or an error as JSON."""
         try:
-            refusal = _refusal(request)
+            refusal = _refusal_of_other_pages(request)
             response = await handler(request) if refusal is None else refusal
         except web.HTTPException as error:
-            response = refused(error.status, error.reason)
+            response = refusal_response(error.status, error.reason)
         except UserError as error:
-            response = refused(400, str(error))
+            response = refusal_response(400, str(error))
         except Exception as error:  # reported to the client, not on the terminal
-            response = refused(500, f"The page's server failed: {error!r}")
+            response = refusal_response(500, f"The page's server failed: {error!r}")
         return response
 
     @staticmethod
-    async def protect(_: web.Request, response: web.StreamResponse) -> None:
-        """Add the page's policy to a response that is about to be sent."""
-        for name, value in _HEADERS.items():
+    async def add_security_headers(_: web.Request, response: web.StreamResponse) -> None:
+        """Add the security headers to a response that is about to be sent."""
+        for name, value in _SECURITY_HEADERS.items():
             response.headers.setdefault(name, value)
 
     def may_act(self, request: web.Request) -> bool:
-        """Return whether a request has the token."""
-        scheme, _, given = request.headers.get("Authorization", "").partition(" ")
+        """Return whether a request has the token that permits it to act."""
+        scheme, _, given_token = request.headers.get("Authorization", "").partition(" ")
         return scheme == "Bearer" and hmac.compare_digest(
-            given.encode(errors="surrogateescape"), self._token
+            given_token.encode(errors="surrogateescape"), self._token
         )
 
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
-        """Return whether a request may send a command to the control socket.
+        """Return whether a request may send a command to the daemon.
 
         Parameters
         ----------
         request
             Request with the command.
         command, parameters
-            Members of the command. A prediction from a file makes the daemon read that file.
+            Name and parameters of the command. A prediction from a file requires the token, because
+            the daemon would read that file.
         """
         if self.may_act(request):
             return True
         reads_a_file = (
             command == "predict" and isinstance(parameters, dict) and "path" in parameters
         )
-        return command in _FREE_COMMANDS and not reads_a_file
+        return command in _COMMANDS_WITHOUT_TOKEN and not reads_a_file
 
 
-async def object_of(request: web.Request) -> dict[str, Any]:
+async def read_json_object(request: web.Request) -> dict[str, Any]:
     """Return the JSON object in a request's body.
 
     Parameters
@@ -141,109 +148,121 @@ async def object_of(request: web.Request) -> dict[str, Any]:
         If the body is no JSON object, or does not arrive in time.
     """
     try:
-        given = json.loads(await asyncio.wait_for(request.read(), _READ_S))
+        value = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
     except TimeoutError:
         raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
     except (ValueError, RecursionError):
-        given = None
-    if not isinstance(given, dict):
+        value = None
+    if not isinstance(value, dict):
         raise web.HTTPBadRequest(reason="The request is not a JSON object.")
-    return given
+    return value
 
 
-def refused(status: int, text: str) -> web.Response:
-    """Return a refusal for the page.
+def refusal_response(status: int, text: str) -> web.Response:
+    """Return the JSON response that refuses a request.
 
     Parameters
     ----------
     status
-        HTTP status.
+        HTTP status code.
     text
         Sentence for the operator.
     """
     return web.json_response({"ok": False, "error": text, "wrong_use": True}, status=status)
 
 
-def _refusal(request: web.Request) -> web.Response | None:
-    """Return the refusal of a request that this server's page would not send; None if permitted."""
+def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
+    """Return the refusal of a request that this server's own page would not send, or None."""
     host = request.headers.get("Host", "")
     # The port may differ because of a tunnel, but the name must be local.
-    if _name_of(host) not in _OWN_NAMES:
-        return refused(403, "Open this page as http://127.0.0.1:PORT/.")
+    if _host_name_of(host) not in _PERMITTED_HOSTS:
+        return refusal_response(403, "Open this page as http://127.0.0.1:PORT/.")
     origin = request.headers.get("Origin")
     if origin is not None and origin != f"http://{host}":
-        return refused(403, "Requests from other pages are refused.")
+        return refusal_response(403, "Requests from other pages are refused.")
     # A sandboxed report counts as another origin, and its browser requests the icon.
-    site = request.headers.get("Sec-Fetch-Site", "same-origin")
-    if site not in ("same-origin", "none") and request.path != ICON:
-        return refused(403, "Requests from other pages are refused.")
+    fetch_site = request.headers.get("Sec-Fetch-Site", "same-origin")
+    if fetch_site not in ("same-origin", "none") and request.path != ICON:
+        return refusal_response(403, "Requests from other pages are refused.")
     if request.method not in ("GET", "HEAD", "POST"):
-        return refused(405, "Only GET, HEAD and POST are answered.")
+        return refusal_response(405, "Only GET, HEAD and POST are answered.")
     if request.method == "POST" and (
-        request.headers.get(_OWN_HEADER) != "1" or request.content_type != "application/json"
+        request.headers.get(_ACTION_HEADER) != "1" or request.content_type != "application/json"
     ):
-        return refused(403, f"A request that acts is JSON and has the header {_OWN_HEADER}: 1.")
+        return refusal_response(
+            403, f"A request that acts is JSON and has the header {_ACTION_HEADER}: 1."
+        )
     return None
 
 
-def _name_of(host: str) -> str:
-    """Return the name in a Host header; empty if it is not just a name and a port."""
+def _host_name_of(host: str) -> str:
+    """Return the name in a Host header, or "" unless it has only a name and a port."""
     try:
-        split = urlsplit(f"//{host}")
-        port = split.port
+        parsed = urlsplit(f"//{host}")
+        port = parsed.port
     except ValueError:
         return ""
-    plain = split.hostname if port is None else f"{split.hostname}:{port}"
-    return (split.hostname or "") if plain == host else ""
+    name_and_port = parsed.hostname if port is None else f"{parsed.hostname}:{port}"
+    return (parsed.hostname or "") if name_and_port == host else ""
 
 
 # Connections
 
 
 class Connections:
-    """Limits of the number of connections and of their time without a request.
+    """Limits the number of connections and the time until their first request.
 
     Attributes
     ----------
     serving
-        Server of the connections; set it before the first one.
+        Server of the connections; it must be set before the first connection.
     """
 
     serving: web.Server
 
     def __init__(self) -> None:
-        self._silent: dict[RequestHandler, float] = {}
-        """Deadlines of the connections that have sent no request yet."""
+        self._first_request_deadlines: dict[RequestHandler, float] = {}
+        """Deadline of each connection that has sent no request yet."""
         self._pages: set[RequestHandler] = set()
+        """Connections of open pages."""
 
     def close_silent(self) -> None:
-        """Close connections that send no request in time, periodically from now on."""
-        now_s, open_now = time.monotonic(), set(self.serving.connections)
-        self._silent = {each: end_s for each, end_s in self._silent.items() if each in open_now}
-        for protocol, end_s in self._silent.items():
+        """Close connections that have sent no request in time, now and periodically."""
+        now_s, open_connections = time.monotonic(), set(self.serving.connections)
+        self._first_request_deadlines = {
+            each: end_s
+            for each, end_s in self._first_request_deadlines.items()
+            if each in open_connections
+        }
+        for protocol, end_s in self._first_request_deadlines.items():
             if end_s < now_s and protocol.transport is not None:
                 protocol.transport.abort()
-        asyncio.get_running_loop().call_later(_POLL_S, self.close_silent)
+        asyncio.get_running_loop().call_later(_POLL_PERIOD_S, self.close_silent)
 
-    def welcome(self) -> asyncio.Protocol:
-        """Return the protocol of a new connection; the oldest one without a page may close."""
-        open_now = [
+    def accept_connection(self) -> asyncio.Protocol:
+        """Return the protocol of a new connection, and close old ones if there are too many.
+
+        Connections of open pages are not closed.
+        """
+        open_connections = [
             (each, each.transport)
             for each in self.serving.connections
             if each.transport is not None and not each.transport.is_closing()
         ]
-        too_many = max(0, len(open_now) - _MOST_CONNECTIONS + 1)
+        too_many = max(0, len(open_connections) - _MAX_CONNECTIONS + 1)
         # The newest client may want to stop the rig.
-        for transport in [each[1] for each in open_now if each[0] not in self._pages][:too_many]:
+        for transport in [each[1] for each in open_connections if each[0] not in self._pages][
+            :too_many
+        ]:
             transport.abort()
         protocol = self.serving()
-        self._silent[protocol] = time.monotonic() + _SILENT_S
+        self._first_request_deadlines[protocol] = time.monotonic() + _FIRST_REQUEST_TIMEOUT_S
         return protocol
 
     @web.middleware
-    async def note_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
-        """Register the request of a connection, and connections of open pages."""
-        self._silent.pop(request.protocol, None)
+    async def register_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:
+        """Register the first request of a connection, and the connections of open pages."""
+        self._first_request_deadlines.pop(request.protocol, None)
         if request.path != LIVE:
             return await handler(request)
         self._pages.add(request.protocol)

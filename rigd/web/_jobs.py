@@ -1,6 +1,6 @@
-"""Jobs of the page: reports, campaigns and exports by `analyze`, at idle priority.
+"""Queue of the page's jobs: reports, campaigns and exports by `analyze`, at idle priority.
 
-They are suspended while a session runs, and end with the page's process, however that ends.
+Jobs are suspended while a session runs, and end with the page's process, however it ends.
 """
 
 import asyncio
@@ -17,10 +17,11 @@ from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, give_way
 
 Document = dict[str, Any]
 
-MOST_JOBS: Final = 16
-"""Limit of the waiting jobs."""
+MAX_JOBS: Final = 16
+"""Largest number of waiting jobs."""
 _PROGRAM: Final = (*OWN_PYTHON, "-m", "analysis")
-_DIE_WITH_PAGE: Final = """
+"""Command line of `analyze`."""
+_RUN_AND_DIE_WITH_PAGE: Final = """
 import os, signal, sys
 from rigd.runtime import die_with_parent, prefer_oom_kill
 
@@ -29,38 +30,47 @@ prefer_oom_kill()
 signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
 os.execv(sys.argv[2], sys.argv[2:])
 """
-"""Program that executes another one, which ends with the process of its first argument, and first
-of all if memory runs out."""
-_POLL_S: Final = 0.2
-_MOST_STDERR_BYTES: Final = 1000
-_MOST_LINES: Final = 3
+"""Program that executes another one, which the system kills when the page's process ends.
+
+Its first argument is the id of that process. If memory runs out, the system kills the executed
+program first."""
+_POLL_PERIOD_S: Final = 0.2
+"""Period in seconds in which waiting and running jobs are polled."""
+_MAX_STDERR_BYTES: Final = 1000
+"""Number of bytes at the end of a failed job's standard error that are reported."""
+_MAX_STDERR_LINES: Final = 3
+"""Number of lines at the end of a failed job's standard error that are reported."""
 
 
 class JobError(Exception):
-    """A job is refused or failed; the message is for the operator."""
+    """A job was refused or has failed; the message is for the operator."""
 
 
 @dataclass(slots=True)
 class AnalysisJob:
-    """One job of `analyze`."""
+    """Run of `analyze` that the page has requested, with its state."""
 
     number: int
+    """Number of the job, from 1."""
     kind: str
-    """``report``, ``campaign`` or ``export``."""
+    """Kind of the job: ``report``, ``campaign`` or ``export``."""
     arguments: Sequence[str]
-    """Command line of `analyze`."""
+    """Arguments of `analyze`."""
     id: str = ""
-    """Session of the job; empty for several sessions."""
+    """Name of the job's session, or "" for several sessions."""
     address: str = ""
-    """Path at which the result is served."""
+    """URL path at which the result is served."""
     state: str = "waiting"
+    """State of the job: ``waiting``, ``running``, ``done`` or ``failed``."""
     error: str = ""
+    """Message for the operator if the job failed."""
     dropped: bool = False
-    """Whether it was dropped because a session has begun."""
+    """Whether the job was dropped because a session has begun."""
     done: asyncio.Event = field(default_factory=asyncio.Event)
+    """Event that is set when the job has ended."""
 
     def document(self) -> Document:
-        """Return the state of the job as a message for the page."""
+        """Return the state of the job as a message to the open pages."""
         return {
             "type": "job",
             "number": self.number,
@@ -73,66 +83,66 @@ class AnalysisJob:
 
 
 class Jobs:
-    """Queue of jobs, which run one after the other without disturbing a session.
+    """Runs queued jobs one after the other, without disturbing a session.
 
     Parameters
     ----------
     folder
         Folder of the sessions and working directory of the jobs.
     publish
-        Called with each change of a job.
+        Function that receives the state of a job after each change.
 
     Attributes
     ----------
     paused
-        Whether a session runs.
+        Whether jobs are suspended because a session runs.
     """
 
     def __init__(self, folder: Path, publish: Callable[[Document], None]) -> None:
         self.paused = True  # until the daemon reports that no session runs
         self._folder = folder
         self._publish = publish
-        self._waiting: asyncio.Queue[AnalysisJob] = asyncio.Queue(MOST_JOBS)
+        self._queue: asyncio.Queue[AnalysisJob] = asyncio.Queue(MAX_JOBS)
         self._unfinished: dict[int, AnalysisJob] = {}
         self._count = 0
 
     @property
     def addresses(self) -> set[str]:
-        """Paths of the results of waiting and running jobs."""
+        """URL paths of the results of waiting and running jobs."""
         return {job.address for job in self._unfinished.values()}
 
     def put(
         self, kind: str, arguments: Sequence[str], session: str = "", address: str = ""
     ) -> AnalysisJob:
-        """Queue a job.
+        """Queue a job of `analyze`, and return it.
 
         Parameters
         ----------
         kind, arguments, session, address
-            See `AnalysisJob`.
+            Kind, arguments, session and URL path of the job: see `AnalysisJob`.
 
         Raises
         ------
         JobError
-            If too many jobs wait.
+            If too many jobs are waiting.
         """
         self._count += 1
         job = AnalysisJob(self._count, kind, arguments, session, address)
         try:
-            self._waiting.put_nowait(job)
+            self._queue.put_nowait(job)
         except asyncio.QueueFull:
-            raise JobError(f"{MOST_JOBS} jobs are waiting already; try again later.") from None
+            raise JobError(f"{MAX_JOBS} jobs are waiting already; try again later.") from None
         self._unfinished[job.number] = job
         self._publish_state(job)
         return job
 
     async def await_or_drop(self, job: AnalysisJob) -> None:
-        """Wait for the end of a job; drop it if a session begins.
+        """Wait for the end of a job, but drop the job if a session begins.
 
         Parameters
         ----------
         job
-            Queued job, whose ``dropped`` is true if it was dropped.
+            Queued job; its ``dropped`` is set if it was dropped.
         """
         while not job.done.is_set():
             if self.paused:
@@ -140,19 +150,19 @@ class Jobs:
                 if job.state == "waiting":
                     return
             with suppress(TimeoutError):
-                await asyncio.wait_for(job.done.wait(), _POLL_S)
+                await asyncio.wait_for(job.done.wait(), _POLL_PERIOD_S)
 
     async def run(self) -> None:
         """Run the queued jobs until cancelled."""
         while True:
-            job = await self._waiting.get()
+            job = await self._queue.get()
             while self.paused:
-                await asyncio.sleep(_POLL_S)
+                await asyncio.sleep(_POLL_PERIOD_S)
             if not job.dropped:
                 job.state = "running"
                 self._publish_state(job)
                 try:
-                    await self._perform(job)
+                    await self._run_process(job)
                     job.state = "done"
                 except (JobError, OSError) as error:
                     job.state, job.error = "failed", str(error)
@@ -161,13 +171,14 @@ class Jobs:
             del self._unfinished[job.number]
 
     def _publish_state(self, job: AnalysisJob) -> None:
-        """Publish the state of a job, except of an export, whose request waits for it."""
+        """Send the state of a job to the pages, except of an export, whose request waits for it."""
         if job.kind != "export":
             self._publish(job.document())
 
-    async def _perform(self, job: AnalysisJob) -> None:
+    async def _run_process(self, job: AnalysisJob) -> None:
+        """Run a job's process to its end, or raise JobError if it is dropped or fails."""
         process = await asyncio.create_subprocess_exec(
-            *(*OWN_PYTHON, "-c", _DIE_WITH_PAGE, str(os.getpid())),
+            *(*OWN_PYTHON, "-c", _RUN_AND_DIE_WITH_PAGE, str(os.getpid())),
             *(*_PROGRAM, *job.arguments),
             cwd=self._folder,
             stdin=subprocess.DEVNULL,
@@ -180,31 +191,32 @@ class Jobs:
             process_group=0,
         )
         give_way(process.pid)
-        ending = asyncio.create_task(process.communicate())
-        stopped = False
+        communication = asyncio.create_task(process.communicate())
+        suspended = False
         try:
-            while not ending.done():
+            while not communication.done():
                 if job.dropped:
                     raise JobError("A session has begun.")
-                if self.paused is not stopped:
-                    stopped = self.paused
-                    _signal(process.pid, signal.SIGSTOP if stopped else signal.SIGCONT)
-                await asyncio.wait((ending,), timeout=_POLL_S)
-            _, stderr = ending.result()
+                if self.paused is not suspended:
+                    suspended = self.paused
+                    _signal_group(process.pid, signal.SIGSTOP if suspended else signal.SIGCONT)
+                await asyncio.wait((communication,), timeout=_POLL_PERIOD_S)
+            _, stderr = communication.result()
         finally:
             if process.returncode is None:
-                _signal(process.pid, signal.SIGKILL)
-                await asyncio.wait((ending,))
+                _signal_group(process.pid, signal.SIGKILL)
+                await asyncio.wait((communication,))
         if process.returncode != 0:
-            words = (
+            last_lines = (
                 stderr.decode(errors="replace")
-                .strip()[-_MOST_STDERR_BYTES:]
-                .splitlines()[-_MOST_LINES:]
+                .strip()[-_MAX_STDERR_BYTES:]
+                .splitlines()[-_MAX_STDERR_LINES:]
             )
-            why = " ".join(words) or f"exit code {process.returncode}"
+            why = " ".join(last_lines) or f"exit code {process.returncode}"
             raise JobError(f"The {job.kind} was not made: {why}")
 
 
-def _signal(group: int, number: int) -> None:
+def _signal_group(group: int, number: int) -> None:
+    """Send a signal to a process group, if it exists."""
     with suppress(ProcessLookupError):
         os.killpg(group, number)

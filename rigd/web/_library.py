@@ -1,4 +1,4 @@
-"""Sessions on the page: the library's rows, quick looks, reports and downloads.
+"""Routes for recorded sessions: their list, quick looks, reports and downloads.
 
 The name of a session is the stem of its file. No address of the page contains a path.
 """
@@ -16,23 +16,31 @@ from aiohttp import web
 
 from rigd.library import REPORT_PAGE, SessionRow, list_sessions
 from rigd.session.quick_look import QUICK_LOOK_SUFFIX, last_quick_look, read_quick_look
-from rigd.web._access import REPORT_POLICY, WebAccess, object_of, refused
+from rigd.web._access import REPORT_POLICY, WebAccess, read_json_object, refusal_response
 from rigd.web._jobs import JobError, Jobs
 
 Document = dict[str, Any]
 
-_MOST_ROWS: Final = 1000
-_ROWS: Final = 50
-_MOST_IDS: Final = 100
-_MOST_CURVES: Final = 12
+_MAX_ROWS: Final = 1000
+"""Largest number of sessions in one reply."""
+_DEFAULT_ROWS: Final = 50
+"""Default number of sessions in one reply."""
+_MAX_CAMPAIGN_SESSIONS: Final = 100
+"""Largest number of sessions in a campaign."""
+_MAX_RESPONSES: Final = 12
+"""Largest number of frequency responses in one reply."""
 _FILTERS: Final = ("specimen", "operator", "excitation", "outcome", "since", "until", "text")
-_EXPORTS: Final = {"mat": ".mat", "uff": ".uff"}
-_REPORT_FILES: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
-_SESSION_RUNS: Final = "A session runs; files are converted when it has ended."
+"""Query parameters that filter the list of sessions."""
+_EXPORT_SUFFIXES: Final = {"mat": ".mat", "uff": ".uff"}
+"""Suffixes of files that sessions can be converted into, by the end of the URL."""
+_REPORT_FILE_NAME: Final = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_.-]*")
+"""Pattern of the names of a report's files."""
+_SESSION_RUNS_MESSAGE: Final = "A session runs; files are converted when it has ended."
+"""Message that refuses a conversion."""
 
 
 class Library:
-    """Server of the files in the sessions' folder only.
+    """Serves the sessions in one folder to the page, and no other files.
 
     Parameters
     ----------
@@ -49,245 +57,267 @@ class Library:
         self._access = access
         self._jobs = jobs
         self._exporting = asyncio.Lock()
-        self._listing = asyncio.Lock()
-        """Lock for one list at a time, because lists may be slow and requests many."""
+        self._list_lock = asyncio.Lock()
+        """Lock so that one list is made at a time, because lists may be slow and requests many."""
 
     def routes(self) -> list[web.RouteDef]:
-        """Return the routes of the library."""
+        """Return the HTTP routes of the recorded sessions."""
         return [
-            web.get("/api/sessions", self._list),
-            web.get("/api/sessions/{id}/file.{ending}", self._file),
-            web.get("/api/sessions/{id}/look", self._quick_look),
-            web.get("/api/sessions/{id}/report/", self._report),
-            web.get("/api/sessions/{id}/report/{name}", self._report),
+            web.get("/api/sessions", self._list_sessions),
+            web.get("/api/sessions/{id}/file.{ending}", self._send_file),
+            web.get("/api/sessions/{id}/look", self._send_quick_look),
+            web.get("/api/sessions/{id}/report/", self._send_report),
+            web.get("/api/sessions/{id}/report/{name}", self._send_report),
             web.post("/api/sessions/{id}/report", self._make_report),
-            web.get("/api/campaign/{name}/", self._campaign),
-            web.get("/api/campaign/{name}/{file}", self._campaign),
+            web.get("/api/campaign/{name}/", self._send_campaign_report),
+            web.get("/api/campaign/{name}/{file}", self._send_campaign_report),
             web.post("/api/campaign", self._make_campaign),
-            web.get("/api/frf", self._responses),
+            web.get("/api/frf", self._send_responses),
         ]
 
     async def rows(self, **filters: Any) -> list[SessionRow]:  # noqa: ANN401 - the library's
-        """Return the sessions of the folder, newest first.
+        """Return the sessions of the folder that pass the filters, the newest first.
 
         Parameters
         ----------
         **filters
-            As for `rigd.library.list_sessions`.
+            Filters of `rigd.library.list_sessions`.
         """
-        async with self._listing:
+        async with self._list_lock:
             return await asyncio.to_thread(list_sessions, self._folder, **filters)
 
     async def specimens(self) -> list[str]:
-        """Return the specimens of all sessions, the latest first."""
+        """Return the names of the specimens of all sessions, the most recent first."""
         return list(dict.fromkeys(row.specimen for row in await self.rows() if row.specimen))
 
     async def last_response(self, specimen: str, but: str) -> Document | None:
-        """Return the response of the last session of a specimen, as a message for the page.
+        """Return the frequency response of a specimen's last session, as a message to the pages.
+
+        It is None if there is none.
 
         Parameters
         ----------
         specimen
-            Name of the specimen; empty: of the last session without a name.
+            Name of the specimen, or "" for the last session without a specimen's name.
         but
-            Session to exclude, because it is running.
+            Name of a session to exclude, because it is running.
         """
-        found = await asyncio.to_thread(
+        newest = await asyncio.to_thread(
             partial(last_quick_look, self._folder, specimen, but=but, usable=itemgetter("response"))
         )
-        if found is None:
+        if newest is None:
             return None
-        path, quick_look = found
-        where = {"type": "last", "path": str(path), "specimen": specimen}
-        return {**quick_look["response"], **where, "id": path.stem}
+        path, quick_look = newest
+        description = {"type": "last", "path": str(path), "specimen": specimen}
+        return {**quick_look["response"], **description, "id": path.stem}
 
     # Rows
 
-    async def _list(self, request: web.Request) -> web.Response:
+    async def _list_sessions(self, request: web.Request) -> web.Response:
+        """Send a part of the list of sessions."""
         filters = {name: value for name in _FILTERS if (value := request.query.get(name))}
         limit, offset = (
-            _whole(request.query.get(name, str(usual)), name)
-            for name, usual in (("limit", _ROWS), ("offset", 0))
+            _whole_number(request.query.get(name, str(default)), name)
+            for name, default in (("limit", _DEFAULT_ROWS), ("offset", 0))
         )
         rows = await self.rows(**filters)
-        shown = rows[offset : offset + min(limit, _MOST_ROWS)]
+        shown = rows[offset : offset + min(limit, _MAX_ROWS)]
         return web.json_response({"total": len(rows), "sessions": [row.as_dict() for row in shown]})
 
-    async def _quick_look(self, request: web.Request) -> web.Response:
-        quick_look = self._read_quick_look(self._session(request).stem)
+    async def _send_quick_look(self, request: web.Request) -> web.Response:
+        """Send the quick look of a session."""
+        quick_look = self._read_quick_look(self._requested_session(request).stem)
         return (
-            refused(404, "There is no quick look of it.")
+            refusal_response(404, "There is no quick look of it.")
             if quick_look is None
             else web.json_response(quick_look)
         )
 
-    async def _responses(self, request: web.Request) -> web.Response:
-        """Return fitted models and measured responses of several sessions for comparison."""
+    async def _send_responses(self, request: web.Request) -> web.Response:
+        """Send fitted models and measured responses of several sessions for comparison."""
         ids = [name for name in request.query.get("ids", "").split(",") if name]
-        if not 1 <= len(ids) <= _MOST_CURVES:
-            return refused(400, f"ids: name 1 to {_MOST_CURVES} sessions.")
+        if not 1 <= len(ids) <= _MAX_RESPONSES:
+            return refusal_response(400, f"ids: name 1 to {_MAX_RESPONSES} sessions.")
         responses, errors = [], []
         for name in ids:
-            quick_look = self._read_quick_look(self._path(name).stem)
+            quick_look = self._read_quick_look(self._session_path(name).stem)
             if quick_look is None or quick_look["response"] is None:
                 errors.append(f"{name}: there is no quick look of it, and so no response.")
             else:
-                about = {
+                identity = {
                     "id": name,
                     "specimen": quick_look["specimen"],
                     "model": quick_look["model"],
                 }
-                responses.append({**about, **quick_look["response"]})
+                responses.append({**identity, **quick_look["response"]})
         return web.json_response({"responses": responses, "errors": errors})
 
     # Downloads
 
-    async def _file(self, request: web.Request) -> web.StreamResponse:
-        path = self._session(request)
+    async def _send_file(self, request: web.Request) -> web.StreamResponse:
+        """Send a session file, converted if another format is requested."""
+        path = self._requested_session(request)
         ending = request.match_info["ending"]
         if ending == "mcap":
             return web.FileResponse(path, headers=_download_headers(path.name))
-        if ending not in _EXPORTS:
-            return refused(404, "There are .mcap, .mat and .uff.")
+        if ending not in _EXPORT_SUFFIXES:
+            return refusal_response(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
-            return refused(409, _SESSION_RUNS)
+            return refusal_response(409, _SESSION_RUNS_MESSAGE)
         # A browser has few connections to a server, so none may wait here for another.
         if self._exporting.locked():
-            return refused(409, "Another file is being converted; try again when it is done.")
+            return refusal_response(
+                409, "Another file is being converted; try again when it is done."
+            )
         async with self._exporting:
             with tempfile.TemporaryDirectory(prefix="rigd-page-") as folder:
-                out = Path(folder) / f"{path.stem}{_EXPORTS[ending]}"
+                out = Path(folder) / f"{path.stem}{_EXPORT_SUFFIXES[ending]}"
                 arguments = ("export", "record", str(path), str(out))
                 try:
                     job = self._jobs.put("export", arguments, path.stem)
                 except JobError as error:
-                    return refused(409, str(error))
+                    return refusal_response(409, str(error))
                 await self._jobs.await_or_drop(job)
                 if job.dropped:
-                    return refused(409, _SESSION_RUNS)
+                    return refusal_response(409, _SESSION_RUNS_MESSAGE)
                 if job.error:
-                    return refused(409, job.error)
+                    return refusal_response(409, job.error)
                 # The open file can be sent after its folder is deleted.
                 return web.Response(body=out.open("rb"), headers=_download_headers(out.name))
 
     # Reports
 
-    async def _report(self, request: web.Request) -> web.StreamResponse:
-        path = self._session(request)
-        found = next((row for row in await self.rows() if row.path.name == path.name), None)
-        if found is None or found.report is None:
-            return refused(404, "There is no report of it.")
-        return self._page_of(found.report.parent, request.match_info.get("name", REPORT_PAGE))
+    async def _send_report(self, request: web.Request) -> web.StreamResponse:
+        """Send a file of a session's report."""
+        path = self._requested_session(request)
+        session_row = next((row for row in await self.rows() if row.path.name == path.name), None)
+        if session_row is None or session_row.report is None:
+            return refusal_response(404, "There is no report of it.")
+        return self._report_file(
+            session_row.report.parent, request.match_info.get("name", REPORT_PAGE)
+        )
 
-    async def _campaign(self, request: web.Request) -> web.StreamResponse:
-        folder = self._inside(request.match_info["name"])
+    async def _send_campaign_report(self, request: web.Request) -> web.StreamResponse:
+        """Send a file of a campaign's report."""
+        folder = self._path_in_folder(request.match_info["name"])
         if not folder.name.startswith("campaign.report"):
-            return refused(404, "There is no such campaign.")
-        return self._page_of(folder, request.match_info.get("file", REPORT_PAGE))
+            return refusal_response(404, "There is no such campaign.")
+        return self._report_file(folder, request.match_info.get("file", REPORT_PAGE))
 
-    def _page_of(self, folder: Path, name: str) -> web.StreamResponse:
-        """Return one file of a report, which must be a regular file in its folder."""
-        if not _REPORT_FILES.fullmatch(name):
-            return refused(404, "There is no such file.")
+    def _report_file(self, folder: Path, name: str) -> web.StreamResponse:
+        """Return the response with a file of a report, or a refusal.
+
+        Only regular files in the report's folder are served.
+        """
+        if not _REPORT_FILE_NAME.fullmatch(name):
+            return refusal_response(404, "There is no such file.")
         path = (folder / name).resolve()
         if path.parent.parent != self._folder.resolve() or not path.is_file():
-            return refused(404, "There is no such file.")
+            return refusal_response(404, "There is no such file.")
         return web.FileResponse(path, headers={"Content-Security-Policy": REPORT_POLICY})
 
     async def _make_report(self, request: web.Request) -> web.Response:
+        """Queue the report of a session."""
         if not self._access.may_act(request):
-            return refused(403, "Making a report needs the token of the printed address.")
-        path = self._session(request)
+            return refusal_response(403, "Making a report needs the token of the printed address.")
+        path = self._requested_session(request)
         address = f"/api/sessions/{path.stem}/report/"
-        return self._queue("report", [str(path)], path.stem, address)
+        return self._queue_job("report", [str(path)], path.stem, address)
 
     async def _make_campaign(self, request: web.Request) -> web.Response:
+        """Queue the report of several sessions together."""
         if not self._access.may_act(request):
-            return refused(403, "A campaign needs the token of the printed address.")
-        given = await object_of(request)
-        ids = given.get("ids")
+            return refusal_response(403, "A campaign needs the token of the printed address.")
+        body = await read_json_object(request)
+        ids = body.get("ids")
         if (
             not isinstance(ids, list)
-            or not 2 <= len(ids) <= _MOST_IDS
+            or not 2 <= len(ids) <= _MAX_CAMPAIGN_SESSIONS
             or not all(isinstance(name, str) for name in ids)
         ):
-            return refused(400, f"ids: name 2 to {_MOST_IDS} sessions.")
-        paths = sorted({str(self._path(name)) for name in ids})  # in the order of recording
-        folder = self._free("campaign.report")
+            return refusal_response(400, f"ids: name 2 to {_MAX_CAMPAIGN_SESSIONS} sessions.")
+        paths = sorted({str(self._session_path(name)) for name in ids})  # in the order of recording
+        folder = self._unused_folder("campaign.report")
         arguments = [*paths, "--jobs", "1", "--report", str(folder)]
-        return self._queue("campaign", arguments, "", _served_at(folder))
+        return self._queue_job("campaign", arguments, "", _campaign_url_path(folder))
 
-    def _queue(self, kind: str, arguments: list[str], name: str, address: str) -> web.Response:
+    def _queue_job(self, kind: str, arguments: list[str], name: str, address: str) -> web.Response:
+        """Queue a job, and return the response with its number or a refusal."""
         try:
             job = self._jobs.put(kind, arguments, name, address)
         except JobError as error:
-            return refused(409, str(error))
+            return refusal_response(409, str(error))
         return web.json_response({"ok": True, "job": job.number}, status=202)
 
-    def _free(self, name: str) -> Path:
-        """Return an unused folder name, which no waiting campaign will create either."""
+    def _unused_folder(self, name: str) -> Path:
+        """Return the path of a new folder that no queued campaign will create either."""
         number, path = 1, self._folder / name
-        while path.exists() or _served_at(path) in self._jobs.addresses:
+        while path.exists() or _campaign_url_path(path) in self._jobs.addresses:
             number += 1
             path = self._folder / f"{name}-{number}"
         return path
 
     # Names
 
-    def _session(self, request: web.Request) -> Path:
-        return self._path(request.match_info["id"])
+    def _requested_session(self, request: web.Request) -> Path:
+        """Return the file of the session that a request names."""
+        return self._session_path(request.match_info["id"])
 
-    def _path(self, name: str) -> Path:
-        """Return the file of a session.
+    def _session_path(self, name: str) -> Path:
+        """Return the file of the session with a name.
 
         Raises
         ------
         HTTPNotFound
             If the folder has no regular file of that name.
         """
-        path = self._inside(f"{name}.mcap")
+        path = self._path_in_folder(f"{name}.mcap")
         if not path.is_file():
             raise web.HTTPNotFound(reason="There is no such session.")
         return path
 
-    def _inside(self, name: str) -> Path:
-        """Return the path of a name in the folder.
+    def _path_in_folder(self, name: str) -> Path:
+        """Return the path of a file or folder in the sessions' folder by its name.
 
         Raises
         ------
         HTTPNotFound
-            If the name is a path, or a link out of the folder.
+            If the name is a path, a link out of the folder, or does not exist.
         """
         with suppress(OSError, ValueError):
             path = self._folder / name
-            plain = Path(name).name == name and not name.startswith(".") and name.isprintable()
+            is_plain_name = (
+                Path(name).name == name and not name.startswith(".") and name.isprintable()
+            )
             path.lstat()  # raises if it does not exist or the name is too long
-            if plain and path.resolve().parent == self._folder.resolve():
+            if is_plain_name and path.resolve().parent == self._folder.resolve():
                 return path
         raise web.HTTPNotFound(reason="There is no such session.")
 
     def _read_quick_look(self, name: str) -> Document | None:
-        """Return the quick look of a session; None if there is none or it is unreadable."""
+        """Return the quick look of a session, or None if there is none or it is unreadable."""
         with suppress(web.HTTPNotFound):
-            return read_quick_look(self._inside(f"{name}{QUICK_LOOK_SUFFIX}"))
+            return read_quick_look(self._path_in_folder(f"{name}{QUICK_LOOK_SUFFIX}"))
         return None
 
 
-def _served_at(folder: Path) -> str:
-    """Return the path at which a campaign's report is served."""
+def _campaign_url_path(folder: Path) -> str:
+    """Return the URL path at which a campaign's report is served."""
     return f"/api/campaign/{folder.name}/"
 
 
 def _download_headers(name: str) -> dict[str, str]:
+    """Return the HTTP headers that make a browser save a file under a name."""
     # The name of a session may contain any character of file names.
-    plain = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+    is_plain_name = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
     return {
-        "Content-Disposition": f'attachment; filename="{plain}"',
+        "Content-Disposition": f'attachment; filename="{is_plain_name}"',
         "Content-Type": "application/octet-stream",
     }
 
 
-def _whole(text: str, name: str) -> int:
-    if not text.isdecimal() or len(text) > len(str(_MOST_ROWS)) + 3:
+def _whole_number(text: str, name: str) -> int:
+    """Return a query parameter as a whole number, or raise HTTPBadRequest."""
+    if not text.isdecimal() or len(text) > len(str(_MAX_ROWS)) + 3:
         raise web.HTTPBadRequest(reason=f"{name} is not a whole number.")
     return int(text)

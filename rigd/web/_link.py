@@ -1,4 +1,4 @@
-"""The page's connection to the daemon's control socket, restored when it is lost."""
+"""Connection of the page's server to the daemon's control socket, which reconnects by itself."""
 
 import asyncio
 import json
@@ -12,40 +12,47 @@ from typing import Any, Final
 Document = dict[str, Any]
 _Connection = tuple[asyncio.StreamReader, asyncio.StreamWriter]
 
-_STATUS_S: Final = 1.0
-"""Period of status requests while signals arrive."""
-_ALIVE_S: Final = 0.4
-"""Period of status requests while no signals arrive."""
-_SILENT_S: Final = 0.85
-"""Time without a message after which the daemon is reported as silent."""
-_POLL_S: Final = 0.1
-_RETRY_S: Final = 0.5
-_CONNECT_S: Final = 5.0
-_ANSWER_S: Final = 90.0
-_LONGEST_LINE: Final = 1 << 20
-_CROWD_TRIES: Final = 20
-_CROWD_PAUSE_S: Final = 0.1
+_STATUS_PERIOD_S: Final = 1.0
+"""Period in seconds of status requests while signals arrive."""
+_STATUS_PERIOD_WITHOUT_SIGNALS_S: Final = 0.4
+"""Period in seconds of status requests while no signals arrive."""
+_SILENCE_TIMEOUT_S: Final = 0.85
+"""Seconds without a message after which the daemon is reported as silent."""
+_MIN_CHECK_PERIOD_S: Final = 0.1
+"""Shortest period in seconds in which silence is checked."""
+_RECONNECT_PAUSE_S: Final = 0.5
+"""Pause in seconds before a lost connection is opened again."""
+_CONNECT_TIMEOUT_S: Final = 5.0
+"""Timeout in seconds for a new connection."""
+_REPLY_TIMEOUT_S: Final = 90.0
+"""Timeout in seconds for the daemon's reply to a request."""
+_MAX_LINE_BYTES: Final = 1 << 20
+"""Largest size of a message of the daemon in bytes."""
+_CROWDED_ATTEMPTS: Final = 20
+"""Number of attempts to connect while the daemon has too many clients."""
+_CROWDED_PAUSE_S: Final = 0.1
+"""Pause in seconds between attempts to connect while the daemon has too many clients."""
 
 
 class DaemonError(Exception):
-    """The daemon does not reply; the message is for the operator."""
+    """The daemon does not reply to a request; the message is for the operator."""
 
 
 class BusyError(Exception):
-    """A request was not sent; the message is for the operator."""
+    """A request was not sent to the daemon; the message is for the operator."""
 
 
 class DaemonLink:
-    """Connection to one daemon, which receives its events and passes requests on.
+    """Receives the events of a daemon, and sends requests to it.
 
     Parameters
     ----------
     path
-        The daemon's socket.
+        Path of the daemon's control socket.
     on_message
-        Called with each event, and with each status reply.
+        Function that receives each event and each status reply.
     on_lost
-        Called with the reason when the daemon is no longer received.
+        Function that receives the reason when no messages of the daemon arrive any more.
     """
 
     def __init__(
@@ -55,12 +62,14 @@ class DaemonLink:
         self._on_message = on_message
         self._on_lost = on_lost
         self._status_requested = asyncio.Event()
-        self._held: _Connection | None = None
-        self._held_series: float = 0
-        self._ended: float = 0
-        """Last series that has ended; infinite if the message of its end may have been lost."""
-        self._commanding = asyncio.Lock()
-        self._stops = 0
+        self._control_connection: _Connection | None = None
+        self._controlled_series: float = 0
+        self._last_ended_series: float = 0
+        """Number of the last series that has ended.
+
+        It is infinite if the message of a series' end may have been lost."""
+        self._request_lock = asyncio.Lock()
+        self._stop_count = 0
         self._last_received_s = 0.0
         self._silent = False
         self._signals_received = False
@@ -69,30 +78,30 @@ class DaemonLink:
         """Receive the daemon's events until cancelled."""
         while True:
             try:
-                await self._follow()
+                await self._receive_messages()
             except (OSError, ValueError, DaemonError, asyncio.IncompleteReadError) as error:
                 self._register_end(math.inf)
-                self._on_lost(str(error) if isinstance(error, DaemonError) else _GONE)
-            await asyncio.sleep(_RETRY_S)
+                self._on_lost(str(error) if isinstance(error, DaemonError) else _NO_DAEMON_MESSAGE)
+            await asyncio.sleep(_RECONNECT_PAUSE_S)
 
-    def ask_for_status(self) -> None:
-        """Request the status soon, because something has changed."""
+    def request_status(self) -> None:
+        """Make the next request of the daemon's status at once, since the status has changed."""
         self._status_requested.set()
 
-    def note_stop(self) -> None:
-        """Register a stop, which cancels requests that are not sent yet."""
-        self._stops += 1
+    def register_stop(self) -> None:
+        """Register that a stop was requested, which cancels requests that are not sent yet."""
+        self._stop_count += 1
 
-    async def ask(self, request: Document) -> Document:
-        """Send a request and return the reply.
+    async def send_request(self, request: Document) -> Document:
+        """Send a request to the daemon, and return its reply.
 
-        The connection that started a series stays open until its end, and with it the control.
-        Further requests that need control use the same connection.
+        The connection that started a series remains open until the end of the series, and with it
+        the control of the rig. Further requests that need control use the same connection.
 
         Parameters
         ----------
         request
-            Request of docs/control_socket.md.
+            Request as described in docs/control_socket.md.
 
         Raises
         ------
@@ -102,61 +111,67 @@ class DaemonLink:
             If there is no reply.
         """
         if request.get("command") == "predict":
-            return await self._ask_on_new_connection(request)
-        # A start that waited here could begin after a stop, which the daemon would not notice.
-        if self._commanding.locked():
+            return await self._send_on_new_connection(request)
+        # A start that waited here could be sent after a stop, and would then not be stopped.
+        if self._request_lock.locked():
             raise BusyError("Another request is being answered; try again in a moment.")
-        async with self._commanding:
-            held = self._held
-            if held is not None and (held[0].at_eof() or held[1].is_closing()):
+        async with self._request_lock:
+            control_connection = self._control_connection
+            if control_connection is not None and (
+                control_connection[0].at_eof() or control_connection[1].is_closing()
+            ):
                 self._release_control()
             try:
-                if self._held is None:
-                    reply = await self._ask_on_new_connection(request)
+                if self._control_connection is None:
+                    reply = await self._send_on_new_connection(request)
                 else:
-                    reply = await _exchange(self._held, request)
+                    reply = await _send_and_receive(self._control_connection, request)
                 if request.get("command") == "start" and reply.get("ok"):
-                    self._held_series = reply["series"]
+                    self._controlled_series = reply["series"]
             except DaemonError:
                 # Not sent again, because it may have been executed.
                 self._release_control()
                 raise
             finally:
-                if self._held_series <= self._ended:
+                if self._controlled_series <= self._last_ended_series:
                     self._release_control()
             return reply
 
-    async def _ask_on_new_connection(self, request: Document) -> Document:
-        """Send a request on a new connection; repeat it while the daemon has too many clients."""
-        stops = self._stops
-        for attempt in range(_CROWD_TRIES):
+    async def _send_on_new_connection(self, request: Document) -> Document:
+        """Send a request on a new connection, and return the reply.
+
+        It is repeated while the daemon has too many clients.
+        """
+        stops = self._stop_count
+        for attempt in range(_CROWDED_ATTEMPTS):
             if attempt:
-                await asyncio.sleep(_CROWD_PAUSE_S)
+                await asyncio.sleep(_CROWDED_PAUSE_S)
             try:
-                link = await self._connect()
+                connection = await self._connect()
             except (OSError, TimeoutError):
-                raise DaemonError(_GONE) from None
+                raise DaemonError(_NO_DAEMON_MESSAGE) from None
             try:
-                if self._stops != stops and request.get("command") != "predict":
+                if self._stop_count != stops and request.get("command") != "predict":
                     raise BusyError("It was stopped before it began.")
-                reply = await _exchange(link, request)
+                reply = await _send_and_receive(connection, request)
                 if request.get("command") == "start" and reply.get("ok"):
-                    self._held = link
+                    self._control_connection = connection
             finally:
-                if self._held is not link:
-                    link[1].close()
+                if self._control_connection is not connection:
+                    connection[1].close()
             if not reply.get("crowded"):
                 break
         return reply
 
     async def _connect(self) -> _Connection:
-        opening = asyncio.open_unix_connection(self._path, limit=_LONGEST_LINE)
-        return await asyncio.wait_for(opening, _CONNECT_S)
+        """Open a connection to the daemon's socket."""
+        connecting = asyncio.open_unix_connection(self._path, limit=_MAX_LINE_BYTES)
+        return await asyncio.wait_for(connecting, _CONNECT_TIMEOUT_S)
 
-    async def _follow(self) -> None:
+    async def _receive_messages(self) -> None:
         """Receive the messages of one connection until it ends."""
         reader, writer = await self._connect()
-        self._last_received_s, self._ended = (
+        self._last_received_s, self._last_ended_series = (
             time.monotonic(),
             0,
         )  # a new daemon numbers its series from 0
@@ -167,15 +182,16 @@ class DaemonLink:
         try:
             writer.write(b'{"command": "watch", "signals": true}\n')
             while True:
-                self._take(await reader.readline())
+                self._process_message(await reader.readline())
         finally:
             for task in tasks:
                 task.cancel()
             writer.close()
 
-    def _take(self, line: bytes) -> None:
+    def _process_message(self, line: bytes) -> None:
+        """Decode a line of the daemon, and pass events and status replies to `on_message`."""
         if not line:
-            raise DaemonError(_GONE)
+            raise DaemonError(_NO_DAEMON_MESSAGE)
         self._last_received_s, self._silent = time.monotonic(), False
         message = json.loads(line)
         if message.get("reply") == "watch" and not message.get("ok"):
@@ -188,46 +204,52 @@ class DaemonLink:
             self._on_message(message)
 
     async def _report_silence(self) -> None:
-        """Report a daemon that has been silent for a while."""
+        """Report the daemon as silent if it sends no message in time, until cancelled."""
         while True:
-            left_s = self._last_received_s + _SILENT_S - time.monotonic()
-            if left_s <= 0.0 and not self._silent:
+            remaining_s = self._last_received_s + _SILENCE_TIMEOUT_S - time.monotonic()
+            if remaining_s <= 0.0 and not self._silent:
                 self._silent = True
-                self._on_lost(f"The daemon has sent nothing for {_SILENT_S:g} s.")
-            await asyncio.sleep(max(left_s, _POLL_S))
+                self._on_lost(f"The daemon has sent nothing for {_SILENCE_TIMEOUT_S:g} s.")
+            await asyncio.sleep(max(remaining_s, _MIN_CHECK_PERIOD_S))
 
     async def _poll_status(self, writer: asyncio.StreamWriter) -> None:
+        """Request the daemon's status periodically, until cancelled."""
         while True:
             writer.write(b'{"command": "status"}\n')
             self._status_requested.clear()
             # Without signals only the status shows that the daemon is alive.
-            pause_s = _STATUS_S if self._signals_received else _ALIVE_S
+            pause_s = (
+                _STATUS_PERIOD_S if self._signals_received else _STATUS_PERIOD_WITHOUT_SIGNALS_S
+            )
             self._signals_received = False
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._status_requested.wait(), pause_s)
 
     def _register_end(self, series: float) -> None:
-        """Release control after a series, unless a request is pending."""
-        self._ended = series
-        if not self._commanding.locked():
+        """Register the end of a series, and release control unless a request is pending."""
+        self._last_ended_series = series
+        if not self._request_lock.locked():
             self._release_control()
 
     def _release_control(self) -> None:
-        """Release control, by closing its connection."""
-        held, self._held = self._held, None
-        if held is not None:
-            held[1].close()
+        """Close the connection that controls the rig, so that others can control it."""
+        control_connection, self._control_connection = self._control_connection, None
+        if control_connection is not None:
+            control_connection[1].close()
 
 
-async def _exchange(link: _Connection, request: Document) -> Document:
-    """Send a request and return its reply."""
-    reader, writer = link
+async def _send_and_receive(connection: _Connection, request: Document) -> Document:
+    """Send a request on a connection, and return its reply."""
+    reader, writer = connection
     try:
         writer.write(json.dumps(request).encode() + b"\n")
-        line = await asyncio.wait_for(reader.readline(), _ANSWER_S)
+        line = await asyncio.wait_for(reader.readline(), _REPLY_TIMEOUT_S)
         return dict(json.loads(line))
     except (OSError, ValueError, TimeoutError):
         raise DaemonError("The daemon gave no answer.") from None
 
 
-_GONE: Final = "The daemon is not running, or cannot be reached; start it with rigd serve."
+_NO_DAEMON_MESSAGE: Final = (
+    "The daemon is not running, or cannot be reached; start it with rigd serve."
+)
+"""Message for the operator if there is no connection to the daemon."""

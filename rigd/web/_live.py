@@ -1,4 +1,4 @@
-"""Messages to the open pages: each has its own queue, so that a slow page delays no other."""
+"""Messages to the open pages; each page has its own queue, so that a slow one delays no other."""
 
 import asyncio
 import json
@@ -12,16 +12,22 @@ from aiohttp import WSMsgType, web
 
 Document = dict[str, Any]
 
-MOST_PAGES: Final = 24
-_MOST_WAITING: Final = 200
-"""Limit of a page's queue, about 5 s of a session; beyond it the page is dropped."""
-_MOST_MESSAGE_BYTES: Final = 1024
-_HEARTBEAT_S: Final = 10.0
-_MOST_EVENTS: Final = 200
+MAX_PAGES: Final = 24
+"""Largest number of open pages."""
+_MAX_QUEUED_MESSAGES: Final = 200
+"""Largest number of queued messages of a page, about 5 s of a session.
+
+Beyond it the page's connection is closed."""
+_MAX_MESSAGE_BYTES: Final = 1024
+"""Largest size in bytes of a message from a page."""
+_PING_PERIOD_S: Final = 10.0
+"""Period in seconds of the WebSocket's pings."""
+_STORED_LOG_LINES: Final = 200
+"""Number of log lines that are stored for new pages."""
 
 
 class OpenPage:
-    """Connection to one open page.
+    """Connection to one open page, with its queue of messages.
 
     Parameters
     ----------
@@ -34,75 +40,84 @@ class OpenPage:
     def __init__(self, socket: web.WebSocketResponse, transport: asyncio.Transport | None) -> None:
         self._socket = socket
         self._transport = transport
-        self._waiting: deque[str] = deque()
-        self._woken = asyncio.Event()
+        self._queue: deque[str] = deque()
+        self._message_queued = asyncio.Event()
 
     def put(self, text: str) -> None:
-        """Queue a message; drop the page if its queue is full."""
-        if len(self._waiting) >= _MOST_WAITING:
+        """Queue a message to the page, or close its connection if the queue is full."""
+        if len(self._queue) >= _MAX_QUEUED_MESSAGES:
             self.drop()
             return
-        self._waiting.append(text)
-        self._woken.set()
+        self._queue.append(text)
+        self._message_queued.set()
 
     def drop(self) -> None:
-        """Close the connection at once."""
-        self._waiting.clear()
+        """Close the connection of the page at once."""
+        self._queue.clear()
         if self._transport is not None:
             self._transport.abort()
 
     async def write(self) -> None:
-        """Send the queued messages until cancelled or the page is gone."""
+        """Send the queued messages until cancelled or until the page has disconnected."""
         with suppress(ConnectionError, RuntimeError):
             while True:
-                await self._woken.wait()
-                self._woken.clear()
-                while self._waiting:
+                await self._message_queued.wait()
+                self._message_queued.clear()
+                while self._queue:
                     # In one message, because the cost of a message hardly depends on its size.
-                    text = "\n".join(self._waiting)
-                    self._waiting.clear()
+                    text = "\n".join(self._queue)
+                    self._queue.clear()
                     await self._socket.send_str(text)
 
     async def stop_on_request(
         self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
     ) -> None:
-        """Execute each requested stop, one at a time, and send the result to the page."""
+        """Stop the session whenever the page requests it, and send the result to the page.
+
+        Parameters
+        ----------
+        stop_requested
+            Event that is set by each request.
+        stop
+            Function that stops the session.
+        """
         while True:
             await stop_requested.wait()
             stop_requested.clear()
-            self.put(_text({"type": "stop", **await stop()}))
+            self.put(_to_json({"type": "stop", **await stop()}))
 
 
 class Pages:
-    """All open pages, and the last log lines for new pages."""
+    """Connections to all open pages, and the last log lines for new pages."""
 
     def __init__(self) -> None:
         self._pages: set[OpenPage] = set()
-        self._events: deque[Document] = deque(maxlen=_MOST_EVENTS)
+        self._events: deque[Document] = deque(maxlen=_STORED_LOG_LINES)
 
     def __len__(self) -> int:
+        """Return the number of open pages."""
         return len(self._pages)
 
     def send(self, document: Document | None) -> None:
-        """Send a message to all pages; None is ignored."""
+        """Send a message to all open pages; None is ignored."""
         if document is not None and self._pages:
-            text = _text(document)
+            text = _to_json(document)
             for page in list(self._pages):
                 page.put(text)
 
-    def note(self, level: str, text: str) -> None:
-        """Send a log line, and store it for pages that open later."""
+    def log(self, level: str, text: str) -> None:
+        """Send a log line to all open pages, and store it for pages that open later."""
         event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": text}
         self._events.append(event)
         self.send(event)
 
-    async def follow(
+    async def serve(
         self,
         request: web.Request,
         first: Iterable[Document],
         stop: Callable[[], Awaitable[Document]],
     ) -> web.StreamResponse:
-        """Serve a page until it is closed.
+        """Send live messages to a new page until it is closed.
 
         Parameters
         ----------
@@ -111,17 +126,18 @@ class Pages:
         first
             First messages for the page.
         stop
-            Called for each message ``stop`` of the page, which gets the result as ``stop``.
+            Function that stops the session. It is called for each message ``stop`` of the page, and
+            its result is sent to the page.
         """
-        if len(self._pages) >= MOST_PAGES:
-            raise web.HTTPServiceUnavailable(reason=f"There are {MOST_PAGES} open pages already.")
+        if len(self._pages) >= MAX_PAGES:
+            raise web.HTTPServiceUnavailable(reason=f"There are {MAX_PAGES} open pages already.")
         socket = web.WebSocketResponse(
-            heartbeat=_HEARTBEAT_S, compress=False, max_msg_size=_MOST_MESSAGE_BYTES
+            heartbeat=_PING_PERIOD_S, compress=False, max_msg_size=_MAX_MESSAGE_BYTES
         )
         await socket.prepare(request)
         page = OpenPage(socket, request.transport)
         for document in (*first, *self._events):
-            page.put(_text(document))
+            page.put(_to_json(document))
         self._pages.add(page)
         stop_requested = asyncio.Event()
         tasks = [
@@ -148,4 +164,5 @@ class Pages:
             page.drop()
 
 
-_text: Final = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode
+_to_json: Final = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode
+"""Function that converts a document into compact JSON text."""

@@ -1,4 +1,4 @@
-"""Signals of a running record for the page: strips of the last seconds, and the growing response.
+"""Signals of a running session for the page: envelopes over time, and the frequency response.
 
 Both are computed from the daemon's blocks of signals, which may have gaps.
 """
@@ -20,15 +20,21 @@ from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response,
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
 
-STRIP_S: Final = 0.05
-"""Duration of a point of a strip."""
-_STORED_S: Final = 10.0
-_EVERY: Final = 4
-"""Every fourth bin of `analyze` (1/160 Hz) is shown: still two per resolution of a segment."""
-_DIGITS: Final = 6
-_FED_AT_ONCE: Final = 20
-_NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
-_SAMPLE: Final = np.dtype(
+ENVELOPE_POINT_S: Final = 0.05
+"""Duration in seconds of each point of an envelope."""
+_STORED_DURATION_S: Final = 10.0
+"""Seconds of the envelopes that are stored for new pages."""
+_BIN_STEP: Final = 4
+"""Step between the shown frequency bins of `analyze` (1/160 Hz).
+
+There are still two bins per resolution of a segment."""
+_DECIMALS: Final = 6
+"""Number of decimals of the envelopes."""
+_BLOCKS_PER_UPDATE: Final = 20
+"""Number of blocks that are passed to the estimate together."""
+_SIGNAL_NAMES: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
+"""Names of the signals in a block, in the order of its rows."""
+_SAMPLE_TYPE: Final = np.dtype(  # Type of the samples that the frequency response is estimated from
     [
         ("tick", np.int64),
         ("angle_rad", np.float64),
@@ -40,71 +46,80 @@ _SAMPLE: Final = np.dtype(
 
 
 @dataclass(frozen=True, slots=True)
-class Block:
-    """Signals of consecutive ticks; unknown values are NaN."""
+class PageSignalBlock:
+    """Block of the daemon's signals at consecutive ticks."""
 
     first_tick: int
+    """Number of the block's first tick."""
     rate_hz: float
+    """Loop rate in ticks per second."""
     values: Real
-    """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n)."""
+    """Angle (rad), its reference (rad) and coupling torque (N·m), shape (3, n); NaN if unknown."""
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "Block":
-        """Return the block in the daemon's event ``signals``."""
-        data = b"".join(base64.b64decode(event[name]) for name in _NAMES)
-        values = np.frombuffer(data, dtype="<f4").reshape(len(_NAMES), -1).astype(np.float64)
+    def of_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
+        """Decode the block of signals in the daemon's event ``signals``."""
+        data = b"".join(base64.b64decode(event[name]) for name in _SIGNAL_NAMES)
+        values = np.frombuffer(data, dtype="<f4").reshape(len(_SIGNAL_NAMES), -1).astype(np.float64)
         return cls(event["first_tick"], event["rate_hz"], values)
 
 
 # Strips
 
 
-class Strips:
-    """Envelopes of the last 10 s of angle and torque, in points of 0.05 s."""
+class SignalEnvelopes:
+    """Computes and stores the envelopes of angle, reference and torque over the last 10 s.
+
+    Each point of an envelope has the extremes within 0.05 s.
+    """
 
     def __init__(self) -> None:
-        self._points: deque[tuple[float | None, ...]] = deque(maxlen=round(_STORED_S / STRIP_S))
-        self._next = 0
-        """Number of the next point, since the start of the session."""
-        self._rest: list[Real] = []
-        self._end = 0
-        """Next expected tick."""
+        self._points: deque[tuple[float | None, ...]] = deque(
+            maxlen=round(_STORED_DURATION_S / ENVELOPE_POINT_S)
+        )
+        self._next_point = 0
+        """Index of the next point since the start of the session."""
+        self._incomplete_point: list[Real] = []
+        """Values of the next point so far."""
+        self._next_tick = 0
+        """Tick that is expected next."""
 
-    def feed(self, block: Block) -> Document | None:
-        """Add a block; return the message with the points that it completes; None without any."""
-        ticks = max(1, round(STRIP_S * block.rate_hz))
+    def feed(self, block: PageSignalBlock) -> Document | None:
+        """Add a block, and return the message with the points that it completes, or None."""
+        ticks = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
         values = block.values
-        missing = block.first_tick - self._end
-        if missing < 0 or missing > _STORED_S * block.rate_hz:
+        missing_ticks = block.first_tick - self._next_tick
+        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * block.rate_hz:
             self._points.clear()
-            self._next = block.first_tick // ticks
-            self._rest = []
-            missing = block.first_tick - self._next * ticks
-        if missing:
-            self._rest.append(np.full((3, missing), np.nan))
-        self._rest.append(values)
-        self._end = block.first_tick + values.shape[1]
-        waiting = np.concatenate(self._rest, axis=1)
-        count = waiting.shape[1] // ticks
-        self._rest = [waiting[:, count * ticks :]]
+            self._next_point = block.first_tick // ticks
+            self._incomplete_point = []
+            missing_ticks = block.first_tick - self._next_point * ticks
+        if missing_ticks:
+            self._incomplete_point.append(np.full((3, missing_ticks), np.nan))
+        self._incomplete_point.append(values)
+        self._next_tick = block.first_tick + values.shape[1]
+        pending = np.concatenate(self._incomplete_point, axis=1)
+        count = pending.shape[1] // ticks
+        self._incomplete_point = [pending[:, count * ticks :]]
         if count == 0:
             return None
-        bins = waiting[:, : count * ticks].reshape(3, count, ticks)
+        bins = pending[:, : count * ticks].reshape(3, count, ticks)
         # Unlike nanmin and nanmax, these do not warn of points without known values.
-        least, greatest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        extremes = np.stack((least, greatest), axis=1).reshape(6, count).round(_DIGITS)
-        points = [tuple(_known(column)) for column in extremes.T]
-        first, self._next = self._next, self._next + count
+        smallest, largest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
+        extremes = np.stack((smallest, largest), axis=1).reshape(6, count).round(_DECIMALS)
+        points = [tuple(_without_nan(column)) for column in extremes.T]
+        first, self._next_point = self._next_point, self._next_point + count
         self._points.extend(points)
-        return _strip(first, points)
+        return _envelope_message(first, points)
 
     def last(self) -> Document | None:
-        """Return the message with all stored points, for a new page."""
+        """Return the message with all stored points for a new page, or None if there are none."""
         points = list(self._points)
-        return _strip(self._next - len(points), points) if points else None
+        return _envelope_message(self._next_point - len(points), points) if points else None
 
 
-def _strip(first: int, points: list[tuple[float | None, ...]]) -> Document:
+def _envelope_message(first: int, points: list[tuple[float | None, ...]]) -> Document:
+    """Return the message with points of the envelopes; `first` is the index of the first one."""
     names = (
         *("angle_min", "angle_max", "reference_min", "reference_max"),
         *("torque_min", "torque_max"),
@@ -112,13 +127,14 @@ def _strip(first: int, points: list[tuple[float | None, ...]]) -> Document:
     columns = zip(*points, strict=True)
     return {
         "type": "strip",
-        "t0_s": round(first * STRIP_S, 3),
-        "dt_s": STRIP_S,
+        "t0_s": round(first * ENVELOPE_POINT_S, 3),
+        "dt_s": ENVELOPE_POINT_S,
         **{name: list(column) for name, column in zip(names, columns, strict=True)},
     }
 
 
-def _known(values: Real) -> list[float | None]:
+def _without_nan(values: Real) -> list[float | None]:
+    """Return values as a list with None instead of NaN."""
     return [None if value != value else value for value in values.tolist()]
 
 
@@ -126,51 +142,51 @@ def _known(values: Real) -> list[float | None]:
 
 
 class SessionResponse:
-    """Frequency response of the running session, up to the present frequency of the sweep.
+    """Estimates the frequency response of a running session up to the sweep's present frequency.
 
     Parameters
     ----------
     subject
-        The session.
+        Data of the session.
     """
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ, every=_EVERY)
+        self._sweep = SweepResponse(subject, LAST_HZ, every=_BIN_STEP)
         self._thinning: Thinning | None = None
-        self._waiting: list[Block] = []
-        self._fresh = False
+        self._queued_blocks: list[PageSignalBlock] = []
+        self._has_new_data = False
         self._reached_hz = 0.0
 
-    def feed(self, block: Block) -> None:
-        """Add a block; its unknown values are ignored."""
-        self._waiting.append(block)
-        if len(self._waiting) >= _FED_AT_ONCE:
+    def feed(self, block: PageSignalBlock) -> None:
+        """Add a block of signals; its unknown values are ignored."""
+        self._queued_blocks.append(block)
+        if len(self._queued_blocks) >= _BLOCKS_PER_UPDATE:
             self._feed_sweep()
 
     def _feed_sweep(self) -> None:
-        """Process the waiting blocks: a call costs about the same for many blocks as for one."""
-        if not self._waiting:
+        """Pass the queued blocks to the estimate; many of them cost about as much as one."""
+        if not self._queued_blocks:
             return
-        values = np.concatenate([block.values for block in self._waiting], axis=1)
+        values = np.concatenate([block.values for block in self._queued_blocks], axis=1)
         ticks = np.concatenate(
-            [block.first_tick + np.arange(block.values.shape[1]) for block in self._waiting]
+            [block.first_tick + np.arange(block.values.shape[1]) for block in self._queued_blocks]
         )
-        self._waiting.clear()
-        known = np.isfinite(values[0])
-        if known.any():
-            samples = np.zeros(int(known.sum()), dtype=_SAMPLE)
-            samples["tick"] = ticks[known]
-            for name, signal in zip(_NAMES, values, strict=True):
-                samples[name] = signal[known]
+        self._queued_blocks.clear()
+        is_known = np.isfinite(values[0])
+        if is_known.any():
+            samples = np.zeros(int(is_known.sum()), dtype=_SAMPLE_TYPE)
+            samples["tick"] = ticks[is_known]
+            for name, signal in zip(_SIGNAL_NAMES, values, strict=True):
+                samples[name] = signal[is_known]
             self._sweep.feed(samples)
-            self._fresh = True
+            self._has_new_data = True
 
     def document(self) -> Document | None:
-        """Return the message with the response; None if there is nothing new."""
+        """Return the message with the estimated response, or None if it has not changed."""
         self._feed_sweep()
-        estimate = self._sweep.estimate() if self._fresh else None
-        self._fresh = False
+        estimate = self._sweep.estimate() if self._has_new_data else None
+        self._has_new_data = False
         if estimate is None or not estimate.excited.any():
             return None
         reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
@@ -189,8 +205,8 @@ class SessionResponse:
         shown_points = np.union1d(self._thinning.extremes(size), self._thinning.gaps(size))
         coherence = None
         if response.coherence is not None:
-            coherence = _known(np.round(response.coherence[shown_points], 4))
-        return _curve(grid[shown_points], shown[shown_points]) | {
+            coherence = _without_nan(np.round(response.coherence[shown_points], 4))
+        return _response_document(grid[shown_points], shown[shown_points]) | {
             "type": "response",
             "coherence": coherence,
             "reached_hz": round(reached_hz, 3),
@@ -198,25 +214,27 @@ class SessionResponse:
 
 
 def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) -> Document:
-    """Return the message with the nominal beam's response at the sensor.
+    """Return the message with the nominal frequency response from motor angle to sensor torque.
 
     Parameters
     ----------
     beam, damping
-        Specimen of the profile.
+        Nominal beam and damping of the profile or specimen.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     """
     grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
     shown_points = response_thinning(grid).extremes(np.abs(model))
-    return {"type": "nominal", **_curve(grid[shown_points], model[shown_points])}
+    return {"type": "nominal", **_response_document(grid[shown_points], model[shown_points])}
 
 
-def _curve(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
+def _response_document(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
+    """Return frequencies, magnitudes and phases of a response as JSON lists."""
     return {
         "frequency_hz": np.round(frequency_hz, 4).tolist(),
         "magnitude": [
-            None if value is None else float(f"{value:.4g}") for value in _known(np.abs(response))
+            None if value is None else float(f"{value:.4g}")
+            for value in _without_nan(np.abs(response))
         ],
-        "phase_rad": _known(np.round(np.angle(response), 4)),
+        "phase_rad": _without_nan(np.round(np.angle(response), 4)),
     }

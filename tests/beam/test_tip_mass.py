@@ -81,7 +81,7 @@ def test_modes_of_their_own_stiffness_replace_those_of_the_uniform_beam(complian
     """By the sum of the modes: each of the first four with its own stiffness."""
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 100, 60)
     loaded = offset(compliance)
-    elastic, inertial = loaded.factors(s)
+    elastic, inertial = loaded.elastic_and_inertial_factors(s)
     response = transfer(s, BEAM, DAMPINGS["fractional"])
     for z, share in zip(clamped_free_eigenvalues(4)[1:], OFFSETS, strict=True):
         k4, stiffness = (z / BEAM.length_m) ** 4, BEAM.bending_stiffness_n_m2
@@ -92,8 +92,12 @@ def test_modes_of_their_own_stiffness_replace_those_of_the_uniform_beam(complian
     exact = response / (1 + compliance * response)
     assert loaded.transfer(s) == pytest.approx(exact, rel=1e-9)
     h = 1e-6 * s
-    difference = (loaded.at(s + h).response - loaded.at(s - h).response) / (2 * h)
-    assert loaded.slope(s, loaded.at(s)) == pytest.approx(difference, rel=1e-6)
+    difference = (
+        loaded.rigid_clamp_response(s + h).response - loaded.rigid_clamp_response(s - h).response
+    ) / (2 * h)
+    assert loaded.derivative_by_s(s, loaded.rigid_clamp_response(s)) == pytest.approx(
+        difference, rel=1e-6
+    )
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.05])
@@ -123,7 +127,7 @@ def test_what_modes_of_their_own_stiffness_do_not_define_is_refused():
 def test_their_tip_moves_as_the_sum_of_the_modes():
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 40)
     loaded = offset(0.0)
-    elastic, inertial = loaded.factors(s)
+    elastic, inertial = loaded.elastic_and_inertial_factors(s)
     z = clamped_free_eigenvalues(400)
     stiffness = (z / BEAM.length_m) ** 4 * (1 + np.pad(OFFSETS, (1, z.size - 1 - len(OFFSETS))))
     # A turn of the root is 2 L (-1)^(i-1) / z² of each mode, whose tip moves by 2.

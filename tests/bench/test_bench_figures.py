@@ -14,10 +14,10 @@ from rigd.bench import Results, as_json, report_lines
 from rigd.bench.measure import (
     LoopMeasurement,
     UsageMeter,
-    figures,
-    measurement,
-    pooled,
-    usage_of,
+    percentiles,
+    pool_measurements,
+    process_usage,
+    record_measurement,
     wake_ups_us,
 )
 from rigd.engine.shared_state import Phase
@@ -40,7 +40,7 @@ def test_ticks_missed_at_the_start_count():
 
 
 def test_scheduled_ticks_are_recorded_or_missed():
-    found = measurement(
+    found = record_measurement(
         "a", 1000.0, samples([0, 1, 5], 0), scheduled=10, cpu_percent=None, page_faults=None
     )
     assert (found.missed, found.held) == (7, pytest.approx(0.3))
@@ -48,7 +48,7 @@ def test_scheduled_ticks_are_recorded_or_missed():
 
 def test_ticks_that_pass_in_a_stall_are_told_apart():
     ticks = [0, 1, 32, 33, 35, 36]
-    found = measurement(
+    found = record_measurement(
         "a",
         1000.0,
         samples(ticks, [0, 0, 500_000, 0, 900_000, 0]),
@@ -63,12 +63,12 @@ def test_ticks_that_pass_in_a_stall_are_told_apart():
 
 
 def test_percentiles_are_numpys():
-    found = figures(np.arange(1001.0))
+    found = percentiles(np.arange(1001.0))
     assert astuple(found) == pytest.approx((500.0, 900.0, 990.0, 999.0, 1000.0))
 
 
 def test_rounds_together_count_every_tick(measured):
-    both = pooled("both", [measured(held=0.5, cpu=4.0), measured(cpu=6.0)])
+    both = pool_measurements("both", [measured(held=0.5, cpu=4.0), measured(cpu=6.0)])
     assert (both.scheduled, both.missed) == (3000, 1000)
     assert both.lateness_us.size == 2000
     assert both.cpu_percent == 5.0
@@ -119,7 +119,7 @@ def test_the_account_of_a_process_is_read_whatever_its_name(tmp_path):
     folder.mkdir()
     (folder / "stat").write_text("42 (a) b (c) S 1 2 3 4 5 6 700 8 11 10 1 2 3\n")
     (folder / "schedstat").write_text("2500000000 12 13\n")
-    usage = usage_of(42, tmp_path)
+    usage = process_usage(42, tmp_path)
     assert (usage.cpu_s, usage.page_faults) == (2.5, 711)
 
 
@@ -141,7 +141,9 @@ def test_usage_is_taken_between_looks_at_a_running_record():
 
 
 def test_a_process_that_is_gone_leaves_no_usage(monkeypatch):
-    monkeypatch.setattr("rigd.bench.measure.usage_of", lambda pid: usage_of(pid, Path("/nowhere")))
+    monkeypatch.setattr(
+        "rigd.bench.measure.process_usage", lambda pid: process_usage(pid, Path("/nowhere"))
+    )
     meter = UsageMeter(1)
     meter.sample(Phase.RUNNING)
     assert meter.cpu_percent is None

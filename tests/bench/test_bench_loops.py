@@ -15,7 +15,7 @@ SECONDS = 0.3
 
 @pytest.fixture
 def profile():
-    return loops.rig_for(load_profile("antenna_serial"), 500.0, 0.0)
+    return loops.simulated_profile(load_profile("antenna_serial"), 500.0, 0.0)
 
 
 def assert_accounted(found):

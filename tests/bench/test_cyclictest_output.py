@@ -78,5 +78,7 @@ def test_what_it_complains_of_is_told(bench, cyclictest):
 
 def test_one_that_hangs_is_given_up(bench, cyclictest, monkeypatch):
     cyclictest.program.write_text("#!/bin/sh\nexec sleep 60\n")
-    monkeypatch.setattr("rigd.bench._cyclictest._MARGIN_S", -9.9)  # the measurement takes 10 s
+    monkeypatch.setattr(
+        "rigd.bench._cyclictest._TIMEOUT_MARGIN_S", -9.9
+    )  # the measurement takes 10 s
     assert "timed out" in bench().no_peer

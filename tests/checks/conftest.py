@@ -153,7 +153,7 @@ def stand_ins(monkeypatch):
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
     monkeypatch.setattr("rigd.devices._wired_rig.open_devices", made.open)
-    monkeypatch.setattr("rigd.checks.devices.TICKS", 100)
+    monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
     return made
 
 

@@ -24,7 +24,7 @@ REALTIME_KERNEL = "#1 SMP PREEMPT_RT Debian 6.1"
 @pytest.fixture
 def rows(tmp_path, monkeypatch):
     """The rows of a good computer, but for some files."""
-    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: True)
+    monkeypatch.setattr("rigd.checks.machine._is_wall_clock_synchronised", lambda: True)
 
     def of(changed=None, *, kernel=REALTIME_KERNEL, **settings):
         for path, text in (GOOD | (changed or {})).items():
@@ -103,7 +103,7 @@ def test_a_loop_that_is_kept_off_the_isolated_core_is_told_so(rows):
 
 
 def test_a_wall_clock_that_nobody_keeps_is_told(rows, monkeypatch):
-    monkeypatch.setattr("rigd.checks.machine._synchronised", lambda: False)
+    monkeypatch.setattr("rigd.checks.machine._is_wall_clock_synchronised", lambda: False)
     assert rows()["wall clock"].verdict is CheckResult.WARNING
 
 

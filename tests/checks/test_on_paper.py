@@ -8,7 +8,7 @@ import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
 from rigd.checks import check_on_paper, check_without_devices
-from rigd.checks.on_paper import plumb_rows, profile_rows, record_rows, wiring_rows
+from rigd.checks.on_paper import axis_tilt_rows, profile_rows, record_rows, wiring_rows
 from rigd.checks.rows import CheckResult, CheckRow, overall
 from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
@@ -60,13 +60,13 @@ def test_the_longest_record_is_the_one_that_can_be_analysed(can_profile):
 
 
 def test_an_unknown_tilt_of_the_axis_is_a_warning_that_refuses_nothing(can_profile):
-    (row,) = plumb_rows(can_profile)
+    (row,) = axis_tilt_rows(can_profile)
     assert (row.found, row.verdict) == ("not known", CheckResult.WARNING)
     for words in ("0.027 % for 0.5°", "level", "rig.axis_tilt_deg"):
         assert words in row.detail
     assert row in check_without_devices(can_profile, None)
     assert not check_on_paper(can_profile).refusals
-    (row,) = plumb_rows(load_profile("sim"))
+    (row,) = axis_tilt_rows(load_profile("sim"))
     assert row.verdict is CheckResult.SKIPPED
 
 
@@ -81,7 +81,7 @@ def test_a_measured_tilt_says_by_how_much_it_shifts_mode_1(can_profile, tilt_deg
     added = load * np.trapezoid((1 - x) * slope**2, x) / np.trapezoid(shape**2, x)
     squared = undamped_frequencies_rad_s(beam, 1)[0] ** 2
     percent = 100 * (np.sqrt(1 + added / squared) - 1)
-    (row,) = plumb_rows(replace(can_profile, axis_tilt_deg=tilt_deg))
+    (row,) = axis_tilt_rows(replace(can_profile, axis_tilt_deg=tilt_deg))
     assert (row.verdict, row.detail) == (CheckResult.OK, "")
     number = re.search(r"shifted by (\S+) %", row.found)[1]
     assert float(number) == pytest.approx(percent, rel=0.05)

@@ -447,7 +447,7 @@ def test_a_full_disk_is_told_and_leaves_nothing_behind(short, tmp_path):
 
 
 def test_progress_appears_when_it_takes_long(rigd_here, short, monkeypatch, tmp_path):
-    monkeypatch.setattr("rigd.cli.options._QUIET_S", -1.0)
+    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
     monkeypatch.setenv("FORCE_COLOR", "1")
     done = rigd_here("replay", short, "--save", tmp_path / "out.rrd")
     assert done.returncode == 0, done.stderr

@@ -64,7 +64,9 @@ def follow(monkeypatch):
         interrupts = start._Interrupts()
         client = Client(interrupts, *events)
         try:
-            ended = start._follow(client, 7, interrupts, as_json=True, quick_looks=quick_looks)
+            ended = start._follow_series(
+                client, 7, interrupts, as_json=True, quick_looks=quick_looks
+            )
         except typer.Exit as ending:
             ended = ending.exit_code
         return ended, done, client.sent

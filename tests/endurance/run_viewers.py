@@ -19,7 +19,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.bench.measure import measurement
+from rigd.bench.measure import record_measurement
 from rigd.live import Viewer
 from rigd.live._program import RerunProgram
 from rigd.live.address import LiveAddress, running
@@ -56,7 +56,7 @@ class Frozen:
         if self._viewer is None:
             self._viewer, self._began_s = _viewer(address), now_s
         elif not self._frozen and now_s > self._began_s + 5.0:
-            assert self._viewer.exit_code is None, self._viewer.last_words
+            assert self._viewer.exit_code is None, self._viewer.last_log_lines
             os.kill(self._viewer.pid, signal.SIGSTOP)
             self._frozen = True
 
@@ -165,7 +165,7 @@ def run(name: str, seconds: float) -> Outcome:
         (path,) = Path(folder).glob("*.mcap")
         samples = read_session(path).samples
     scheduled = round(seconds * RATE_HZ)
-    found = measurement(
+    found = record_measurement(
         name, RATE_HZ, samples, scheduled=scheduled, cpu_percent=None, page_faults=None
     )
     return Outcome(

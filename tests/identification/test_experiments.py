@@ -12,9 +12,9 @@ from rigd.identification import _records, read_recording
 from rigd.identification.estimate import MotorEstimateError
 from rigd.identification.experiments import (
     SpeedPass,
-    lay_out_passes,
     multisine_session,
-    read_layout,
+    passes_of_schedule,
+    read_schedule,
     speeds_session,
     trial_session,
 )
@@ -31,7 +31,7 @@ def as_text(excitation):
 
 
 def passes_of(excitation):
-    return lay_out_passes(read_layout(as_text(excitation)), excitation.rate_hz)
+    return passes_of_schedule(read_schedule(as_text(excitation)), excitation.rate_hz)
 
 
 @pytest.mark.parametrize("make", SESSIONS)
@@ -117,14 +117,14 @@ def test_bad_options_are_refused(profile, make, options, words):
 @pytest.mark.parametrize("change", [{"excitation": "chirp"}, {"cycles": "many"}, {"turn_s": None}])
 def test_other_metadata_hold_no_layout(profile, change):
     metadata = as_text(multisine_session(profile, torque_percent=40.0, stroke_rad=0.8))
-    assert read_layout(metadata) is not None
+    assert read_schedule(metadata) is not None
     changed = {k: v for k, v in (metadata | change).items() if v is not None}
-    assert read_layout(changed) is None
+    assert read_schedule(changed) is None
 
 
 @pytest.mark.process
 def test_a_session_counts_once(short_chirps, tmp_path, monkeypatch):
-    monkeypatch.setattr(_records, "_passes", lambda *_: ([], 0))
+    monkeypatch.setattr(_records, "_read_passes", lambda *_: ([], 0))
     copied = tmp_path / "copied.mcap"
     shutil.copy(short_chirps[0], copied)
     named = rf"copied\.mcap: it has samples of .*{short_chirps[0].name}"

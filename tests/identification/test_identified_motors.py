@@ -13,13 +13,13 @@ from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
 from rigd.engine.cycle import Cycle, make_observers, make_watch
-from rigd.identification import cautious, tuned
+from rigd.identification import with_cautious_controller, with_tuned_controller
 from rigd.identification.estimate import PassReadings, Timing, estimate_motor
 from rigd.identification.experiments import (
-    TOP_HZ,
-    lay_out_passes,
+    HIGHEST_FREQUENCY_HZ,
     multisine_session,
-    read_layout,
+    passes_of_schedule,
+    read_schedule,
     speeds_session,
     trial_session,
 )
@@ -116,16 +116,16 @@ def as_text(excitation):
 
 
 def windows_of(excitation, signals, session):
-    layout = read_layout(as_text(excitation))
+    layout = read_schedule(as_text(excitation))
     return [
         PassReadings(
             *(signal[run.first : run.end] for signal in signals),
             run.speed_rad_s,
-            TOP_HZ[excitation.kind],
+            HIGHEST_FREQUENCY_HZ[excitation.kind],
             session,
             (session, run.speed_rad_s),
         )
-        for run in lay_out_passes(layout, excitation.rate_hz)
+        for run in passes_of_schedule(layout, excitation.rate_hz)
     ]
 
 
@@ -140,8 +140,8 @@ def identify(nominal, motor, seed):
         signals = record(prepared, true_rig, motor.torque_scale, excitation)
         return windows_of(excitation, signals, number)
 
-    trial = estimate_motor(run(trial_session, cautious(nominal), 0), timing)
-    fitted = tuned(nominal, trial)
+    trial = estimate_motor(run(trial_session, with_cautious_controller(nominal), 0), timing)
+    fitted = with_tuned_controller(nominal, trial)
     windows = run(multisine_session, fitted, 1) + run(speeds_session, fitted, 2)
     return estimate_motor(windows, timing)
 

@@ -12,7 +12,7 @@ from rigd.identification.estimate import (
     MotorEstimateError,
     PassReadings,
     Timing,
-    _coverage,
+    _student_factor,
     estimate_motor,
 )
 
@@ -203,4 +203,4 @@ def test_a_record_without_torque_tells_nothing():
 @pytest.mark.parametrize("freedom", [5, 8, 15, 30, 100])
 def test_three_deviations_cover_as_much_as_of_a_normal(freedom):
     quantile = scipy.special.stdtrit(freedom, scipy.special.ndtr(3.0)) / 3.0
-    assert _coverage(np.array(float(freedom))) == pytest.approx(quantile, rel=0.06)
+    assert _student_factor(np.array(float(freedom))) == pytest.approx(quantile, rel=0.06)

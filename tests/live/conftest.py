@@ -444,5 +444,5 @@ def unhurried(start_producer, start_publisher):
     """A publisher that leaves nothing out, although the machine may stand still for a minute."""
     return start_publisher(
         start_producer(capacity=64_000),
-        first="from rigd.live import publisher; publisher._WAITING_S = 60.0",
+        first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 60.0",
     )

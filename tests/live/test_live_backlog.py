@@ -5,7 +5,7 @@ from functools import partial
 import pytest
 
 from rigd.engine.shared_state import StateField
-from rigd.live.publisher import POLL_S, Backlog, Vitals
+from rigd.live.publisher import POLL_S, Backlog, HealthReader
 
 pytestmark = pytest.mark.process
 
@@ -19,7 +19,7 @@ def names(drawings):
 
 
 def test_everything_goes_out_in_order_and_once():
-    backlog = Backlog(most_samples=100)
+    backlog = Backlog(max_samples=100)
     assert not backlog
     backlog.put([drawing("a"), drawing("b")], 50)
     backlog.put_required([drawing("note")])
@@ -32,7 +32,7 @@ def test_everything_goes_out_in_order_and_once():
 
 
 def test_the_oldest_samples_make_room_and_are_counted():
-    backlog = Backlog(most_samples=100)
+    backlog = Backlog(max_samples=100)
     backlog.put_required([drawing("note")])
     for number in range(5):
         backlog.put([drawing(number)], 40)
@@ -42,14 +42,14 @@ def test_the_oldest_samples_make_room_and_are_counted():
 
 
 def test_the_newest_stay_however_many_they_are():
-    backlog = Backlog(most_samples=100)
+    backlog = Backlog(max_samples=100)
     backlog.put([drawing("old")], 10)
     backlog.put([drawing("new")], 500)
     assert (backlog.dropped, backlog.take()[1]) == (10, 500)
 
 
 def test_what_a_new_connection_is_given_anyway_is_not_sent_twice():
-    backlog = Backlog(most_samples=100)
+    backlog = Backlog(max_samples=100)
     backlog.put_required([drawing("note")])
     backlog.put([drawing("a")], 1)
     backlog.drop_required()
@@ -71,7 +71,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
         shared_state[word] = value
     for _ in range(5):
         channels.samples.publish()
-    health = Vitals(channels).read(0.0, view_dropped=11)
+    health = HealthReader(channels).read(0.0, view_dropped=11)
     assert (health.missed_ticks, health.late_ticks, health.lost_ticks) == (3, 7, 2)
     assert (health.disk_free_mb, health.recorder_lag_ticks, health.view_dropped) == (12_000, 5, 11)
     assert health.bus_load_percent == pytest.approx(34.5)
@@ -81,7 +81,7 @@ def test_vitals_are_what_the_board_says_in_the_units_of_the_view(channels):
 def test_vitals_of_what_there_is_not_are_not_known(channels):
     for word in (StateField.BUS_LOAD_PPM, StateField.BUS_ERRORS, StateField.SENSOR_STATUS):
         channels.shared_state[word] = -1
-    health = Vitals(channels).read(0.0, view_dropped=0)
+    health = HealthReader(channels).read(0.0, view_dropped=0)
     assert health.disk_free_mb is None
     assert (health.bus_load_percent, health.bus_errors, health.sensor_status) == (None, None, None)
     assert health.rate_hz is None
@@ -89,24 +89,24 @@ def test_vitals_of_what_there_is_not_are_not_known(channels):
 
 def test_counts_of_the_session_before_are_not_taken_for_this_ones(channels):
     channels.shared_state[StateField.MISSED] = 5
-    vitals = Vitals(channels)
+    vitals = HealthReader(channels)
     assert vitals.read(0.0, view_dropped=0).missed_ticks == 0
     channels.shared_state[StateField.GO] = 1
     assert vitals.read(1.0, view_dropped=0).missed_ticks == 5
 
 
 def test_the_rate_is_that_of_the_last_second(channels):
-    vitals, shared_state = Vitals(channels), channels.shared_state
+    vitals, shared_state = HealthReader(channels), channels.shared_state
     shared_state[StateField.GO] = 1
     rates = []
     for look in range(20):
         now_s = look * POLL_S
-        assert vitals.due(now_s)
+        assert vitals.is_due(now_s)
         shared_state[StateField.SCHEDULED] = round(
             1000 * now_s if look < 10 else 1250 + 500 * now_s
         )
         rates.append(vitals.read(now_s, view_dropped=0).rate_hz)
-        assert not vitals.due(now_s + 0.9 * POLL_S)
+        assert not vitals.is_due(now_s + 0.9 * POLL_S)
     assert rates[9] == pytest.approx(1000.0, abs=2.0)
     assert rates[-1] == pytest.approx(500.0, abs=2.0)
     shared_state[StateField.SCHEDULED] = 10

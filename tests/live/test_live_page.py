@@ -100,7 +100,7 @@ def test_who_only_connects_takes_but_the_room_there_is(page):
 
 
 def test_a_connection_does_not_last_for_ever(monkeypatch, page):
-    monkeypatch.setattr("rigd.live._page._LONGEST_S", 0.2)
+    monkeypatch.setattr("rigd.live._page._MAX_CONNECTION_S", 0.2)
     with socket.create_connection(("127.0.0.1", page.port), 30.0) as connection:
         connection.sendall(b"GET / HTTP/1.0\r\n")  # the end of it never comes
         assert connection.recv(1) == b""

@@ -23,7 +23,7 @@ from rigd.live.messages import LiveFit, LiveJob
 pytestmark = pytest.mark.process
 
 LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
-IMPATIENT = "from rigd.live import publisher; publisher._WAITING_S = 1.0"
+IMPATIENT = "from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
 
 
 def fetch(url: str):
@@ -240,7 +240,7 @@ def test_a_server_that_stays_frozen_is_replaced(start_producer, start_publisher,
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
         producer,
-        first=f"from rigd.live import _feed as feed; feed._MOST_STALLED_POLLS = 20; {own_port}",
+        first=f"from rigd.live import _feed as feed; feed._MAX_STALLED_POLLS = 20; {own_port}",
     )
     frozen = publisher.server_pid
     os.kill(frozen, signal.SIGSTOP)

@@ -64,7 +64,7 @@ def test_sessions_leave_nothing_behind(publisher):
 
 
 def test_a_server_that_has_seen_many_sessions_makes_room(start_publisher, receive, own_port):
-    publisher = start_publisher(first=f"{own_port}; outlet._MOST_SESSIONS = 2")
+    publisher = start_publisher(first=f"{own_port}; outlet._MAX_SESSIONS = 2")
     first = publisher.address
     publisher.finish()
     run_session(publisher, "second")
@@ -82,7 +82,7 @@ def test_a_session_that_begins_while_the_server_is_frozen_is_shown_when_it_goes_
 ):
     producer = start_producer(speed=8.0)
     publisher = start_publisher(
-        producer, first="from rigd.live import publisher; publisher._WAITING_S = 1.0"
+        producer, first="from rigd.live import publisher; publisher._MAX_QUEUED_S = 1.0"
     )
     server = publisher.server_pid
     os.kill(server, signal.SIGSTOP)

@@ -113,7 +113,9 @@ def test_running_and_fault_are_shown_within_a_second(publisher, producer, receiv
 def test_a_lost_supervisor_is_named_and_whether_the_torque_is_off(
     producer, start_publisher, save, off
 ):
-    publisher = start_publisher(first="from rigd.live import publisher as p; p._ORPHANED_S = 0.5")
+    publisher = start_publisher(
+        first="from rigd.live import publisher as p; p._MAX_ORPHANED_S = 0.5"
+    )
     shared_state = producer.channels.shared_state
     shared_state[StateField.PHASE] = Phase.RUNNING
     saver = save(publisher.address)

@@ -18,7 +18,7 @@ pytestmark = pytest.mark.process
 def viewer(publisher, tmp_path):
     window = Viewer(publisher.address, tmp_path, ("--headless", "--window-size", "320x200"))
     if not eventually(lambda: window.control_url or window.exit_code is not None):
-        pytest.fail(window.last_words)
+        pytest.fail(window.last_log_lines)
     yield window
     window.close()
 
@@ -98,10 +98,10 @@ def test_a_window_that_does_not_answer_is_waited_for_by_nobody(
     publisher, viewer, shown_s, monkeypatch
 ):
     assert eventually(lambda: shown_s() > 0.5)
-    monkeypatch.setattr("rigd.live._viewer._ANSWER_S", 0.5)
+    monkeypatch.setattr("rigd.live._viewer._SWITCH_TIMEOUT_S", 0.5)
     os.kill(viewer.pid, signal.SIGSTOP)
     assert not viewer.connect(publisher.address)
     assert not viewer.connect(publisher.address), "one at a time"
     os.kill(viewer.pid, signal.SIGCONT)
-    monkeypatch.setattr("rigd.live._viewer._ANSWER_S", 60.0)
+    monkeypatch.setattr("rigd.live._viewer._SWITCH_TIMEOUT_S", 60.0)
     assert eventually(lambda: viewer.connect(publisher.address))

@@ -18,14 +18,14 @@ class Ended(Protocol):
     def without_graphics(self) -> bool: ...
 
     @property
-    def last_words(self) -> str: ...
+    def last_log_lines(self) -> str: ...
 
 
 def viewer_ended(viewer: Ended) -> NoReturn:
     """End a test whose viewer has: skipped if the computer lacks graphics, failed otherwise."""
     if viewer.without_graphics:
         pytest.skip(NO_GRAPHICS)
-    pytest.fail(viewer.last_words)
+    pytest.fail(viewer.last_log_lines)
 
 
 def viewer_said(log: str) -> NoReturn:

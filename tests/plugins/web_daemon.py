@@ -202,18 +202,18 @@ def served(tmp_path_factory):
     server.close()
 
 
-JobError, Jobs, MOST_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MOST_JOBS
+JobError, Jobs, MAX_JOBS = _jobs.JobError, _jobs.Jobs, _jobs.MAX_JOBS
 
 _PARTS = {
-    "silent_s": (_access, "_SILENT_S"),
-    "read_s": (_access, "_READ_S"),
-    "most_connections": (_access, "_MOST_CONNECTIONS"),
-    "most_pages": (_live, "MOST_PAGES"),
-    "most_waiting": (_live, "_MOST_WAITING"),
+    "silent_s": (_access, "_FIRST_REQUEST_TIMEOUT_S"),
+    "read_s": (_access, "_BODY_TIMEOUT_S"),
+    "most_connections": (_access, "_MAX_CONNECTIONS"),
+    "most_pages": (_live, "MAX_PAGES"),
+    "most_waiting": (_live, "_MAX_QUEUED_MESSAGES"),
     "list_sessions": (_library, "list_sessions"),
     "response": (_server, "SessionResponse"),
     "program": (_jobs, "_PROGRAM"),
-    "poll_s": (_jobs, "_POLL_S"),
+    "poll_s": (_jobs, "_POLL_PERIOD_S"),
     "give_way": (_jobs, "give_way"),
 }
 """Limits and parts of the page's server that tests replace."""

@@ -333,12 +333,12 @@ def _with_value(text, key, value):
 def key_cases(seed, every):
     """Yield cases for each key of profile, specimen, EDS and JSON files."""
     from rigd.profile import load_profile
-    from rigd.profile._schema import is_number, keys
+    from rigd.profile._schema import is_number, key_types
 
     turn = seed
     for base in ("sim", "antenna_can", "antenna_serial"):
         text = load_profile(base).text
-        for key, annotation in keys().items():
+        for key, annotation in key_types().items():
             if base != "sim" and not key.startswith(("can.", "cia402.", "ati_", "acquisition.")):
                 continue
             values = TOML_NUMBERS if is_number(annotation) else TOML_TEXTS

@@ -79,7 +79,7 @@ def test_a_damaged_file_is_offered_a_copy_or_the_recovery(run, original, tmp_pat
 
 
 def test_a_recovery_that_takes_long_shows_its_progress(run, torn, monkeypatch):
-    monkeypatch.setattr("rigd.cli.options._QUIET_S", -1.0)
+    monkeypatch.setattr("rigd.cli.options._PROGRESS_DELAY_S", -1.0)
     monkeypatch.setenv("FORCE_COLOR", "1")  # rich takes that for a terminal
     result = run(rigd, "recover", torn)
     assert result.exit_code == 0

@@ -72,7 +72,7 @@ def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
     angles_rad = np.round(angles_rad / STEP_RAD) * STEP_RAD
     watch.reset(float(angles_rad[0]))
     # From rest to this speed nothing can go in one tick.
-    watch._previous_moved_rad = watch._before_that_rad = float(angles_rad[1] - angles_rad[0])
+    watch._previous_moved_rad = watch._second_last_moved_rad = float(angles_rad[1] - angles_rad[0])
     watch._previous_angle_rad = float(angles_rad[1])
     limited = [v for v in angles_rad[2:].tolist() if abs(v) < 1.2]
     assert follow(watch, limited) is None

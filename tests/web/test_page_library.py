@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 from processes import eventually
-from web_daemon import MOST_JOBS, TOKEN, JobError, Jobs
+from web_daemon import MAX_JOBS, TOKEN, JobError, Jobs
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -214,7 +214,7 @@ from rigd.web import _jobs
 
 ignore()
 _jobs._PROGRAM = (sys.executable, "-c")
-_jobs._POLL_S = 0.02
+_jobs._POLL_PERIOD_S = 0.02
 
 async def work():
     jobs = _jobs.Jobs(pathlib.Path(), lambda _: None)
@@ -283,7 +283,7 @@ def test_what_became_of_a_job_is_told(jobs):
 
 def test_only_so_many_jobs_wait(jobs):
     async def scenario():
-        for _ in range(MOST_JOBS + 1):
+        for _ in range(MAX_JOBS + 1):
             await asyncio.sleep(0)
             jobs.put("report", ["pass"])
         with pytest.raises(JobError):

@@ -321,11 +321,11 @@ def begin(served):
         }
         series = {"path": name, "running": True, "excitation": excitation.kind, "notes": {}}
         served.daemon.status |= {"state": "running", "series": series | {"plan": plan}}
-        served.call(served.server._link.ask_for_status)
+        served.call(served.server._link.request_status)
 
     yield session
     served.daemon.status |= {"state": "ready", "series": None}
-    served.call(served.server._link.ask_for_status)
+    served.call(served.server._link.request_status)
     assert eventually(lambda: served.server._session is None)
 
 

@@ -8,7 +8,7 @@ import pytest
 
 from rigd.beam import Beam, Damping, transfer
 from rigd.view import Subject
-from rigd.web._signals import Block, SessionResponse, Strips, nominal_document
+from rigd.web._signals import PageSignalBlock, SessionResponse, SignalEnvelopes, nominal_document
 
 RATE_HZ = 1000.0
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
@@ -18,7 +18,7 @@ def block(first, angle, reference=None, torque=None):
     angle = np.asarray(angle, dtype=float)
     reference = angle if reference is None else np.asarray(reference, dtype=float)
     torque = -angle if torque is None else np.asarray(torque, dtype=float)
-    return Block(first, RATE_HZ, np.stack((angle, reference, torque)))
+    return PageSignalBlock(first, RATE_HZ, np.stack((angle, reference, torque)))
 
 
 def test_a_block_is_what_the_event_tells():
@@ -26,7 +26,7 @@ def test_a_block_is_what_the_event_tells():
         name: base64.b64encode(np.array([k, np.nan], dtype="<f4").tobytes()).decode()
         for k, name in enumerate(("angle_rad", "angle_reference_rad", "coupling_torque_nm"))
     }
-    found = Block.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
+    found = PageSignalBlock.of_event(told | {"first_tick": 7, "rate_hz": RATE_HZ})
     assert (found.first_tick, found.values[:, 0].tolist()) == (7, [0.0, 1.0, 2.0])
     assert np.isnan(found.values[0, 1])
 
@@ -34,7 +34,7 @@ def test_a_block_is_what_the_event_tells():
 @pytest.mark.parametrize("pieces", [1, 7, 51, 400])
 def test_strips_are_the_extremes_of_each_point_in_whatever_pieces_they_come(pieces):
     angle = np.sin(np.arange(400) / 30.0)
-    strips = Strips()
+    strips = SignalEnvelopes()
     firsts = range(0, 400, pieces)
     told = [strips.feed(block(first, angle[first : first + pieces])) for first in firsts]
     told = [each for each in told if each]
@@ -47,7 +47,7 @@ def test_strips_are_the_extremes_of_each_point_in_whatever_pieces_they_come(piec
 
 
 def test_what_is_missed_is_no_point_and_what_comes_after_has_its_own_time():
-    strips = Strips()
+    strips = SignalEnvelopes()
     strips.feed(block(0, np.ones(50)))
     told = strips.feed(block(200, np.r_[np.full(50, np.nan), np.full(50, 2.0)]))
     assert told["t0_s"] == 0.05
@@ -56,7 +56,7 @@ def test_what_is_missed_is_no_point_and_what_comes_after_has_its_own_time():
 
 
 def test_a_new_session_begins_anew_and_only_10_s_are_kept():
-    strips = Strips()
+    strips = SignalEnvelopes()
     for first in range(0, 15_000, 500):
         strips.feed(block(first, np.ones(500)))
     last = strips.last()
