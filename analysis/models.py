@@ -338,7 +338,7 @@ PAPER_TYPES: Final = ("I", "II", "III", "IV", "V", "VI")
 PAPER_WEIGHTINGS: Final = ("const", "omega")
 """Weightings used in the reference paper."""
 
-ESTIMATOR_WORDS: Final[Mapping[Estimator, str]] = {
+ESTIMATOR_NAMES: Final[Mapping[Estimator, str]] = {
     "h1": "Welch's H1",
     "h2": "Welch's H2",
     "hv": "Welch's Hv",
@@ -367,9 +367,9 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
     "Welch's H1, 8 Hamming segments of 17266, overlap 2590, nfft 160000"
     """
     if estimator == "fft":
-        return ESTIMATOR_WORDS[estimator]
+        return ESTIMATOR_NAMES[estimator]
     return (
-        f"{ESTIMATOR_WORDS[estimator]}, {segments} Hamming segments of "
+        f"{ESTIMATOR_NAMES[estimator]}, {segments} Hamming segments of "
         f"{segmentation.segment_length}, overlap {segmentation.overlap}, nfft {segmentation.nfft}"
     )
 

@@ -115,7 +115,7 @@ class OnlineEstimate:
         It has internal and external damping. A damping that is insignificant, or whose order is not
         identifiable (so that it may be a stiffness or an inertia), has order 1.
         """
-        from analysis.identify import INTEGER
+        from analysis.identify import ORDER_ONE_STRUCTURE
         from analysis.models import COEFFICIENT_OF
 
         headline, analysis = self.headline, self.analysis
@@ -126,7 +126,12 @@ class OnlineEstimate:
         if not flagged or fit is not headline.fit:
             return fit
         return next(
-            (candidate for candidate in analysis.fits if candidate.structure is INTEGER), fit
+            (
+                candidate
+                for candidate in analysis.fits
+                if candidate.structure is ORDER_ONE_STRUCTURE
+            ),
+            fit,
         )
 
     @property
@@ -142,7 +147,7 @@ class OnlineEstimate:
         test = headline.uniform_beam
         if headline.modal is None or test is None or test.status == "passed":
             return fit.plant
-        return headline.modal.plant_like(fit.plant)
+        return headline.modal.plant_with_modal_frequencies(fit.plant)
 
     def as_json(self) -> dict[str, Any]:
         """Return the estimate as a JSON document (docs/online_fit.md)."""
@@ -300,7 +305,7 @@ class OnlineEstimator:
         OnlineEstimate
             Estimate, or the reason why no fit is possible.
         """
-        from analysis.identify import Measurement, MeasurementError, freest_alone, select
+        from analysis.identify import Measurement, MeasurementError, fit_freest_alone, select
         from analysis.record import RecordError
         from analysis.suited import record_band_hz
         from analysis.validity import record_validity
@@ -321,7 +326,7 @@ class OnlineEstimator:
                 findings = selection.verdict.findings
                 orders = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
-                headline, findings, analysis = freest_alone(measurement, band_hz)
+                headline, findings, analysis = fit_freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session receives the reason and continues, as later samples may suffice.
             is_expected = isinstance(error, SessionError | RecordError | MeasurementError)

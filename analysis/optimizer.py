@@ -328,7 +328,7 @@ _CACHED_POINTS: Final = 2
 """Number of points whose values are cached: the last step of a descent may have been rejected."""
 
 
-class Recent(Generic[_Value]):
+class RecentValues(Generic[_Value]):
     """Cache of a function's values at the last two points of a descent.
 
     Covariances are evaluated at the last point of a descent, and the next descent begins there.

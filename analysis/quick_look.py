@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library.trend import change_between
 from rigd.printable import listed
-from rigd.runtime import begin_background, raise_on
+from rigd.runtime import begin_background, raise_on_signals
 from rigd.session import SessionError, Validity
 from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import (
@@ -153,7 +153,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
 
 def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
     """Fit a record; return the estimates (or None), their validity, and remarks."""
-    from analysis.identify import Measurement, MeasurementError, freest_alone
+    from analysis.identify import Measurement, MeasurementError, fit_freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
@@ -167,7 +167,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             whole = whole_record(record)
             headline, findings, validity = whole.headline, whole.verdict.findings, whole.validity
         else:
-            headline, findings, _ = freest_alone(
+            headline, findings, _ = fit_freest_alone(
                 Measurement.of_record(record), record_band_hz(record)
             )
             model = headline.fit.plant.beam, headline.fit.plant.damping
@@ -212,7 +212,7 @@ def _model_document(
 
     from analysis.report import ShownModel
     from analysis.report.bands import dense_grid
-    from rigd.view.frequency_charts import response_thinning
+    from rigd.view.frequency_charts import response_decimation
 
     if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
@@ -220,7 +220,7 @@ def _model_document(
     peaks_hz = [mode.frequency_hz for mode in shown.modes]
     band = shown.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, limits = np.abs(band.response), band.magnitude_limits()
-    selected = response_thinning(band.frequency_hz).extremes(magnitude)
+    selected = response_decimation(band.frequency_hz).extremes(magnitude)
     return {
         "frequency_hz": _round_digits(band.frequency_hz[selected]),
         "magnitude": _round_digits(magnitude[selected]),
@@ -240,7 +240,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     from analysis.models import LARGEST_FRACTION_OF_RATE
     from analysis.suited import welch_exclusion_reason
     from rigd.spectral import SpectralError, segmentation_of
-    from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_thinning
+    from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
 
     last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
@@ -262,7 +262,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
         estimate.excited & (undelayed.frequency_hz >= FIRST_HZ) & np.isfinite(undelayed.response)
     )
     hz, values = undelayed.frequency_hz[shown], undelayed.response[shown]
-    selected = response_thinning(hz).extremes(np.abs(values))
+    selected = response_decimation(hz).extremes(np.abs(values))
     response = {
         "frequency_hz": _round_digits(hz[selected]),
         "magnitude": _round_digits(np.abs(values[selected])),
@@ -510,7 +510,7 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
 
 def main() -> None:
     """Write and print the quick look of the session that the command line names."""
-    raise_on(signal.SIGINT)
+    raise_on_signals(signal.SIGINT)
     parser = argparse.ArgumentParser(prog="python -m analysis.quick_look", description=__doc__)
     parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")
     parser.add_argument(

@@ -457,7 +457,9 @@ def check_fillable(
     rate_hz : float
         Sampling rate.
     """
-    problem = too_much_unknown(f"the {channel} in the sweep", int(unknown.sum()), len(unknown))
+    problem = unknown_fraction_message(
+        f"the {channel} in the sweep", int(unknown.sum()), len(unknown)
+    )
     if problem:
         raise RecordError(f"{path}: {problem}")
     gap_ticks, start = longest_run(unknown)
@@ -469,7 +471,7 @@ def check_fillable(
         )
 
 
-def too_much_unknown(channel_text: str, unknown: int, total: int) -> str | None:
+def unknown_fraction_message(channel_text: str, unknown: int, total: int) -> str | None:
     """Return an error message if too many samples of a channel are unknown, or None.
 
     The limit is the fraction `MAX_UNKNOWN_FRACTION`.

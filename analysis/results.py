@@ -154,11 +154,11 @@ class WholeRecord:
 
         Their standard uncertainties and intervals include the uncertainty of the scale.
         """
-        from analysis.identify.scales import scales_absorbed, with_scales
+        from analysis.identify.scales import parameters_compensate_scales, with_scale_uncertainty
 
-        if not scales_absorbed(self.fit):
+        if not parameters_compensate_scales(self.fit):
             return {}
-        return with_scales(self.headline.parameters, self.record.uncertainty)
+        return with_scale_uncertainty(self.headline.parameters, self.record.uncertainty)
 
     def headline_json(self) -> dict[str, Any]:
         """Return the reported estimates as the content of a JSON document."""
@@ -183,11 +183,11 @@ class WholeRecord:
 
     def _covariance_json(self) -> dict[str, Any]:
         """Return names and covariance matrix of the fit; ``ln_`` marks a logarithm."""
-        from analysis.identify import LOGARITHMIC
+        from analysis.identify import LOGARITHMIC_PARAMETERS
 
         return {
             "names": [
-                f"ln_{parameter}" if parameter in LOGARITHMIC else parameter
+                f"ln_{parameter}" if parameter in LOGARITHMIC_PARAMETERS else parameter
                 for parameter in self.fit.determined
             ],
             "matrix": self.fit.covariance.tolist(),

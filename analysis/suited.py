@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 Band = tuple[float, float]
 """First and last frequency of a band in Hz."""
 
-LEFT_OUT: Final = "Welch fits left out: "
+WELCH_OMITTED_TEXT: Final = "Welch fits left out: "
 """Start of the sentence that states why the Welch fits were omitted."""
 
 _WELCH_EXCLUSIONS: Final = {
@@ -188,7 +188,7 @@ def welch_analysis(
             if not optional or isinstance(error, SettingsError):
                 raise
             reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
-    return None, f"{LEFT_OUT}{reason}."
+    return None, f"{WELCH_OMITTED_TEXT}{reason}."
 
 
 def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> str | None:

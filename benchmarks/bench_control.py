@@ -4,7 +4,7 @@ import numpy as np
 from timing import least_s
 
 from rigd.control import ClosedLoop, PidController, check_stability, close_loop, design_pid
-from rigd.engine.cycle import make_watch
+from rigd.engine.cycle import make_limit_monitor
 from rigd.excitation import chirp
 from rigd.profile import load_profile
 
@@ -26,7 +26,7 @@ def main() -> None:
     model, motor = profile.loop_model(), profile.rig.motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     pid = PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
-    watch = make_watch(profile)
+    watch = make_limit_monitor(profile)
     wrench = (0.1, 0.1, 0.1, 0.01, 0.01, 0.01)
 
     def steps() -> None:

@@ -15,7 +15,7 @@ from timing import least_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
-from rigd.engine.cycle import Cycle, make_observers, make_watch
+from rigd.engine.cycle import Cycle, make_limit_monitor, make_reading_monitors
 from rigd.engine.timing import TickScheduler, VirtualClock
 from rigd.profile import load_profile
 
@@ -43,9 +43,9 @@ def cycle() -> Callable[[], None]:
     controller = PidController(gains, profile.control, rig.rate_hz, motor.peak_torque_nm)
     devices = open_devices(rig)
     devices.drive.enable()
-    watch = make_watch(profile)
+    watch = make_limit_monitor(profile)
     tick = Cycle(
-        devices, rig.sensor.projection, controller, watch, make_observers(profile, devices)
+        devices, rig.sensor.projection, controller, watch, make_reading_monitors(profile, devices)
     )
     metronome = TickScheduler(VirtualClock(), rig.rate_hz)
 

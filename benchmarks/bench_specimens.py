@@ -76,7 +76,8 @@ def line(case: Case, found: CampaignResult) -> str:
     mixed = "no"
     if (leading := alike.leading) is not None:
         sizes = " and ".join(str(len(group)) for group in leading.groups)
-        mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({leading.own_stds:.0f} std)"
+        stds = f"{leading.between_std_in_own_stds:.0f} std"
+        mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({stds})"
     worst = "" if alike.mixed else f"{worst_error(case, found):.1f}"
     lost = len(found.failures) + len(found.lost_trials)
     return (

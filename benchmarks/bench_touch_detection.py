@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from rigd.control import PidController, design_pid
 from rigd.excitation import chirp
-from rigd.excitation.moves import slew, still_path
+from rigd.excitation.moves import slew, vibration_free_path
 from rigd.identified_beam import TOUCH
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import RigPreview
@@ -159,7 +159,7 @@ def free_motion(hours: float) -> None:
             for _ in range(20):
                 to = random.uniform(-1.2, 1.2)
                 if number % 4 == 2:
-                    way = (to - at) * still_path(random.uniform(0.4, 1.2), 1000.0, poles)
+                    way = (to - at) * vibration_free_path(random.uniform(0.4, 1.2), 1000.0, poles)
                 else:
                     way = slew(
                         to - at,

@@ -36,7 +36,7 @@ TRUTH = {"color": style.INK, "linewidth": 0.9}
 def weights(folder: Path, found: Parameters, made: Session) -> None:
     """Draw nominal models of types I, IV and III over the estimate they were fitted to."""
     h1 = made.noisy(0).h1()
-    with style.styled():
+    with style.figure_style():
         figure = style.new_figure(
             10.0, 3.9, "One ζ for three peaks",
             "types I and IV have internal damping only: constant weights fit the two higher peaks "
@@ -71,7 +71,7 @@ def first_peak(folder: Path, peaks: list[FirstPeak]) -> None:
     """Draw the first peak as it is and as Welch's estimate shows it, and the damping found."""
     shown = (0, 2, 3, 4, 5)
     colours = (style.PURPLE, style.BLUE, style.GREEN, style.ORANGE, style.VERMILION)
-    with style.styled():
+    with style.figure_style():
         figure = style.new_figure(
             10.0, 4.5, "The window has its own peak",
             "left: five beams of different damping; right: the damping ratio that each method "
@@ -129,7 +129,7 @@ def order(
     """Draw loss factors that follow from what is found, and alpha session by session."""
     hz = np.geomspace(1.0, 50.0, 300)
     true = Damping(7.1e-5, 1.0, 5.5e-2, 0.594)
-    with style.styled():
+    with style.figure_style():
         figure = style.new_figure(
             10.0, 4.0, "Three stiffness offsets, read as a fractional order",
             f"{uniform.size} sessions of a beam with α = 1 whose modes are +0.6, +0.5 and −1.3 % "
@@ -187,7 +187,7 @@ def order(
 
 def segments(folder: Path, estimates: dict[int, FrequencyResponse]) -> None:
     """Draw which part of the sweep the segments hold, and what becomes of the third peak."""
-    with style.styled():
+    with style.figure_style():
         figure = style.new_figure(
             10.0, 3.9, "Five samples short",
             "15 % overlap rounded up (2590 samples) and rounded down (2589): then an eighth "

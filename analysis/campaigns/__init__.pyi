@@ -7,8 +7,8 @@ from ._estimates import RecordEstimate as RecordEstimate
 from ._estimates import WelchFit as WelchFit
 from ._experiment import CampaignError as CampaignError
 from ._experiment import SingleSessionError as SingleSessionError
+from ._experiment import differing_fact_keys as differing_fact_keys
 from ._experiment import fact_text as fact_text
-from ._experiment import in_dispute as in_dispute
 from ._headlines import campaign_numbers as campaign_numbers
 from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
@@ -20,4 +20,4 @@ from ._session import analyse_session as analyse_session
 from ._statistics import NominalModel as NominalModel
 from ._statistics import RankedStructure as RankedStructure
 from ._statistics import best_models as best_models
-from ._validation import by_model as by_model
+from ._validation import group_errors_by_model as group_errors_by_model

@@ -278,7 +278,7 @@ def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
     ]
 
 
-def in_dispute(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
+def differing_fact_keys(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
     """Return the keys of the properties in which specimens differ."""
     first_facts = specimens[0].facts
     return tuple(

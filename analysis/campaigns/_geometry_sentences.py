@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.campaigns.sentences import describe_single_sessions, probability
-from analysis.identify.headline import EXACT_CONDITION
-from analysis.identify.sentences import LOSSES, slope_of_loss
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
+from analysis.identify.sentences import LOSS_NAMES, loss_slope_sentence
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
 from rigd.units import to_uncertainty
@@ -80,12 +80,12 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
     sessions_sentence = describe_single_sessions(counts, sum(counts.values()))
     if pooled_order.value is None or pooled_order.interval is None:
         return (
-            f"The slope of the {LOSSES[pooled_order.order]} ({pooled_order.order}) is not "
+            f"The slope of the {LOSS_NAMES[pooled_order.order]} ({pooled_order.order}) is not "
             "identifiable: "
             f"{pooled_order.reason}. {sessions_sentence}"
         )
     shown_hz = [mode.frequency_hz for mode in modal.modes]
-    sentence = slope_of_loss(
+    sentence = loss_slope_sentence(
         pooled_order.order,
         pooled_order.value,
         pooled_order.interval,
@@ -122,7 +122,10 @@ def describe_orders_if_exact(
             f"{order.order} {value} (95 %: {low} to {high}; {conclusions[exact.status]})"
         )
     return (
-        [f"{EXACT_CONDITION.capitalize()} (type {freest.name}): {'; '.join(orders_shown)}."]
+        [
+            f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest.name}): "
+            f"{'; '.join(orders_shown)}."
+        ]
         if orders_shown
         else []
     )

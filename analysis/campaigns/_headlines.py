@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.identify import headline_json, with_modal_model
+from analysis.identify import headline_json, replace_by_modal_model
 from analysis.identify.headline import (
     ConditionalEstimate,
     Estimates,
@@ -98,7 +98,7 @@ def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
     )
     if modal is None:
         return exact
-    numbers = with_modal_model(
+    numbers = replace_by_modal_model(
         exact,
         modal,
         modal.uniform_beam,

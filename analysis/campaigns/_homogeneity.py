@@ -19,7 +19,7 @@ import numpy as np
 
 from analysis.campaigns._orders import common_structure, freest_estimate
 from analysis.campaigns.pooling import random_effects
-from analysis.identify import LOGARITHMIC
+from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
@@ -93,14 +93,14 @@ class Heterogeneity:
         return len(self.values) - 1
 
     @property
-    def own_stds(self) -> float:
+    def between_std_in_own_stds(self) -> float:
         """Scatter between sessions, tau, divided by the standard deviation of a typical session."""
         return math.sqrt(max(self.cochran_q / self.degrees_of_freedom - 1, 0.0))
 
     @property
     def i_squared(self) -> float:
         """Fraction of the variance between sessions that their uncertainties do not explain."""
-        return self.own_stds**2 / (1 + self.own_stds**2)
+        return self.between_std_in_own_stds**2 / (1 + self.between_std_in_own_stds**2)
 
     @property
     def of_rig(self) -> bool:
@@ -137,7 +137,11 @@ class Homogeneity:
         mode_scatters = [
             scatter for scatter in mixed if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
         ]
-        return max(mode_scatters or mixed, key=lambda scatter: scatter.own_stds, default=None)
+        return max(
+            mode_scatters or mixed,
+            key=lambda scatter: scatter.between_std_in_own_stds,
+            default=None,
+        )
 
     @property
     def mixed(self) -> bool:
@@ -243,7 +247,7 @@ def _with_known_std(values: Iterator[tuple[str, float, float]]) -> SessionValues
 def _test_heterogeneity(quantity: str, values: SessionValues, level: float) -> Heterogeneity:
     """Return the between-session scatter of a quantity, tested at a significance level."""
     estimate, std = np.array([entry[1:] for entry in values]).T
-    logarithmic = quantity in LOGARITHMIC
+    logarithmic = quantity in LOGARITHMIC_PARAMETERS
     if logarithmic:
         estimate, std = np.log(estimate), std / estimate
     effects = random_effects(estimate[:, None], (std**2)[:, None, None])

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import PooledMode, random_effects
-from analysis.identify import CONSTANTS, ModalEstimate, ModalModel
+from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel
 from analysis.identify.uniform_beam import (
     TolerantEstimate,
     UniformBeamTest,
@@ -41,11 +41,11 @@ _COMMON_MODE_FRACTION: Final = 0.9
 _SIGNIFICANCE_LEVEL: Final = 0.01
 """Level, for all modes together, at which rising and falling sweeps differ significantly."""
 
-_LN_FREQUENCY_INDEX: Final = CONSTANTS.index("ln_frequency")
+_LN_FREQUENCY_INDEX: Final = MODE_CONSTANT_NAMES.index("ln_frequency")
 """Index of the logarithm of the frequency among the constants of a mode."""
-_LN_DAMPING_RATIO_INDEX: Final = CONSTANTS.index("ln_damping_ratio")
+_LN_DAMPING_RATIO_INDEX: Final = MODE_CONSTANT_NAMES.index("ln_damping_ratio")
 """Index of the logarithm of the damping ratio among the constants of a mode."""
-_RESIDUE_PHASE_INDEX: Final = CONSTANTS.index("residue_phase_rad")
+_RESIDUE_PHASE_INDEX: Final = MODE_CONSTANT_NAMES.index("residue_phase_rad")
 """Index of the phase of the residue among the constants of a mode."""
 
 
@@ -159,7 +159,7 @@ def _modal_estimate(
     modes: tuple[int, ...], joint: NDArray[np.float64], covariance: NDArray[np.float64]
 ) -> ModalEstimate:
     """Return the modal estimate with given constants and background, and their covariance."""
-    constants, background = np.split(joint, [len(modes) * len(CONSTANTS)])
+    constants, background = np.split(joint, [len(modes) * len(MODE_CONSTANT_NAMES)])
     model = ModalModel.of_constants(constants, background.tolist())
     return ModalEstimate(model, modes, constants, covariance)
 
@@ -172,14 +172,16 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
-    """Pool the `CONSTANTS` of some modes, and the background, over estimates.
+    """Pool the `MODE_CONSTANT_NAMES` of some modes, and the background, over estimates.
 
     Whole turns are removed from the phase differences to the first estimate.
     """
     values, covariances = map(
         np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)
     )
-    phases = values[:, _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)]
+    phases = values[
+        :, _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
+    ]
     phases -= 2 * math.pi * np.round((phases - phases[0]) / (2 * math.pi))
     return random_effects(values, covariances)
 
@@ -273,16 +275,17 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     values, covariances = zip(*_pool_groups((rising, falling), modes), strict=True)
     difference, covariance = values[1] - values[0], covariances[0] + covariances[1]
     phases = difference[
-        _RESIDUE_PHASE_INDEX : len(modes) * len(CONSTANTS) : len(CONSTANTS)
+        _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
     ]  # a view into `difference`
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
     changes = []
     for index, mode in enumerate(modes):
-        rows = slice(len(CONSTANTS) * index, len(CONSTANTS) * (index + 1))
+        rows = slice(len(MODE_CONSTANT_NAMES) * index, len(MODE_CONSTANT_NAMES) * (index + 1))
         mode_difference, mode_covariance = difference[rows], covariance[rows, rows]
         chance = float(
             chi_square_p_value(
-                mode_difference @ np.linalg.solve(mode_covariance, mode_difference), len(CONSTANTS)
+                mode_difference @ np.linalg.solve(mode_covariance, mode_difference),
+                len(MODE_CONSTANT_NAMES),
             )
         )
         std = np.sqrt(np.diag(mode_covariance))

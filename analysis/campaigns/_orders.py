@@ -14,8 +14,8 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import estimates_by_structure
-from analysis.identify import effective_reason, tolerant_status
-from analysis.identify.profile_likelihood import WIDEST_FRACTION
+from analysis.identify import effective_reason, order_status_with_geometry_tolerance
+from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import student_t_quantile
@@ -224,7 +224,7 @@ def tolerant_pooled_order(
         Whether a uniform beam does not predict the pooled constants.
     """
     order = exact.order
-    status, reason = tolerant_status(order, estimate, refused=refused)
+    status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
     pooled = PooledOrder(
         order=order,
         status=status,
@@ -276,7 +276,7 @@ def _status_and_reason(
     ):
         # The order is free in no fitted structure, so only the sessions' verdicts are available.
         return "compatible", None
-    if parameter is None or _relative_width(parameter.interval) > WIDEST_FRACTION:
+    if parameter is None or _relative_width(parameter.interval) > MAX_IDENTIFIABLE_FRACTION:
         return "not identifiable", "the sessions do not determine the order"
     if not _nearly_all_adequate(verdicts):
         return "open", _UNEXPLAINED_REASON

@@ -269,7 +269,7 @@ def _session_result(
         record_band_hz=record_band_hz(record, task.band_hz),
         digests=sample_digests(record.angle_rad, record.torque_nm),
         validity=result.validity,
-        modal=None if modal is None or not modal.visible else modal.of_visible(),
+        modal=None if modal is None or not modal.visible else modal.restrict_to_visible_modes(),
         nominal=None if whole is None else whole.analysis.comparison.measurement.nominal,
         uniformity=record.uniformity,
     )

@@ -166,7 +166,7 @@ def left_out_errors(
     )
 
 
-def by_model(
+def group_errors_by_model(
     errors: Sequence[LeftOutError],
 ) -> list[tuple[str, str, str | None, tuple[LeftOutError, ...]]]:
     """Group prediction errors by method, damping structure and weighting.

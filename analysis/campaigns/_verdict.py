@@ -19,7 +19,7 @@ from analysis.campaigns._orders import (
     rival_estimates,
     tolerant_pooled_order,
 )
-from analysis.identify import refused_reason, tolerant_sizes
+from analysis.identify import loss_factors_with_geometry_tolerance, uniform_beam_refusal_reason
 from analysis.identify.sentences import uniformity
 from analysis.identify.verdict import BIC_DECISIVE, BIC_TIE
 from rigd.units import interval_text
@@ -278,7 +278,7 @@ def _final_order(
     if modal.tolerant is not None:
         refused = modal.uniform_beam.status == "refused"
         return tolerant_pooled_order(exact, modal.tolerant, verdicts, refused=refused)
-    reason = refused_reason(modal.uniform_beam)
+    reason = uniform_beam_refusal_reason(modal.uniform_beam)
     return exact if reason is None else exact.doubted(reason)
 
 
@@ -304,7 +304,9 @@ def _describe_parameters(
         geometry.describe_tolerance(modal, modal.tolerant),
         *uniformity_sentences,
         residual_sentence,
-        *sentences.describe_loss_factors(tolerant_sizes(modal.uniform_beam, modal.tolerant)),
+        *sentences.describe_loss_factors(
+            loss_factors_with_geometry_tolerance(modal.uniform_beam, modal.tolerant)
+        ),
     )
 
 

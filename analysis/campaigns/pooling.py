@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, SETTINGS, Plant, damping_size
+from analysis.identify import LOGARITHMIC_PARAMETERS, SETTINGS, Plant, damping_size
 from analysis.identify.headline import ReportedLossFactor, ReportedValue
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
@@ -415,8 +415,8 @@ def _pooled_parameter(
     chance: float,
 ) -> PooledParameter:
     """Return a pooled parameter from the statistics of its value or of its logarithm."""
-    value = math.exp(mean) if name in LOGARITHMIC else mean
-    unit = value if name in LOGARITHMIC else 1.0
+    value = math.exp(mean) if name in LOGARITHMIC_PARAMETERS else mean
+    unit = value if name in LOGARITHMIC_PARAMETERS else 1.0
     return PooledParameter(
         name=name,
         value=value,
@@ -431,14 +431,14 @@ def _pooled_parameter(
 
 def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[float, float]:
     """Return an interval of a parameter from the centre and half width of its coordinate."""
-    if name in LOGARITHMIC:
+    if name in LOGARITHMIC_PARAMETERS:
         return math.exp(mean - half_width), math.exp(mean + half_width)
     return mean - half_width, mean + half_width
 
 
 def _coordinate(name: str, value: float) -> float:
     """Return the value of a parameter, or its logarithm if the logarithm is estimated."""
-    return math.log(value) if name in LOGARITHMIC else value
+    return math.log(value) if name in LOGARITHMIC_PARAMETERS else value
 
 
 def _covariance_block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:

@@ -6,10 +6,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._experiment import fact_text, in_dispute
+from analysis.campaigns._experiment import differing_fact_keys, fact_text
 from analysis.campaigns._statistics import PAPER_BEST_MODELS
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
-from analysis.identify.sentences import LOSSES
+from analysis.identify.sentences import LOSS_NAMES
 from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
 from analysis.statistics import student_t_quantile
 from rigd.printable import listed
@@ -64,7 +64,7 @@ def label(quantity: str) -> tuple[str, float, str]:
     return f"{mode_quantity} of mode {mode}", factor, unit
 
 
-def with_unit(parameter: str) -> str:
+def symbol_with_unit(parameter: str) -> str:
     """Return the symbol or name of a quantity, followed by its display unit in parentheses.
 
     Examples
@@ -147,7 +147,7 @@ def title(text: str, homogeneity: Homogeneity) -> str:
 
 def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]:
     """Describe the different specimens that the session files state."""
-    differing_keys = in_dispute(specimens)
+    differing_keys = differing_fact_keys(specimens)
     specimen_texts = "; ".join(
         ", ".join(
             f"{key} {fact_text(key, specimen.facts[key])}"
@@ -216,8 +216,8 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
         else ""
     )
     return (
-        f"{label(scatter.quantity)[0]} varies between sessions by {scatter.own_stds:.3g} of its "
-        "own "
+        f"{label(scatter.quantity)[0]} varies between sessions by "
+        f"{scatter.between_std_in_own_stds:.3g} of its own "
         f"standard deviations ({scatter_text}Cochran's Q = {scatter.cochran_q:.3g} where "
         f"{scatter.degrees_of_freedom} is expected, I² {equals_sign}{i_squared_text})"
     )
@@ -350,7 +350,7 @@ def _order_clause(pooled_order: PooledOrder) -> str:
 
 def _slope_clause(pooled_order: PooledOrder) -> str:
     """Describe how one loss grows with frequency over the visible modes, as a clause."""
-    loss = LOSSES[pooled_order.order]
+    loss = LOSS_NAMES[pooled_order.order]
     if (
         pooled_order.value is None
         or pooled_order.interval is None

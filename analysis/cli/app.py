@@ -31,7 +31,7 @@ from analysis.cli.welch_options import (
 )
 from analysis.results import FIGURE_FORMATS, Routes
 from rigd.printable import readable_errors
-from rigd.runtime import raise_on, use_one_thread
+from rigd.runtime import raise_on_signals, use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -147,7 +147,7 @@ app.add_typer(export_app, name="export")
 
 def main() -> None:
     """Run the command `analyze` and end the process with its exit code."""
-    raise_on(signal.SIGINT)
+    raise_on_signals(signal.SIGINT)
     use_one_thread()
     # Figures consist of many objects that exist until they are drawn. A garbage collection after
     # every 700 new objects would take 5 % of the computing time.

@@ -314,15 +314,15 @@ def export_model_command(
     are stated over the band.
     """
     from analysis.exchange import export_model
-    from analysis.linear_model import INPUTS, SAMPLES, ModelOptions
+    from analysis.linear_model import DEFAULT_SAMPLES, INPUT_KINDS, ModelOptions
     from rigd.printable import progress_bar
 
     options = ModelOptions(
         beam,
-        parse_option_choice(input_kind, INPUTS, "--input"),
+        parse_option_choice(input_kind, INPUT_KINDS, "--input"),
         _parse_order(order),
         _parse_rate(rate),
-        SAMPLES if samples is None else samples,
+        DEFAULT_SAMPLES if samples is None else samples,
     )
 
     def run() -> None:

@@ -18,7 +18,7 @@ import numpy as np
 import rigd
 from analysis.exchange._file_statements import FileStatements, plan_timebase
 from analysis.exchange._source import ExchangeError, read_source
-from analysis.record_checks import first_mode_hz, too_much_unknown
+from analysis.record_checks import first_mode_hz, unknown_fraction_message
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
 from rigd.session import SessionWriter
 from rigd.session.layout import Status, encode_samples
@@ -381,7 +381,7 @@ def hold_last_values(
                 f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
                 "analysis needs it."
             )
-        problem = too_much_unknown(f"'{names[name]}'", count, len(mask))
+        problem = unknown_fraction_message(f"'{names[name]}'", count, len(mask))
         if problem:
             raise ExchangeError(
                 f"{path}: {problem} Or choose another channel, or cut the session out of the file."

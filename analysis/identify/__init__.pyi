@@ -20,15 +20,19 @@ from ._fit import fit_record as fit_record
 from ._headline_json import headline_json as headline_json
 from ._modal_fit import ModalFit as ModalFit
 from ._modal_headline import effective_reason as effective_reason
-from ._modal_headline import refused_reason as refused_reason
-from ._modal_headline import tolerant_sizes as tolerant_sizes
-from ._modal_headline import tolerant_status as tolerant_status
-from ._modal_headline import with_modal_model as with_modal_model
-from ._modal_model import BACKGROUND as BACKGROUND
-from ._modal_model import CONSTANTS as CONSTANTS
+from ._modal_headline import (
+    loss_factors_with_geometry_tolerance as loss_factors_with_geometry_tolerance,
+)
+from ._modal_headline import (
+    order_status_with_geometry_tolerance as order_status_with_geometry_tolerance,
+)
+from ._modal_headline import replace_by_modal_model as replace_by_modal_model
+from ._modal_headline import uniform_beam_refusal_reason as uniform_beam_refusal_reason
+from ._modal_model import BACKGROUND_COEFFICIENTS as BACKGROUND_COEFFICIENTS
+from ._modal_model import MODE_CONSTANT_NAMES as MODE_CONSTANT_NAMES
 from ._modal_model import ModalEstimate as ModalEstimate
 from ._modal_model import ModalModel as ModalModel
-from ._plant import LOGARITHMIC as LOGARITHMIC
+from ._plant import LOGARITHMIC_PARAMETERS as LOGARITHMIC_PARAMETERS
 from ._plant import SETTINGS as SETTINGS
 from ._plant import Plant as Plant
 from ._plant import Setting as Setting
@@ -39,8 +43,8 @@ from ._result import DampingSize as DampingSize
 from ._result import ModeEstimate as ModeEstimate
 from ._result import RecordAnalysis as RecordAnalysis
 from ._result import RecordFit as RecordFit
-from ._select import INTEGER as INTEGER
+from ._select import ORDER_ONE_STRUCTURE as ORDER_ONE_STRUCTURE
 from ._select import Selection as Selection
-from ._select import freest_alone as freest_alone
+from ._select import fit_freest_alone as fit_freest_alone
 from ._select import select as select
 from ._uncertainty import damping_size as damping_size

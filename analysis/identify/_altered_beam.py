@@ -253,7 +253,7 @@ def _basis() -> _Basis:
 
 
 @lru_cache(maxsize=16)
-def mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
+def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ...]) -> ModeTerms:
     """Return the Galerkin coefficients of the given modes of an altered beam.
 
     `modes` are mode numbers, from 1. The basis is extended by one mode for each point mass, which

@@ -11,7 +11,7 @@ if TYPE_CHECKING:
     from analysis.models import Structure
 
 
-FAR_BEHIND: Final = 1000.0
+FAR_BEHIND_BIC_DIFFERENCE: Final = 1000.0
 """Difference of BIC to the best candidate above which a candidate is only fitted roughly. It cannot
 become the best one, however exactly its minimum is found."""
 

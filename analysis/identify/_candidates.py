@@ -8,14 +8,19 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND, Candidate
-from analysis.identify._channel_checks import wrong_scale
+from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE, Candidate
+from analysis.identify._channel_checks import sign_and_unit_findings
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._leakage import without_leakage
 from analysis.identify._plant import free_settings
-from analysis.identify._refit import FEW, MANY, MISSED, Refit
-from analysis.identify._search import RENEWALS
+from analysis.identify._refit import (
+    DESCENT_EVALUATIONS,
+    MISSED_COST_FRACTION,
+    REFIT_EVALUATIONS,
+    Refit,
+)
+from analysis.identify._search import MAX_ANGLE_REESTIMATES
 from analysis.identify.parametrization import Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
@@ -118,16 +123,16 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        if misread := tuple(wrong_scale(Comparison.of(measurement, band_hz))):
+        if misread := tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz))):
             # No beam explains such a record, so all structures leave much the same residual.
-            return replace(cls.of_freest(measurement, fixed, band_hz), misread=misread)
+            return replace(cls.fit_freest_structure(measurement, fixed, band_hz), misread=misread)
         candidate_set = cls._of_uniform_beam(
             fit_record(measurement, fixed=fixed, band_hz=band_hz), fixed
         )
         return candidate_set._exclude_leakage()
 
     @classmethod
-    def from_earlier(
+    def refit_from_earlier(
         cls,
         earlier: Sequence[Candidate],
         measurement: Measurement,
@@ -167,7 +172,9 @@ class CandidateSet:
             analysis, fixed, (replace(first_candidate, fit=analysis.fits[0]),)
         )
         earlier_set = replace(candidate_set, candidates=tuple(earlier))
-        refitted = (earlier_set._refit_in(candidate_set, c, MANY) for c in other_candidates)
+        refitted = (
+            earlier_set._refit_in(candidate_set, c, DESCENT_EVALUATIONS) for c in other_candidates
+        )
         candidate_set = (
             candidate_set.with_candidates((*candidate_set.candidates, *refitted))
             ._exclude_leakage()
@@ -176,7 +183,7 @@ class CandidateSet:
         return candidate_set._update_reference_following()
 
     @classmethod
-    def of_freest(
+    def fit_freest_structure(
         cls,
         measurement: Measurement,
         fixed: tuple[Setting, ...],
@@ -218,7 +225,7 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate: the one with the lowest BIC, unless `led_by` was called."""
+        """Return the first candidate: that of the lowest BIC, or of `with_leading_candidate`."""
         return self.candidates[0]
 
     @property
@@ -243,7 +250,7 @@ class CandidateSet:
             else freest_candidate
         )
 
-    def led_by(self, candidate: Candidate) -> CandidateSet:
+    def with_leading_candidate(self, candidate: Candidate) -> CandidateSet:
         """Return the set with one candidate moved to the front, so that it is reported."""
         other_candidates = (c for c in self.candidates if c is not candidate)
         return replace(self, candidates=(candidate, *other_candidates))
@@ -266,12 +273,12 @@ class CandidateSet:
         """Return the unknowns of a structure on this record, as the coordinates of a search."""
         return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
-    def refit(self, candidate: Candidate, max_evaluations: int = MANY) -> Refit:
+    def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:
         """Return the minimum reached by a descent from the estimate of a candidate."""
         return self.descend_from_plant(candidate.fit.plant, candidate.structure, max_evaluations)
 
     def descend_from_plant(
-        self, plant: Plant, structure: Structure, max_evaluations: int = MANY
+        self, plant: Plant, structure: Structure, max_evaluations: int = DESCENT_EVALUATIONS
     ) -> Refit:
         """Return the minimum reached by a descent from a plant, with a given structure."""
         unknowns = self.unknowns(structure)
@@ -296,16 +303,16 @@ class CandidateSet:
         Return `self` if that part has converged.
         """
         candidate_set = self
-        for _ in range(RENEWALS):
+        for _ in range(MAX_ANGLE_REESTIMATES):
             best = candidate_set.best
             comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
             if comparison is candidate_set.comparison:
                 break
             set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))
-            noise = set_of_best.refit(best, FEW).noise_here()
+            noise = set_of_best.refit(best, REFIT_EVALUATIONS).residual_noise()
             set_of_best = replace(set_of_best, noise=noise)
             candidate_set = replace(
-                set_of_best, candidates=(set_of_best.refit(best, FEW).candidate(),)
+                set_of_best, candidates=(set_of_best.refit(best, REFIT_EVALUATIONS).candidate(),)
             )
         if candidate_set is self:
             return self
@@ -314,7 +321,8 @@ class CandidateSet:
             candidate for candidate in self.candidates if candidate is not self.best
         )
         refitted = (
-            self._refit_in(candidate_set, candidate, MANY) for candidate in other_candidates
+            self._refit_in(candidate_set, candidate, DESCENT_EVALUATIONS)
+            for candidate in other_candidates
         )
         return candidate_set.with_candidates((*candidate_set.candidates, *refitted)).cross_check()
 
@@ -326,7 +334,9 @@ class CandidateSet:
     def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
         """Fit all candidates again under a slightly different noise spectrum."""
         new_set = replace(self, noise=noise)
-        return new_set.with_candidates(self._refit_in(new_set, c, FEW) for c in self.candidates)
+        return new_set.with_candidates(
+            self._refit_in(new_set, c, REFIT_EVALUATIONS) for c in self.candidates
+        )
 
     def _refit_in(
         self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
@@ -337,7 +347,10 @@ class CandidateSet:
         """
         bic_difference = candidate.bic - min(each.bic for each in self.candidates)
         return new_set.refit(
-            candidate, max_evaluations if bic_difference < FAR_BEHIND else _ROUGH_FIT_EVALUATIONS
+            candidate,
+            max_evaluations
+            if bic_difference < FAR_BEHIND_BIC_DIFFERENCE
+            else _ROUGH_FIT_EVALUATIONS,
         ).candidate()
 
     def cross_check(self) -> CandidateSet:
@@ -356,7 +369,7 @@ class CandidateSet:
                 break
         return candidate_set
 
-    def restarted_from(self, plant: Plant) -> CandidateSet:
+    def restart_from_plant(self, plant: Plant) -> CandidateSet:
         """Refit each candidate, starting from a plant that another search found."""
         return self.with_candidates(
             self._refit_from_plant(c, plant) for c in self.candidates
@@ -371,16 +384,16 @@ class CandidateSet:
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
         start = self.descend_from_plant(plant, structure, 1)
-        cost_to_beat = candidate.fit.cost * (1 - MISSED)
+        cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
         if start.predicted_cost > cost_to_beat:
             return candidate
-        first_descent = start.further(FEW)
+        first_descent = start.further(REFIT_EVALUATIONS)
         if first_descent.cost > candidate.fit.cost * (1 + _CONTINUATION_COST_TOLERANCE):
             return candidate
-        minimum = first_descent.further(MANY)
+        minimum = first_descent.further(DESCENT_EVALUATIONS)
         return candidate if minimum.cost > cost_to_beat else minimum.candidate()
 
-    def with_special_cases(self) -> CandidateSet:
+    def fit_special_cases(self) -> CandidateSet:
         """Add fits of special cases of the freest structure, which start from its estimate.
 
         The special cases have an internal damping of order 1, or lack an insignificant damping. An
@@ -396,9 +409,9 @@ class CandidateSet:
             self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
         )
         candidate_set = self.with_candidates((*self.candidates, *fitted)).cross_check()
-        return candidate_set.led_by(candidate_set.freest)
+        return candidate_set.with_leading_candidate(candidate_set.freest)
 
-    def with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
+    def fit_with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
         """Fit a candidate with the damping that it lacks, for the uncertainty of its modes.
 
         An insignificant damping may still exist, and the damping ratio of a mode is the sum of both
@@ -435,7 +448,7 @@ class CandidateSet:
         if coefficient_growth > 1:
             start = start_point.x.copy()
             start[index] += math.log(coefficient_growth)
-            minimum = self.descent(unknowns, start, MANY)
+            minimum = self.descent(unknowns, start, DESCENT_EVALUATIONS)
             if minimum.x[index] > start_point.x[index]:
                 return minimum.fit(), False
         scaled_hessian, scale = start_point.equations.scaled_hessian()
@@ -444,7 +457,7 @@ class CandidateSet:
         x[index] += max(math.log(scaled_std / scale[index]), 0.0)
         return self.descent(unknowns, x, 1).fit(), True
 
-    def with_orders_free(self) -> CandidateSet:
+    def fit_with_free_orders(self) -> CandidateSet:
         """Add fits of the structures with free orders, unless the set contains them."""
         best = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
@@ -465,18 +478,20 @@ class CandidateSet:
         new_set = self.with_candidates((*self.candidates, *added_candidates))
         if new_set.best.bic > best.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
             return new_set.cross_check()
-        return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).noise_here())
+        return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).residual_noise())
 
-    def with_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
+    def refit_with_additional_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
         """Fit all candidates with additional torque spectra of free amplitude.
 
         The noise is estimated again from the residual of the best candidate with these spectra.
         """
         all_columns = np.concatenate([self.columns, columns])
         best_refit = replace(self, columns=all_columns).refit(self.best)
-        return self.with_columns(all_columns, best_refit.noise_here())
+        return self.refit_with_effect_spectra(all_columns, best_refit.residual_noise())
 
-    def with_columns(self, columns: NDArray[np.complex128], noise: NoiseSpectrum) -> CandidateSet:
+    def refit_with_effect_spectra(
+        self, columns: NDArray[np.complex128], noise: NoiseSpectrum
+    ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
         The spectra represent effects in addition to the linear beam and replace `columns`.
@@ -490,10 +505,12 @@ class CandidateSet:
         """Return the set with its candidates replaced by the given ones, sorted by rising BIC."""
         return replace(self, candidates=_by_rising_bic(candidates))
 
-    def all_but_white(self, fit: RecordFit) -> bool:
+    def is_nearly_white(self, fit: RecordFit) -> bool:
         """Return whether the residual of a fit passes the test of whiteness at the 1 % level."""
         is_used = self.noise.counts
-        return whiteness(fit.residual[is_used], self.comparison.frequency_hz[is_used]).all_but_white
+        return whiteness(
+            fit.residual[is_used], self.comparison.frequency_hz[is_used]
+        ).is_nearly_white
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:

@@ -130,7 +130,7 @@ _CERTAIN_LOG_FACTOR: Final = math.log(5.0)
 searches for a stiffness so far from that of the file."""
 
 
-def wrong_scale(comparison: Comparison) -> Iterator[Finding]:
+def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     """Yield a finding if torque over angle has the wrong sign or a wrong unit."""
     angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
     torque = comparison.spectrum(comparison.torque_nm[comparison.retained])

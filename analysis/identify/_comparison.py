@@ -18,7 +18,7 @@ from analysis.identify.drag_torque import DragExpansion, DragResponse
 from analysis.identify.free_decay import (
     DecaySpectra,
     LaterDecaySpectra,
-    decay_columns,
+    count_decay_spectra,
     mode_poles,
 )
 from analysis.models import LARGEST_FRACTION_OF_RATE
@@ -344,7 +344,7 @@ class Comparison:
         return replace(
             self,
             angle_rad=coherent_rad,
-            prediction=self.prediction.of_other(coherent_rad),
+            prediction=self.prediction.with_angle(coherent_rad),
             incoherent_rad=angle_rad - coherent_rad,
         ).recompute_incoherent_torque(plant)
 
@@ -356,7 +356,7 @@ class Comparison:
         """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
-        incoherent_prediction = self.prediction.of_other(self.incoherent_rad)
+        incoherent_prediction = self.prediction.with_angle(self.incoherent_rad)
         incoherent_nm = incoherent_prediction.torque(plant)[0]
         at_unknown_nm = incoherent_prediction.torque_at_fine_samples(
             plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
@@ -397,7 +397,7 @@ class Comparison:
         # The torque of a ringing beam moves the motor, and that motion changes the ringing.
         for _ in range(_FEEDBACK_ITERATIONS):
             coherent_rad = self._coherent_part(
-                whole_angle_rad, coherent_prediction.of_other(coherent_rad).torque(plant)[0]
+                whole_angle_rad, coherent_prediction.with_angle(coherent_rad).torque(plant)[0]
             )
         return self._use_coherent_part(whole_angle_rad, coherent_rad, plant)
 
@@ -406,7 +406,7 @@ class Comparison:
         """Return the removed hum in newton metres at the retained samples; 0 if there is none."""
         return self._hum_torque_at(np.arange(self.samples) / self.decimation.rate_hz)
 
-    def without_hum(self, hum: tuple[Hum, ...]) -> Comparison:
+    def remove_hum(self, hum: tuple[Hum, ...]) -> Comparison:
         """Return the comparison with only the given hum removed; restore hum removed before."""
         with_new_hum = replace(self, hum=hum)
         ticks = self._decimated_indices(~self.measurement.torque_known)
@@ -501,7 +501,7 @@ class Comparison:
         ndarray of complex, shape (k, K)
         """
         total = self.decays.gradient(poles, amplitudes)
-        decay_amplitudes = decay_columns(poles)
+        decay_amplitudes = count_decay_spectra(poles)
         for number, later in enumerate(self.later_decays, start=1):
             total += later.gradient(poles, amplitudes[number * decay_amplitudes :])
         return total

@@ -22,7 +22,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._plant import Plant
-from analysis.record_checks import MAX_GAP_S, longest_run, too_much_unknown
+from analysis.record_checks import MAX_GAP_S, longest_run, unknown_fraction_message
 from rigd.beam import Damping
 
 if TYPE_CHECKING:
@@ -212,7 +212,7 @@ class Measurement:
     uniformity: float = 1e-3
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
-    one_sweep: bool = True
+    is_single_sweep: bool = True
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -245,7 +245,7 @@ class Measurement:
             uniformity=record.uniformity,
             tip_mass_kg=record.tip_mass_kg,
             axis_tilt_deg=record.axis_tilt_deg,
-            one_sweep=record.metadata.get("excitation", "chirp") == "chirp"
+            is_single_sweep=record.metadata.get("excitation", "chirp") == "chirp"
             and record.there is None,
         )
 
@@ -276,7 +276,9 @@ class Measurement:
                     f"not finite at {bad.size} of {n} ticks; mask them as unknown or record the "
                     "session again."
                 )
-            complaint = too_much_unknown(f"the {channel}", int(np.count_nonzero(~is_known)), n)
+            complaint = unknown_fraction_message(
+                f"the {channel}", int(np.count_nonzero(~is_known)), n
+            )
             if complaint:
                 raise MeasurementError(f"{self.name}: {complaint}")
         for channel, is_known, allowed_s in (

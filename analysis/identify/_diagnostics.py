@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
     from analysis.identify._result import ModeEstimate
-    from analysis.identify._step_in_time import Step
+    from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.headline import Headline
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
 
@@ -104,7 +104,7 @@ def search_limit_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
             )
 
 
-def of_settings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
+def setting_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
     """Yield findings of delay, inertia, beam data and initial ringing that differ from the file.
 
     A parameter with a flag in `headline` yields no finding.
@@ -292,7 +292,7 @@ def unexplained(
     whiteness: Whiteness,
     input_dependence: InputRelation,
     modes: tuple[ModeEstimate, ...],
-    step: Step | None = None,
+    step: StiffnessStep | None = None,
 ) -> Finding:
     """Return the finding that describes the unexplained residual of a record.
 

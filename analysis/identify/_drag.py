@@ -23,8 +23,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._refit import MISSED, Refit
-from analysis.identify.drag_torque import HALF_DENSITY, DragError, DragLaw, DragResponse
+from analysis.identify._refit import MISSED_COST_FRACTION, Refit
+from analysis.identify.drag_torque import (
+    HALF_AIR_DENSITY_KG_PER_M3,
+    DragError,
+    DragLaw,
+    DragResponse,
+)
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
@@ -134,7 +139,7 @@ class DragEstimate:
     covariance: tuple[tuple[float, ...], ...]
 
 
-def with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
+def refit_with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
     """Refit all candidates with air drag, if that explains the record better.
 
     To first order, the spectrum of a small drag predicts by how much drag reduces the cost of each
@@ -230,7 +235,7 @@ def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
     return False
 
 
-def small_drag(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
+def small_drag_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small drag per metre of C_D d, shape (1, K), in N·m/m."""
     whole_angle_rad = comparison.angle_rad + comparison.incoherent_rad
     response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant)
@@ -243,7 +248,7 @@ def _first_order_drag(refit: Refit) -> tuple[float, float]:
     All other parameters of the fit stay free.
     """
     (drag_spectrum,), residual = refit.unexplained_columns(
-        small_drag(refit.objective.comparison, refit.plant)
+        small_drag_spectrum(refit.objective.comparison, refit.plant)
     )
     square = float(np.vdot(drag_spectrum, drag_spectrum).real)
     if square <= 0:
@@ -254,7 +259,7 @@ def _first_order_drag(refit: Refit) -> tuple[float, float]:
 
 def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _DragFitStart | None:
     """Fit a candidate with drag to first order; return None if the drag would be negative."""
-    drag_spectrum = small_drag(candidate_set.comparison, candidate.fit.plant)
+    drag_spectrum = small_drag_spectrum(candidate_set.comparison, candidate.fit.plant)
     refit = replace(candidate_set, columns=drag_spectrum).refit(
         candidate, _SHORT_DESCENT_EVALUATIONS
     )
@@ -315,7 +320,7 @@ def _converged_drag_fit(
             refit = descent(
                 refit.x, columns=drag.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
             )
-        x, law, noise = refit.x, _law_at_minimum(refit), refit.noise_here()
+        x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
         if law.at(drag.speed_m_s) <= 0:
             return None
         comparison = None
@@ -346,7 +351,7 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
         candidate_set,
         comparison=converged_fit.objective.comparison,
         columns=converged_fit.columns,
-        noise=converged_fit.noise_here(),
+        noise=converged_fit.residual_noise(),
     )
     converged_cost = set_with_drag.descent(
         converged_fit.objective.unknowns, converged_fit.x, 1
@@ -362,7 +367,7 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
             set_with_drag.noise,
             set_with_drag.columns,
             max_evaluations=_SHORT_DESCENT_EVALUATIONS,
-            relative_tolerance=MISSED,
+            relative_tolerance=MISSED_COST_FRACTION,
             hopeless=(_EARLY_EVALUATIONS, cost_limit),
         )
         short_descents.append((refit.candidate(), refit))
@@ -424,7 +429,7 @@ _QUADRATURE_POINTS: Final = 64
 
 
 @dataclass(frozen=True, slots=True)
-class DampingAt:
+class DampingAtAmplitude:
     """Damping ratio of a mode in free vibration at one amplitude.
 
     Attributes
@@ -444,7 +449,7 @@ class DampingAt:
     std: float
 
 
-def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]:
+def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplitude, ...]:
     """Return the damping ratios of the first visible modes at several amplitudes of the tip.
 
     The result is empty if the candidates include no drag.
@@ -469,7 +474,7 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAt, ...]
             )[: law_numbers.size]
             variance = mode.damping_ratio_std**2 + float(ratio_by_law @ covariance @ ratio_by_law)
             estimates.append(
-                DampingAt(
+                DampingAtAmplitude(
                     mode=mode.number,
                     tip_amplitude_m=amplitude,
                     damping_ratio=mode.damping_ratio + float(ratio_by_law @ law_numbers),
@@ -493,6 +498,8 @@ def damping_ratio_by_drag_law(
     for power in _SPEED_EXPONENTS:
         time_mean = 2 / math.sqrt(math.pi) * math.gamma(power / 2 + 1) / math.gamma(power / 2 + 1.5)
         shape_mean = float(weights @ shape ** (power + 1)) / float(weights @ shape**2)
-        damping_per_length = HALF_DENSITY * speed ** (power - 1) * time_mean * shape_mean
+        damping_per_length = (
+            HALF_AIR_DENSITY_KG_PER_M3 * speed ** (power - 1) * time_mean * shape_mean
+        )
         ratios.append(damping_per_length / (2 * density_kg_per_m * omega_rad_s))
     return np.array(ratios)

@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._altered_beam import Alteration, mode_terms
+from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._causes import CAUSES, RELAXATION
 from analysis.identify._finding import Finding
-from analysis.identify.uniform_beam import REFUSED_BELOW, ConstantsProblem
+from analysis.identify.uniform_beam import MIN_P_VALUE_OF_UNIFORM_BEAM, UniformBeamProblem
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.identify._causes import Cause
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._plant import Plant
-    from analysis.identify._step_in_time import Step
+    from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.uniform_beam import UniformBeamTest
 
 _CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
@@ -134,7 +134,7 @@ def explanations(
     modes = fit.visible
     if not modes:
         return ()
-    problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
+    problem = UniformBeamProblem(fit, modes, nominal, tilt_deg=tilt_deg)
     best_beam = problem.minima()[0].x
     middle_start = problem.starts()[len(problem.starts()) // 2]
     without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
@@ -172,7 +172,7 @@ def explanations(
 
 
 def _fit_cause(
-    problem: ConstantsProblem, cause: Cause, start_beams: Sequence[NDArray[np.float64]]
+    problem: UniformBeamProblem, cause: Cause, start_beams: Sequence[NDArray[np.float64]]
 ) -> CauseFit | None:
     """Fit one cause to the modes; return None if it cannot be tested or does not explain them.
 
@@ -187,7 +187,7 @@ def _fit_cause(
     for _, start, x in sorted(starts, key=lambda each: each[0]):
         cost, y = _descend_with_tolerances(problem, cause, x, start, degrees_of_freedom)
         p_value = float(chi_square_p_value(cost, degrees_of_freedom))
-        if p_value >= REFUSED_BELOW:
+        if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM:
             break
     else:
         return None
@@ -210,7 +210,7 @@ def _fit_cause(
 
 
 def _descend_with_tolerances(
-    problem: ConstantsProblem,
+    problem: UniformBeamProblem,
     cause: Cause,
     x: NDArray[np.float64],
     y: NDArray[np.float64],
@@ -242,13 +242,13 @@ class _CauseSearch:
 
     def __init__(
         self,
-        problem: ConstantsProblem,
+        problem: UniformBeamProblem,
         cause: Cause,
         x: NDArray[np.float64],
         tolerance: float = _CONSTANT_TOLERANCES[0],
     ) -> None:
         self._problem, self._cause, self._beam_x = problem, cause, x
-        self._plain_terms = mode_terms(Alteration(), problem.nominal.beam, problem.modes)
+        self._plain_terms = galerkin_mode_terms(Alteration(), problem.nominal.beam, problem.modes)
         self._lower = np.concatenate([problem.lower, cause.lower])
         upper = np.where(x <= problem.lower, problem.lower, problem.upper)
         self._upper = np.concatenate([upper, cause.upper])
@@ -313,7 +313,7 @@ class _CauseSearch:
         alteration = self._cause.alter(self._problem.stated, cause_unknowns, beam)
         if alteration.has_same_shapes(Alteration()):
             return replace(self._plain_terms, alteration=alteration)
-        terms = mode_terms(alteration, beam, self._problem.modes)
+        terms = galerkin_mode_terms(alteration, beam, self._problem.modes)
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
@@ -385,7 +385,9 @@ def _limited_step(
 # Words
 
 
-def finding(test: UniformBeamTest, causes: Sequence[CauseFit], step: Step | None = None) -> Finding:
+def finding(
+    test: UniformBeamTest, causes: Sequence[CauseFit], step: StiffnessStep | None = None
+) -> Finding:
     """Return the finding that names possible causes of deviating modes.
 
     Parameters
@@ -395,7 +397,7 @@ def finding(test: UniformBeamTest, causes: Sequence[CauseFit], step: Step | None
     found : sequence of CauseFit
         Causes from `explanations`.
     step : Step, optional
-        Step of the stiffness during the record, from `step_score`.
+        Step of the stiffness during the record, from `best_stiffness_step`.
     """
     phrases = [each.words for each in causes]
     if step is not None and step.named:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND
+from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
 from analysis.identify._comparison import Comparison
 from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
@@ -109,17 +109,17 @@ def fit_record(
         for unknowns in (Unknowns.of(structure, nominal, free_names) for structure in structures)
     ]
     closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
-    reference_descent = searches[closest_index].lowest()
-    reference_descent = reference_descent.to_minimum(
+    reference_descent = searches[closest_index].lowest_coarse_minimum()
+    reference_descent = reference_descent.descend_to_minimum(
         reference_descent.noise(), _ROUGH_COST_TOLERANCE
     )
     whole_angle = reference_descent.objective.comparison
     comparison = whole_angle.use_reference_coherent_angle(reference_descent.plant)
-    searches = [search.on(comparison) for search in searches]
+    searches = [search.with_comparison(comparison) for search in searches]
     reference_descent = Descent(searches[closest_index].objective, reference_descent.x)
-    without_hum = reference_descent.without_hum(_ROUGH_COST_TOLERANCE)
-    if without_hum is not reference_descent:
-        reference_descent = _update_reference_following(without_hum, whole_angle)
+    remove_hum = reference_descent.remove_hum(_ROUGH_COST_TOLERANCE)
+    if remove_hum is not reference_descent:
+        reference_descent = _update_reference_following(remove_hum, whole_angle)
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
@@ -134,7 +134,7 @@ def fit_record(
         if updated_descent is not reference_descent:
             reference_descent = updated_descent
             comparison = reference_descent.objective.comparison
-            searches = [search.on(comparison) for search in searches]
+            searches = [search.with_comparison(comparison) for search in searches]
         noise, descents = _descend_with_noise(searches, closest_index, reference_descent, descents)
         closest_index = min(range(len(searches)), key=lambda i: descents[i].cost(noise))
         reference_descent = descents[closest_index]
@@ -176,12 +176,12 @@ def refit_record(
     """
     comparison = Comparison.of(measurement, band_hz).use_reference_coherent_angle(plant)
     descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
-    descent = descent.to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
+    descent = descent.descend_to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
     descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
     if descent.hum():
         return None
     noise = descent.noise(with_lines=True)
-    descent = descent.to_minimum(noise, _COST_TOLERANCE)
+    descent = descent.descend_to_minimum(noise, _COST_TOLERANCE)
     if not _residual_is_noise(descent, noise):
         return None
     comparison = descent.objective.comparison
@@ -206,9 +206,11 @@ def _descend_with_noise(
     hum = reference_descent.objective.comparison.hum
     noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
     closest_descent = (
-        searches[closest_index].under(noise, reference_descent).to_minimum(noise, _COST_TOLERANCE)
+        searches[closest_index]
+        .descend_to_lowest(noise, reference_descent)
+        .descend_to_minimum(noise, _COST_TOLERANCE)
     )
-    far_behind_ratio = math.exp(FAR_BEHIND / (2 * np.count_nonzero(noise.counts)))
+    far_behind_ratio = math.exp(FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise.counts)))
     cost_limit = far_behind_ratio * closest_descent.cost(noise)
     descents = []
     for i, search in enumerate(searches):
@@ -218,7 +220,7 @@ def _descend_with_noise(
                 Descent(search.objective, earlier_descents[i].x), noise, cost_limit
             )
         if descent is None:
-            descent = search.under(noise).to_minimum(
+            descent = search.descend_to_lowest(noise).descend_to_minimum(
                 noise, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
             )
         descents.append(descent)
@@ -230,7 +232,7 @@ def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
     objective, is_used = descent.objective, noise.counts
     residual = objective.project(objective.linearise(descent.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
-    return whiteness(residual[is_used], hz[is_used]).all_but_white
+    return whiteness(residual[is_used], hz[is_used]).is_nearly_white
 
 
 def _descent_if_still_worse(
@@ -239,7 +241,7 @@ def _descent_if_still_worse(
     """Return a short descent of a structure if its cost stays above a limit, else None."""
     if earlier.cost(noise) <= cost_limit:
         return None
-    descent = earlier.to_minimum(noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit))
+    descent = earlier.descend_to_minimum(noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit))
     return descent if descent.cost(noise) > cost_limit else None
 
 
@@ -250,11 +252,11 @@ def _update_reference_following(descent: Descent, whole_angle: Comparison) -> De
     """
     hum, unknowns = descent.objective.comparison.hum, descent.objective.unknowns
     for _ in range(_MAX_REFERENCE_ESTIMATES):
-        comparison = whole_angle.use_reference_coherent_angle(descent.plant).without_hum(hum)
+        comparison = whole_angle.use_reference_coherent_angle(descent.plant).remove_hum(hum)
         descent = Descent(Objective(comparison, unknowns), descent.x)
-        descent = descent.to_minimum(descent.noise(), _COST_TOLERANCE)
+        descent = descent.descend_to_minimum(descent.noise(), _COST_TOLERANCE)
         hum = descent.hum() or hum
-    return Descent(Objective(descent.objective.comparison.without_hum(hum), unknowns), descent.x)
+    return Descent(Objective(descent.objective.comparison.remove_hum(hum), unknowns), descent.x)
 
 
 # Result at a minimum

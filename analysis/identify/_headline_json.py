@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, Protocol
 
-from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 
 if TYPE_CHECKING:
     from collections.abc import Iterable
@@ -119,7 +119,7 @@ def _mode_json(mode: ReportedMode) -> dict[str, Any]:
 def _exact_json(exact: Estimates) -> dict[str, Any]:
     """Return the estimates for a beam that is uniform to 1e-5, for the JSON document."""
     return {
-        "condition": EXACT_CONDITION,
+        "condition": EXACTLY_UNIFORM_CONDITION,
         "parameters": {name: each.as_json() for name, each in exact.parameters.items()},
         "modes": [_mode_json(each) for each in exact.modes],
     }

@@ -98,7 +98,7 @@ class Hum:
         return torque
 
 
-def resonance_reach_hz(pole: Pole, spacing_hz: float) -> float:
+def resonance_half_width_hz(pole: Pole, spacing_hz: float) -> float:
     """Return the half width of a resonance in hertz, for bins that are `spacing_hz` apart."""
     return max(
         _RESONANCE_HALF_WIDTHS * abs(pole.at_rad_s.real) / (2 * np.pi),
@@ -106,7 +106,7 @@ def resonance_reach_hz(pole: Pole, spacing_hz: float) -> float:
     )
 
 
-def hum_near_modes(
+def find_hum_near_modes(
     comparison: Comparison,
     plant: Plant,
     poles: tuple[Pole, ...],
@@ -142,7 +142,7 @@ def hum_near_modes(
         if not pole.oscillates:
             continue
         mode_hz = pole.at_rad_s.imag / (2 * np.pi)
-        reach_hz = _SEARCH_HALF_WIDTHS * resonance_reach_hz(pole, float(hz[1] - hz[0]))
+        reach_hz = _SEARCH_HALF_WIDTHS * resonance_half_width_hz(pole, float(hz[1] - hz[0]))
         search_range_hz = (max(mode_hz - reach_hz, hz[0]), min(mode_hz + reach_hz, hz[-1]))
         if search_range_hz[1] - search_range_hz[0] < reach_hz / 2:
             continue  # a wrong model may have modes outside the band

@@ -19,9 +19,9 @@ import numpy as np
 from analysis.identify._data import MeasurementError, RecordedImpact
 from analysis.identify._finding import Finding
 from analysis.identify._fit import fit_record
-from analysis.identify._refit import FEW, Refit
+from analysis.identify._refit import REFIT_EVALUATIONS, Refit
 from analysis.identify.parametrization import Unknowns
-from analysis.identify.residual_tests import largest_of, whiteness
+from analysis.identify.residual_tests import largest_deviate_limit, whiteness
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_deviate
 
@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 _FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 """Structure with both dampings and free orders."""
 
-MAX_KNOCKS: Final = 3
+MAX_IMPACTS: Final = 3
 """Maximum number of impacts in one record."""
 
 _WINDOW_HALF_WIDTHS_S: Final = (0.08, 0.5)
@@ -120,14 +120,14 @@ class DetectedImpact:
         )
 
 
-def knocks_in(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
+def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
     """Search a record for one more impact; yield alternative impacts, the likeliest first.
 
     An impact may be larger than the response to the motor, so that a fit to the whole record fails.
     One half of the record then contains no impact, or only a free decay at its start. So the search
     also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_KNOCKS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
         return
     found_in_whole = find_impact(candidate_set)
     if found_in_whole is not None and found_in_whole.obvious:
@@ -204,7 +204,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         fit, is_used = analysis.fits[0], analysis.noise.counts
         if not whiteness(fit.residual[is_used], analysis.comparison.frequency_hz[is_used]).white:
             continue
-        comparison_with_hum = comparison.without_hum(()).recompute_incoherent_torque(fit.plant)
+        comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
         refit_at_start = partial(
             Refit.descend,
@@ -215,17 +215,17 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         )
         first_refit = refit_at_start(noise=candidate_set.noise)
         noise_of_all_bins = replace(
-            first_refit.noise_here(), counts=np.ones(hz.size, dtype=bool), lines=()
+            first_refit.residual_noise(), counts=np.ones(hz.size, dtype=bool), lines=()
         )
         yield refit_at_start(noise=noise_of_all_bins)
 
 
-def with_knock(measurement: Measurement, impact: DetectedImpact) -> Measurement:
+def add_known_impact(measurement: Measurement, impact: DetectedImpact) -> Measurement:
     """Return the measurement with a detected impact added to its known impacts."""
     return replace(measurement, knocks=(*measurement.knocks, impact.knock))
 
 
-def of_knocks(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
+def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
     """Yield a finding for each known impact of a record.
 
     `explained` states whether the model with the impacts explains the record.
@@ -279,7 +279,7 @@ def _likeliest_start(refit: Refit) -> int | None:
     )
     start_sample = int(np.argmax(cost_reductions))
     deviate = chi_square_deviate(float(cost_reductions[start_sample]), lengths.size)
-    if deviate < math.sqrt(2 * largest_of(comparison.samples)):
+    if deviate < math.sqrt(2 * largest_deviate_limit(comparison.samples)):
         return None
     # The residual of a wrong model rises and falls with the sweep; an impact begins abruptly.
     power = comparison.in_time(residual) ** 2
@@ -310,9 +310,9 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
         )
         refit = Refit.descend(
             comparison, refit.objective.unknowns, refit.x, refit.noise, columns,
-            max_evaluations=FEW,
+            max_evaluations=REFIT_EVALUATIONS,
         )  # fmt: skip
-        refit = replace(refit, noise=refit.noise_here())
+        refit = replace(refit, noise=refit.residual_noise())
     return Refit.descend(
         comparison,
         refit.objective.unknowns,
@@ -394,7 +394,7 @@ def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[in
     )
     reduction_by_decays = float(reductions_samples_first[end - begin :].sum())
     normal_deviate = chi_square_deviate(reduction_by_decays, len(decays))
-    is_significant = normal_deviate > math.sqrt(2 * largest_of(comparison.samples))
+    is_significant = normal_deviate > math.sqrt(2 * largest_deviate_limit(comparison.samples))
     return (
         (begin, end)
         if is_significant

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.noise import NoiseSpectrum, noise_of, smooth_power
+from analysis.identify.noise import NoiseSpectrum, estimate_noise, smooth_power
 
 if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
@@ -53,7 +53,7 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     is_near_end = np.abs(all_hz - end_hz) < min(_SEARCH_RANGE_HZ, rate_hz / 2 - end_hz)
     known_fraction = comparison.measurement.known_torque_fraction
     near_mode = np.zeros(np.count_nonzero(is_near_end), dtype=bool)
-    noise_near_end = noise_of(
+    noise_near_end = estimate_noise(
         residual[is_near_end], all_hz[is_near_end], samples, known_fraction, near_mode=near_mode
     )
     is_used, lines = noise.counts.copy(), list(noise.lines)

@@ -22,12 +22,12 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._modal_model import BACKGROUND, ModalEstimate, ModalModel
+from analysis.identify._modal_model import BACKGROUND_COEFFICIENTS, ModalEstimate, ModalModel
 from analysis.identify._result import Ringing
 from analysis.identify.free_decay import Pole, mode_poles
-from analysis.identify.noise import smooth_power, with_peaks
+from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
-from analysis.optimizer import Box, NormalEquations, Recent, descend
+from analysis.optimizer import Box, NormalEquations, RecentValues, descend
 from rigd.beam import LoadedBeam
 
 if TYPE_CHECKING:
@@ -116,7 +116,7 @@ class ModalFit(ModalEstimate):
     ringing: Ringing
     span: NDArray[np.float64]
 
-    def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return by how much each additional torque spectrum would reduce the cost, shape (c,).
 
         Each spectrum is added to the fit alone, with a free amplitude; the cost is the sum of
@@ -151,7 +151,7 @@ class ModalFit(ModalEstimate):
             )
         )
 
-    def plant_like(self, plant: Plant) -> Plant:
+    def plant_with_modal_frequencies(self, plant: Plant) -> Plant:
         """Return the plant with each visible mode's stiffness adjusted to its fitted frequency.
 
         The given plant is returned unchanged if there is no such plant, if the visible modes are
@@ -259,7 +259,7 @@ class _ModalSearch:
             residual = problem.residual(search.x, model)
             comparison = search.comparison.renewed(model, search.noise).fill_unknown_torque(model)
             power = smooth_power(residual, finely=True)
-            power = with_peaks(residual, power, ~search.is_near_mode())
+            power = noise_power_with_peaks(residual, power, ~search.is_near_mode())
             power /= comparison.measurement.known_torque_fraction
             counts = search.noise.counts
             change = np.abs(np.log(power / search.noise.power)[counts]).mean()
@@ -452,7 +452,7 @@ class _ModalProblem:
         effect_spectra: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent: Recent[_LinearSolution] = Recent()
+        self._recent: RecentValues[_LinearSolution] = RecentValues()
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -462,7 +462,9 @@ class _ModalProblem:
         self._measured_torque = self._whiten(
             comparison.spectrum(comparison.torque_nm[comparison.retained])
         )
-        background = np.array([(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND)])
+        background = np.array(
+            [(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND_COEFFICIENTS)]
+        )
         self._background = self._predicted_spectra(background)
 
     def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -545,7 +547,7 @@ class _ModalProblem:
         projections = span @ measured_torque
         residual = projections @ span - measured_torque
         linear_parameters = np.linalg.solve(factor.T, projections)
-        nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND :]
+        nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND_COEFFICIENTS :]
         jacobian = np.array(drag_jacobian).reshape(x.size, residual.size)
         if poles:
             jacobian += self._whiten(self._comparison.decay_gradient(poles, nuisance_amplitudes))
@@ -566,8 +568,8 @@ class _ModalProblem:
         poles, residues = [], []
         first_background = 2 * len(modes)
         background = linear_parameters[
-            first_background : first_background + BACKGROUND
-        ] / self.scale_rad_s ** np.arange(BACKGROUND)
+            first_background : first_background + BACKGROUND_COEFFICIENTS
+        ] / self.scale_rad_s ** np.arange(BACKGROUND_COEFFICIENTS)
         for k, (log_omega, eta) in enumerate(modes):
             omega, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
             q = _unit_pole(eta)
@@ -580,7 +582,7 @@ class _ModalProblem:
 
     def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
         """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
-        first_nuisance = 2 * len(self._numbers) + BACKGROUND
+        first_nuisance = 2 * len(self._numbers) + BACKGROUND_COEFFICIENTS
         amplitudes = self.solution_at(x).linear_parameters[first_nuisance:]
         poles = self._poles(x)
         comparison = self._comparison
@@ -601,7 +603,7 @@ class _ModalProblem:
         The decay of each mode has two amplitudes, which are free linear parameters of the fit.
         """
         mode_count = len(self._numbers)
-        first_decay = 2 * mode_count + BACKGROUND
+        first_decay = 2 * mode_count + BACKGROUND_COEFFICIENTS
         amplitudes = point.linear_parameters[first_decay : first_decay + 2 * mode_count]
         rows = slice(2 * mode_count + first_decay, 2 * mode_count + first_decay + 2 * mode_count)
         return Ringing(
@@ -613,17 +615,19 @@ class _ModalProblem:
     def constants(
         self, point: _LinearSolution, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the `CONSTANTS` of all modes, and their joint covariance with the background.
+        """Return the constants of all modes, and their joint covariance with the background.
 
-        Their shapes are (4 n,) and (4 n + 5, 4 n + 5).
+        The constants are `MODE_CONSTANT_NAMES`. The shapes are (4 n,) and (4 n + 5, 4 n + 5).
         """
         mode_count = x.size // 2
         constants = np.empty(4 * mode_count)
         first_background = x.size + 2 * mode_count
-        derivatives = np.zeros((4 * mode_count + BACKGROUND, first_background + BACKGROUND))
+        derivatives = np.zeros(
+            (4 * mode_count + BACKGROUND_COEFFICIENTS, first_background + BACKGROUND_COEFFICIENTS)
+        )
         background_rows = derivatives[4 * mode_count :]
         background_rows[:, first_background:] = np.diag(
-            self.scale_rad_s ** -np.arange(float(BACKGROUND))
+            self.scale_rad_s ** -np.arange(float(BACKGROUND_COEFFICIENTS))
         )
         for k in range(mode_count):
             log_omega, eta = x[2 * k : 2 * k + 2]

@@ -11,19 +11,24 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from analysis.identify._plant import OF_BEAM
+from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify._uncertainty import damping_size
 from analysis.identify.headline import (
-    NAMES,
+    DAMPING_PARAMETER_NAMES,
     Estimates,
     ReportedMode,
     ReportedValue,
-    size_of,
-    symmetric,
+    reported_loss_factor,
+    symmetric_value,
 )
-from analysis.identify.profile_likelihood import WIDEST_FRACTION
+from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.uniform_beam import PARAMETERS
-from analysis.identify.verdict import EXCLUDED, NOT_DETERMINED, OrderVerdict, Status
+from analysis.identify.verdict import (
+    EXCLUSION_DEVIANCES,
+    ORDER_NOT_DETERMINED_REASON,
+    OrderVerdict,
+    Status,
+)
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 
@@ -41,12 +46,12 @@ NOT_UNIFORM: Final = (
 NO_ORDER: Final = "no beam with one internal and one external order explains the losses"
 """Reason for a flag on damping parameters: no beam with fractional orders explains the losses."""
 
-_EFFECTIVE_PARAMETERS: Final = (*OF_BEAM, "delay_s", "gamma", "lambda")
+_EFFECTIVE_PARAMETERS: Final = (*BEAM_PARAMETERS, "delay_s", "gamma", "lambda")
 """Parameters that a deviation from a uniform beam may change by more than the tolerance of the
 geometry. External damping is among them: it is relative to the inertia of each mode."""
 
 
-def refused_reason(test: UniformBeamTest) -> str | None:
+def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
     """Return the reason why values of a uniform beam are invalid; None if they may be valid."""
     if test.status != "refused":
         return None
@@ -54,10 +59,10 @@ def refused_reason(test: UniformBeamTest) -> str | None:
 
 
 _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
-"""Type variable for `Estimates` or a subclass, which `with_modal_model` takes and returns."""
+"""Type variable for `Estimates` or a subclass, which `replace_by_modal_model` takes and returns."""
 
 
-def with_modal_model(
+def replace_by_modal_model(
     exact: _EstimatesT,
     modal: ModalEstimate,
     test: UniformBeamTest,
@@ -87,7 +92,7 @@ def with_modal_model(
     half_width : float
         Half width of the modes' 95 % intervals, in standard deviations.
     """
-    refusal = refused_reason(test)
+    refusal = uniform_beam_refusal_reason(test)
     exact_estimates = exact if refusal is None else exact.doubted(refusal)
     # The effect of drag depends on how a mode decays, which the beam model includes.
     modes_of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
@@ -105,7 +110,9 @@ def with_modal_model(
             },
             **_reported_parameters(tolerant, doubt, refused=refusal is not None),
         },
-        sizes=tuple(each.flagged(doubt) for each in tolerant_sizes(test, tolerant)),
+        sizes=tuple(
+            each.flagged(doubt) for each in loss_factors_with_geometry_tolerance(test, tolerant)
+        ),
         structures=_structure_status(exact_estimates, tolerant),
         simpler=None,
         exact=Estimates(
@@ -140,11 +147,15 @@ def _reported_modes(
         inertia, relative_std = modal.inertia(number)
         mode = ReportedMode(
             number,
-            symmetric(modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width),
-            symmetric(modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt, half_width),
+            symmetric_value(
+                modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width
+            ),
+            symmetric_value(
+                modal_mode.damping_ratio, modal_mode.damping_ratio_std, doubt, half_width
+            ),
             shown=True,
             source="modal",
-            participation=symmetric(inertia, inertia * relative_std, doubt, half_width),
+            participation=symmetric_value(inertia, inertia * relative_std, doubt, half_width),
         )
         if from_beam and number in modes:
             beam_mode = modes[number]
@@ -184,7 +195,7 @@ def _reason_undetermined(estimate: TolerantEstimate, name: str) -> str | None:
         return NO_ORDER
     for order, coefficient in COEFFICIENT_OF.items():
         if name in (order, coefficient) and not identifiable(estimate, order):
-            return NOT_DETERMINED
+            return ORDER_NOT_DETERMINED_REASON
     return None
 
 
@@ -194,8 +205,8 @@ def identifiable(estimate: TolerantEstimate, order: str) -> bool:
     Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
     """
     low, high = estimate.interval[order]
-    widest = WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-    is_significant = estimate.deviance_without[COEFFICIENT_OF[order]] > NORMAL_95**2
+    widest = MAX_IDENTIFIABLE_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+    is_significant = estimate.deviance_without_damping[COEFFICIENT_OF[order]] > NORMAL_95**2
     return high - low <= widest and is_significant
 
 
@@ -213,19 +224,19 @@ def _structure_status(
         structure = STRUCTURES[name.partition(",")[0]]
         for order, coefficient in COEFFICIENT_OF.items():
             if not structure.has(coefficient):
-                deviance_rise = estimate.deviance_without[coefficient]
+                deviance_rise = estimate.deviance_without_damping[coefficient]
             elif structure.fixed.get(order) == 1.0:  # type: ignore[call-overload]
-                deviance_rise = estimate.deviance_of_one[order]
+                deviance_rise = estimate.deviance_of_order_one[order]
             else:
                 continue
-            if deviance_rise > EXCLUDED[0]:
+            if deviance_rise > EXCLUSION_DEVIANCES[0]:
                 return "excluded"
         return "compatible"
 
     return tuple((name, status_of(name, exact_status)) for name, exact_status in exact.structures)
 
 
-def tolerant_sizes(
+def loss_factors_with_geometry_tolerance(
     test: UniformBeamTest, estimate: TolerantEstimate
 ) -> tuple[ReportedLossFactor, ...]:
     """Return the loss factors at the frequencies where they depend least on their orders.
@@ -242,7 +253,7 @@ def tolerant_sizes(
     """
     values = dict(estimate.values)
     reported = []
-    for damping, (coefficient, order) in NAMES.items():
+    for damping, (coefficient, order) in DAMPING_PARAMETER_NAMES.items():
         loss_factor = damping_size(
             coefficient, order, values, PARAMETERS, estimate.covariance, estimate.first_rad_s
         )
@@ -251,7 +262,7 @@ def tolerant_sizes(
         flag = NO_ORDER if estimate.basis == "none" else None
         if damping == "external" and test.status == "refused":
             flag = flag or NOT_UNIFORM
-        reported.append(size_of(damping, loss_factor, flag))
+        reported.append(reported_loss_factor(damping, loss_factor, flag))
     return tuple(reported)
 
 
@@ -268,7 +279,7 @@ def effective_reason(name: str, *, refused: bool) -> str | None:
     return NOT_UNIFORM if refused and name in _EFFECTIVE_PARAMETERS else None
 
 
-def tolerant_order(
+def order_verdict_with_geometry_tolerance(
     order: Order,
     estimate: TolerantEstimate,
     profile: LikelihoodProfile,
@@ -282,7 +293,7 @@ def tolerant_order(
     against every number of the record. With `refused`, a uniform beam does not predict the modes:
     the cause may have a loss of its own, so no order is excluded.
     """
-    status, reason = tolerant_status(order, estimate, refused=refused)
+    status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
     if reason is not None:
         return OrderVerdict(order, status, None, None, reason, profile)
     value, interval = estimate.values[order], estimate.interval[order]
@@ -292,7 +303,7 @@ def tolerant_order(
     return OrderVerdict(order, status, value, interval, None, profile)
 
 
-def tolerant_status(
+def order_status_with_geometry_tolerance(
     order: Order, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
     """Return the status of one damping order, and the reason if it is not identifiable.
@@ -309,9 +320,9 @@ def tolerant_status(
     if estimate.basis == "none":
         return "not identifiable", NO_ORDER
     if not identifiable(estimate, order):
-        return "not identifiable", NOT_DETERMINED
+        return "not identifiable", ORDER_NOT_DETERMINED_REASON
     low, high = estimate.interval[order]
     if low <= 1 <= high:
         return "compatible", None
-    is_fractional = estimate.deviance_of_one[order] > EXCLUDED[0] and not refused
+    is_fractional = estimate.deviance_of_order_one[order] > EXCLUSION_DEVIANCES[0] and not refused
     return ("fractional" if is_fractional else "open"), None

@@ -31,10 +31,10 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-BACKGROUND: Final = 5
+BACKGROUND_COEFFICIENTS: Final = 5
 """Number of coefficients of the background polynomial, b0 to b4."""
 
-CONSTANTS: Final = ("ln_frequency", "ln_damping_ratio", "ln_residue", "residue_phase_rad")
+MODE_CONSTANT_NAMES: Final = ("ln_frequency", "ln_damping_ratio", "ln_residue", "residue_phase_rad")
 """Names of the four real constants of a mode, in the order of the covariance of a fit."""
 
 
@@ -110,11 +110,11 @@ class ModalModel:
         Parameters
         ----------
         constants : ndarray, shape (4 n,)
-            `CONSTANTS` of each mode in turn, by rising frequency.
+            `MODE_CONSTANT_NAMES` of each mode in turn, by rising frequency.
         background : sequence of float
             Coefficients b0 to b4 of the background.
         """
-        rows = constants.reshape(-1, len(CONSTANTS)).tolist()
+        rows = constants.reshape(-1, len(MODE_CONSTANT_NAMES)).tolist()
         poles, residues = [], []
         for ln_frequency, ln_ratio, ln_residue, phase_rad in rows:
             ratio = math.exp(ln_ratio)
@@ -151,7 +151,7 @@ class ModalEstimate:
         Number of each mode of the model among those of the beam, from 1; 0 for a resonance that
         does not belong to the beam.
     constants : ndarray, shape (4 n,)
-        `CONSTANTS` of each mode in turn; the phase is that of the residue divided by j.
+        `MODE_CONSTANT_NAMES` of each mode in turn; the phase is that of the residue divided by j.
     joint_covariance : ndarray, shape (4 n + 5, 4 n + 5)
         Covariance of the constants and the coefficients of the background.
     """
@@ -179,7 +179,7 @@ class ModalEstimate:
         numbers : sequence of int
             Numbers of m modes.
         """
-        mode_indices = np.arange(len(CONSTANTS))
+        mode_indices = np.arange(len(MODE_CONSTANT_NAMES))
         indices = [
             mode_indices + mode_indices.size * self.numbers.index(number) for number in numbers
         ]
@@ -216,16 +216,18 @@ class ModalEstimate:
         """
         rows = self.rows([number])
         # The logarithm of the inertia is ln_residue - 3 ln_frequency, plus a constant.
-        weights = np.zeros(len(CONSTANTS))
-        weights[CONSTANTS.index("ln_frequency")] = -3.0
-        weights[CONSTANTS.index("ln_residue")] = 1.0
+        weights = np.zeros(len(MODE_CONSTANT_NAMES))
+        weights[MODE_CONSTANT_NAMES.index("ln_frequency")] = -3.0
+        weights[MODE_CONSTANT_NAMES.index("ln_residue")] = 1.0
         relative_std = math.sqrt(float(weights @ self.covariance[np.ix_(rows, rows)] @ weights))
         return self.model.effective_inertias_kg_m2[self.numbers.index(number)], relative_std
 
-    def of_visible(self) -> ModalEstimate:
+    def restrict_to_visible_modes(self) -> ModalEstimate:
         """Return the modal model restricted to the visible modes, with the same background."""
         rows, indices = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
-        joint_rows = np.concatenate([rows, self.constants.size + np.arange(BACKGROUND)])
+        joint_rows = np.concatenate(
+            [rows, self.constants.size + np.arange(BACKGROUND_COEFFICIENTS)]
+        )
         return ModalEstimate(
             ModalModel(
                 tuple(self.model.poles_rad_s[index] for index in indices),
@@ -239,8 +241,10 @@ class ModalEstimate:
 
     def as_json(self) -> dict[str, Any]:
         """Return model, mode numbers and covariance as a dictionary for `json.dumps`."""
-        names = [f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in CONSTANTS]
-        names += [f"background_{power}" for power in range(BACKGROUND)]
+        names = [
+            f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in MODE_CONSTANT_NAMES
+        ]
+        names += [f"background_{power}" for power in range(BACKGROUND_COEFFICIENTS)]
         return {
             **self.model.as_json(),
             "modes": list(self.numbers),

@@ -28,7 +28,7 @@ import numpy as np
 
 from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
 from analysis.identify._data import fast_length
-from analysis.identify._predictor import torque_channel
+from analysis.identify._predictor import torque_channel_response
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
@@ -74,7 +74,7 @@ _FORCE_TOLERANCE: Final = 1e-3
 
 
 @dataclass(frozen=True, slots=True)
-class Term:
+class NonlinearTerm:
     """Nonlinear restoring force of one kind on one mode.
 
     Attributes
@@ -89,7 +89,7 @@ class Term:
     mode: int
 
 
-class ModalForces:
+class NonlinearForceSpectra:
     """Computes the torque spectra of nonlinear restoring forces of unit size on single modes.
 
     Parameters
@@ -125,7 +125,7 @@ class ModalForces:
             density_over_stiffness * self._s**2 + damping.gamma * self._s**damping.lambda_
         )
 
-    def column(self, term: Term, size: float = 0.0) -> NDArray[np.complex128]:
+    def column(self, term: NonlinearTerm, size: float = 0.0) -> NDArray[np.complex128]:
         """Return the torque spectrum of a force divided by its `size`, shape (K,), in N·m.
 
         It is not finite if the repeated substitution diverges: the force is then too large.
@@ -171,7 +171,7 @@ class ModalForces:
             * self._inertia_and_external
             / dynamic_stiffness
             * force
-            * torque_channel(self._plant, self._s)
+            * torque_channel_response(self._plant, self._s)
         )
         in_time = np.fft.irfft(torque, self._length)[: self._samples]
         in_time *= self._growth[::_OVERSAMPLING]
@@ -258,12 +258,12 @@ class NonlinearForce:
         Standard deviation of `size`.
     """
 
-    term: Term
+    term: NonlinearTerm
     size: float
     std: float
 
 
-def nonlinear_forces(
+def add_nonlinear_forces(
     candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add significant nonlinear forces one by one, and refit all candidates with them.
@@ -306,7 +306,7 @@ def _add_forces(
     candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
     """Add significant forces to one candidate one by one, then refit all candidates with them."""
-    terms: list[Term] = []
+    terms: list[NonlinearTerm] = []
     sizes = std = np.zeros(0)
     best = candidate_set.best
     refit = candidate_set.refit(start_candidate)
@@ -329,7 +329,7 @@ def _add_forces(
         refit, sizes, std = fitted
     if not terms:
         return candidate_set, ()
-    with_forces = candidate_set.with_columns(refit.columns, refit.noise_here())
+    with_forces = candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise())
     forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
     return with_forces, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
 
@@ -340,24 +340,29 @@ def _deviance_reduction(candidate: Candidate, cost_before: float, cost_after: fl
 
 
 def _best_first_order_force(
-    candidate_set: CandidateSet, refit: Refit, modes: tuple[int, ...], excluded_terms: list[Term]
-) -> tuple[Term | None, float]:
+    candidate_set: CandidateSet,
+    refit: Refit,
+    modes: tuple[int, ...],
+    excluded_terms: list[NonlinearTerm],
+) -> tuple[NonlinearTerm | None, float]:
     """Return the force with the largest cost reduction to first order, and the cost with it.
 
     Forces in `excluded_terms` are not considered.
     """
-    forces = ModalForces(candidate_set.comparison, refit.plant)
+    forces = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
     # If drag on the whole beam is significant, drag on a single mode is not tested.
     kinds = (
         FORCE_KINDS
         if candidate_set.drag is None
         else tuple(k for k in FORCE_KINDS if k != "quadratic drag")
     )
-    terms = [Term(kind, mode) for kind in kinds for mode in modes]
+    terms = [NonlinearTerm(kind, mode) for kind in kinds for mode in modes]
     terms = [term for term in terms if term not in excluded_terms]
     if not terms:
         return None, refit.cost
-    cost_reductions = refit.saved_by(np.array([forces.column(term) for term in terms]))
+    cost_reductions = refit.cost_reduction_by_spectrum(
+        np.array([forces.column(term) for term in terms])
+    )
     best_index = int(np.argmax(cost_reductions))
     return terms[best_index], max(
         refit.cost - float(cost_reductions[best_index]), 1e-3 * refit.cost
@@ -365,7 +370,10 @@ def _best_first_order_force(
 
 
 def _fit_with_forces(
-    candidate_set: CandidateSet, refit: Refit, terms: list[Term], sizes: NDArray[np.float64]
+    candidate_set: CandidateSet,
+    refit: Refit,
+    terms: list[NonlinearTerm],
+    sizes: NDArray[np.float64],
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit a plant with the given forces, starting from given sizes of the forces.
 
@@ -374,7 +382,7 @@ def _fit_with_forces(
     """
     std = np.zeros(sizes.size)
     for _ in range(_MAX_SIZE_ITERATIONS):
-        forces = ModalForces(candidate_set.comparison, refit.plant)
+        forces = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
         spectra = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
         if not np.isfinite(spectra).all():
             return None

@@ -45,10 +45,10 @@ OPTIONAL_PARAMETERS: Final = (
 """Parameters of a rig with a compliant clamp, a mass at the tip or filters in the torque channel; 0
 if it has none."""
 
-OF_BEAM: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
+BEAM_PARAMETERS: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
 """Parameters of the beam other than its damping."""
 
-LOGARITHMIC: Final = frozenset({"zeta", "gamma", *OF_BEAM})
+LOGARITHMIC_PARAMETERS: Final = frozenset({"zeta", "gamma", *BEAM_PARAMETERS})
 """Parameters that are positive and uncertain by a factor, so their logarithm is estimated."""
 
 

@@ -54,7 +54,7 @@ _BUTTERWORTH_LOSS: Final = 2**0.5
 """Reciprocal quality factor of a second-order Butterworth filter."""
 
 
-def torque_channel(
+def torque_channel_response(
     plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
 ) -> NDArray[np.complex128]:
     """Return the transfer function of delay and filters of the torque channel, of the shape of `s`.
@@ -139,7 +139,7 @@ class ResponseGrid:
             response = response * clamp_factor
         response += plant.tool_inertia_kg_m2 * self._s_squared
         derivatives["tool_inertia_kg_m2"] = self._s_squared
-        channel_times_angle = torque_channel(plant, self._s) * angle
+        channel_times_angle = torque_channel_response(plant, self._s) * angle
         if "delay_s" in wrt:
             derivatives["delay_s"] = -self._s * response
         spectra = np.empty((1 + len(wrt), channel_times_angle.size), dtype=np.complex128)
@@ -228,7 +228,7 @@ class TorquePredictor:
         self._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
         self._growth = np.exp(sigma * time_s[retained])
 
-    def of_other(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
+    def with_angle(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
         """Return the predictor for another angle of the same length, shape (n,)."""
         predictor = copy(self)
         predictor._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)

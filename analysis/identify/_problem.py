@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify.free_decay import Pole
-from analysis.optimizer import NormalEquations, Recent, descend
+from analysis.optimizer import NormalEquations, RecentValues, descend
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -113,7 +113,7 @@ class Objective:
         self.comparison = comparison
         self.unknowns = unknowns
         self.columns = no_columns if columns is None else columns
-        self._recent: Recent[Linearisation] = Recent()
+        self._recent: RecentValues[Linearisation] = RecentValues()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return residual and derivatives at `x`; the results at the last two points are cached."""

@@ -16,7 +16,7 @@ from analysis.identify._candidate import Candidate
 from analysis.identify._fit import summary
 from analysis.identify._problem import Objective
 from analysis.identify.noise import NoiseSpectrum, smooth_power
-from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps
+from analysis.identify.parametrization import VANISHING_LOSS, Steps
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
     from analysis.optimizer import NormalEquations
 
 
-FEW: Final = 8
+REFIT_EVALUATIONS: Final = 8
 """Number of evaluations of the sum of squares after which a fit under slightly other noise has
 converged, or a start has proved useless."""
 
-MANY: Final = 40
+DESCENT_EVALUATIONS: Final = 40
 """Number of evaluations of the sum of squares after which a descent from another start has
 converged."""
 
-MISSED: Final = 1e-5
+MISSED_COST_FRACTION: Final = 1e-5
 """Fraction of a sum of squares (some 1e4) by which a lower minimum counts as missed. The BIC
 penalty of a parameter is 9."""
 
@@ -88,7 +88,7 @@ class Refit:
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
         """
-        region = Steps.of(unknowns, NEXT_TO_NOTHING)
+        region = Steps.of(unknowns, VANISHING_LOSS)
         x = np.clip(start, region.lower, region.upper)
         for name in hold:
             index = unknowns.names.index(name)
@@ -111,7 +111,7 @@ class Refit:
         objective, minimum = self.objective.minimum(
             self.x,
             self.noise.weight,
-            Steps.of(self.objective.unknowns, NEXT_TO_NOTHING),
+            Steps.of(self.objective.unknowns, VANISHING_LOSS),
             relative_tolerance=_COST_TOLERANCE,
             max_evaluations=max_evaluations,
         )
@@ -201,7 +201,7 @@ class Refit:
             explaining_spectra = np.concatenate([projected.jacobian, explaining_spectra])
         return unexplained_part(columns * weight, explaining_spectra), projected.residual
 
-    def saved_by(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the first-order cost reduction by each added torque spectrum alone, shape (c,).
 
         Parameters
@@ -244,7 +244,7 @@ class Refit:
         unknowns = self.objective.unknowns
         return Candidate(unknowns.structure, self.fit(), len(self.columns))
 
-    def noise_here(self) -> NoiseSpectrum:
+    def residual_noise(self) -> NoiseSpectrum:
         """Return the noise of the residual at this minimum. Lines stay excluded."""
         residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         known_fraction = self.objective.comparison.measurement.known_torque_fraction

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._hum import hum_near_modes, resonance_reach_hz
+from analysis.identify._hum import find_hum_near_modes, resonance_half_width_hz
 from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
-from analysis.identify.free_decay import decay_columns
-from analysis.identify.noise import NoiseSpectrum, noise_of
+from analysis.identify.free_decay import count_decay_spectra
+from analysis.identify.noise import NoiseSpectrum, estimate_noise
 from analysis.identify.parametrization import Steps
 from analysis.optimizer import NormalEquations, descend
 from analysis.paper import thinned
@@ -232,7 +232,7 @@ refined."""
 _MAX_STORED_MINIMA: Final = 4
 """Largest number of stored minima that are compared again under another noise spectrum."""
 
-RENEWALS: Final = 4
+MAX_ANGLE_REESTIMATES: Final = 4
 """Largest number of re-estimates of the angle that follows the reference."""
 
 _MAX_HUM_SEARCHES: Final = 3
@@ -252,7 +252,7 @@ class Descent:
         """Return rig and beam at the current point of the descent."""
         return self.objective.unknowns.plant(self.x)
 
-    def to_minimum(
+    def descend_to_minimum(
         self, noise: NoiseSpectrum, tolerance: float, hopeless: tuple[int, float] | None = None
     ) -> Descent:
         """Descend to the local minimum under a noise spectrum.
@@ -282,13 +282,13 @@ class Descent:
         Return `self` if it has converged already.
         """
         descent = self
-        for _ in range(RENEWALS):
+        for _ in range(MAX_ANGLE_REESTIMATES):
             comparison = descent.objective.comparison.renewed(descent.plant, noise)
             if comparison is descent.objective.comparison:
                 break
             descent = Descent(Objective(comparison, descent.objective.unknowns), descent.x)
             noise = descent.noise()
-            descent = descent.to_minimum(noise, tolerance)
+            descent = descent.descend_to_minimum(noise, tolerance)
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
@@ -296,11 +296,11 @@ class Descent:
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         amplitudes = self.objective.project(at, noise.weight).amplitudes
-        decays = decay_columns(at.poles) * (1 + len(comparison.later_decays))
+        decays = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
         decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
-        return hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
+        return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
-    def without_hum(self, tolerance: float) -> Descent:
+    def remove_hum(self, tolerance: float) -> Descent:
         """Remove the hum near modes and descend again. Return `self` if there is no hum."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
@@ -308,10 +308,10 @@ class Descent:
             if not hum:
                 return self
             objective = Objective(
-                descent.objective.comparison.without_hum(hum), descent.objective.unknowns
+                descent.objective.comparison.remove_hum(hum), descent.objective.unknowns
             )
             descent = Descent(objective, descent.x)
-            descent = descent.to_minimum(descent.noise(), tolerance)
+            descent = descent.descend_to_minimum(descent.noise(), tolerance)
         return descent
 
     def noise(self, *, with_lines: bool = False) -> NoiseSpectrum:
@@ -323,9 +323,9 @@ class Descent:
             hz = comparison.frequency_hz
             near_mode = np.zeros(hz.size, dtype=bool)
             for pole in at.poles:
-                width = resonance_reach_hz(pole, float(hz[1] - hz[0]))
+                width = resonance_half_width_hz(pole, float(hz[1] - hz[0]))
                 near_mode |= np.abs(hz - abs(pole.at_rad_s.imag) / (2 * np.pi)) < width
-        return noise_of(
+        return estimate_noise(
             objective.project(at, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
@@ -366,15 +366,15 @@ class StructureSearch:
         """Return the unknowns of the structure."""
         return self.objective.unknowns
 
-    def on(self, comparison: Comparison) -> StructureSearch:
+    def with_comparison(self, comparison: Comparison) -> StructureSearch:
         """Return the same search, with the same starts, on other data of the record."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
-    def lowest(self) -> Descent:
+    def lowest_coarse_minimum(self) -> Descent:
         """Return a descent that starts at the lowest minimum of the coarse response."""
         return Descent(self.objective, self.minima[0].x)
 
-    def under(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
+    def descend_to_lowest(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
         """Descend to the lowest minimum of the whole record under a noise spectrum.
 
         Under another noise spectrum another minimum may be the lowest. So all minima are compared
@@ -407,5 +407,5 @@ class StructureSearch:
             ]
         if len(rivals) == 1:
             return rivals[0]
-        final_descents = [rival.to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
+        final_descents = [rival.descend_to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
         return min(final_descents, key=lambda end: end.cost(noise))

@@ -12,28 +12,41 @@ from typing import TYPE_CHECKING, Final, Generic, TypeVar
 import numpy as np
 
 from analysis.identify._candidates import CandidateSet
-from analysis.identify._channel_checks import wrong_scale
+from analysis.identify._channel_checks import sign_and_unit_findings
 from analysis.identify._comparison import Comparison
-from analysis.identify._diagnostics import findings, of_settings, unexplained
+from analysis.identify._diagnostics import findings, setting_findings, unexplained
 from analysis.identify._drag import (
     damping_with_amplitude,
-    with_air_drag,
+    refit_with_air_drag,
 )
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._finding import doubted
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._knock import MAX_KNOCKS, knocks_in, of_knocks, with_knock
+from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts, impact_findings
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._modal_headline import tolerant_order, with_modal_model
-from analysis.identify._nonlinear import nonlinear_forces
+from analysis.identify._modal_headline import (
+    order_verdict_with_geometry_tolerance,
+    replace_by_modal_model,
+)
+from analysis.identify._nonlinear import add_nonlinear_forces
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
-from analysis.identify._step_in_time import step_score
-from analysis.identify._time_varying import along_time, changing, established
+from analysis.identify._step_in_time import best_stiffness_step
+from analysis.identify._time_varying import (
+    established,
+    find_temporal_changes,
+    temporal_change_findings,
+)
 from analysis.identify._visible_modes import visible_modes
-from analysis.identify.headline import MISREAD, UNEXPLAINED_REASON, Headline, headline, of_fit
-from analysis.identify.profile_likelihood import WIDEST_FRACTION, profile_both_orders
+from analysis.identify.headline import (
+    CONTRADICTED_FILE_REASON,
+    UNEXPLAINED_REASON,
+    Headline,
+    headline,
+    headline_of_fit,
+)
+from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION, profile_both_orders
 from analysis.identify.residual_tests import (
     InputRelation,
     Whiteness,
@@ -45,7 +58,7 @@ from analysis.identify.sentences import experiments, headline_sentences
 from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
 from analysis.identify.verdict import (
     BIC_TIE,
-    NOT_DETERMINED,
+    ORDER_NOT_DETERMINED_REASON,
     CandidateRow,
     Verdict,
     not_reported_reason,
@@ -69,7 +82,7 @@ if TYPE_CHECKING:
     from analysis.identify._plant import Setting
     from analysis.identify._result import ModeEstimate, RecordFit
     from analysis.identify._small_effects import SmallEffect
-    from analysis.identify._step_in_time import Step
+    from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify._time_varying import TemporalChange
     from analysis.identify.profile_likelihood import Order
     from analysis.identify.residual_tests import Harmonic
@@ -91,7 +104,7 @@ _TILTED_AXIS_REASON: Final = (
 _CLIPPED_TORQUE_REASON: Final = "the torque is clipped"
 """Reason against all numbers if the torque is clipped."""
 
-INTEGER: Final = STRUCTURES["III"]
+ORDER_ONE_STRUCTURE: Final = STRUCTURES["III"]
 """Structure with internal and external damping of order 1. It is fitted from every start: it has no
 local minima by undetermined orders, and no damping that is in fact a stiffness or an inertia."""
 
@@ -196,7 +209,7 @@ class _Assessment(Generic[_ResultT]):
     Attributes
     ----------
     result : _ResultT
-        Selection, or the result of `freest_alone`.
+        Selection, or the result of `fit_freest_alone`.
     candidate_set : CandidateSet
         Candidates, the one of the reported numbers first.
     explained : bool
@@ -216,14 +229,16 @@ def _assess_with_impacts(
 ) -> _Assessment[_ResultT]:
     """Assess a record, and assess it again with each impact that explains its residual."""
     assessment = assess(measurement)
-    for _ in range(MAX_KNOCKS):
+    for _ in range(MAX_IMPACTS):
         if assessment.explained or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(assessment.kinds):
             break
         better_assessment = None
         # Harmonics last through the whole sweep, but a strong impact may be mistaken for them.
-        for impact in knocks_in(assessment.candidate_set, obvious="harmonics" in assessment.kinds):
+        for impact in find_impacts(
+            assessment.candidate_set, obvious="harmonics" in assessment.kinds
+        ):
             with_impact = assess(
-                with_knock(assessment.candidate_set.comparison.measurement, impact)
+                add_known_impact(assessment.candidate_set.comparison.measurement, impact)
             )
             if with_impact.explained or impact.evident:
                 better_assessment = with_impact
@@ -244,7 +259,7 @@ def _select_with_known_impacts(
     """Select the structure of a record whose known impacts are part of the measurement."""
     earlier_candidates = earlier.candidates if earlier else ()
     refitted = (
-        CandidateSet.from_earlier(earlier_candidates, measurement, fixed, band_hz)
+        CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed, band_hz)
         if earlier_candidates
         else None
     )
@@ -256,7 +271,7 @@ def _select_with_known_impacts(
     is_linear = modal is not None and _is_linear_and_constant(linear, modal, band_hz)
     if modal is not None:
         small_linear_effect = small_effect(
-            linear.comparison, modal, modal.plant_like(linear.likeliest.plant)
+            linear.comparison, modal, modal.plant_with_modal_frequencies(linear.likeliest.plant)
         )
     modal_with_effect, effect_suffices = modal, is_linear
     if small_linear_effect is not None:
@@ -265,14 +280,14 @@ def _select_with_known_impacts(
             linear, modal_with_effect, band_hz
         )
     if not (is_linear or effect_suffices or measurement.knocks):
-        for impact in knocks_in(linear, obvious=True):
+        for impact in find_impacts(linear, obvious=True):
             with_impact = _select_with_known_impacts(
-                with_knock(measurement, impact), fixed, band_hz, None
+                add_known_impact(measurement, impact), fixed, band_hz, None
             )
             if with_impact.explained:
                 return with_impact
     stiffness_step = None
-    if modal is not None and measurement.one_sweep:
+    if modal is not None and measurement.is_single_sweep:
         if not (is_linear or effect_suffices) or (
             small_linear_effect is not None and small_linear_effect.large
         ):
@@ -293,11 +308,11 @@ def _select_with_known_impacts(
         else:
             small_linear_effect = None
     elif small_linear_effect is not None and small_linear_effect.saved > LARGE_DEVIANCE_REDUCTION:
-        candidate_set = linear.with_effect(small_linear_effect.column[None])
+        candidate_set = linear.refit_with_additional_effect(small_linear_effect.column[None])
         modal = _fit_modal_model(candidate_set)
     else:
         modal = modal_with_effect
-    candidate_set = candidate_set.with_orders_free()
+    candidate_set = candidate_set.fit_with_free_orders()
     visible_numbers = _visible_mode_numbers(candidate_set, modal)
     beam_test = _uniform_beam_test(measurement, modal)
     uniform_beam_refused = beam_test is not None and beam_test.status == "refused"
@@ -309,7 +324,7 @@ def _select_with_known_impacts(
     candidate_set, *profiles = profile_both_orders(
         candidate_set, determined, compute=compute_profiles
     )
-    leading = candidate_set.led_by(candidate_set.freest)
+    leading = candidate_set.with_leading_candidate(candidate_set.freest)
     whiteness_test, input_test, harmonic_tests = _test_residual(leading, modal, band_hz)
     explained = whiteness_test.white and not input_test.related
     all_findings = findings(leading, forces, harmonic_tests)
@@ -317,7 +332,9 @@ def _select_with_known_impacts(
     model_reason = _wrong_model_reason(kinds, explained=explained)
     clipped_reason = _CLIPPED_TORQUE_REASON if "clipping" in kinds else None
     doubt = (
-        model_reason or clipped_reason or _doubt_reason(changes, one_sweep=measurement.one_sweep)
+        model_reason
+        or clipped_reason
+        or _doubt_reason(changes, is_single_sweep=measurement.is_single_sweep)
     )
     alpha, lambda_ = (
         order_verdict(candidate_set, each, visible_numbers, doubt=doubt) for each in profiles
@@ -331,17 +348,21 @@ def _select_with_known_impacts(
     reported = _add_modal_model(reported, measurement, modal, beam_test, doubt, mode_doubt)
     if reported.tolerant is not None:
         alpha, lambda_ = (
-            tolerant_order(each.order, reported.tolerant, each, doubt, refused=uniform_beam_refused)
+            order_verdict_with_geometry_tolerance(
+                each.order, reported.tolerant, each, doubt, refused=uniform_beam_refused
+            )
             for each in profiles
         )
         orders = alpha, lambda_
     if "nonlinear stiffness" in kinds:
         reported = reported.with_stiffness_law_flag()
     sentences, advice = [], []
-    if model_reason == MISREAD:
+    if model_reason == CONTRADICTED_FILE_REASON:
         all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
     else:
-        change_findings = tuple(changing(changes, one_sweep=measurement.one_sweep))
+        change_findings = tuple(
+            temporal_change_findings(changes, is_single_sweep=measurement.is_single_sweep)
+        )
         all_findings += _setting_findings(leading, reported, kinds)
         all_findings += () if small_linear_effect is None else (small_linear_effect.finding(),)
         if (
@@ -460,7 +481,7 @@ def _add_modal_model(
         tolerant = tolerant_estimate(
             modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
         )
-    return with_modal_model(exact_headline, modal, test, tolerant, doubt, mode_doubt)
+    return replace_by_modal_model(exact_headline, modal, test, tolerant, doubt, mode_doubt)
 
 
 def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
@@ -480,7 +501,11 @@ def _explain_deviations(
     if len(modal.visible) <= _MODES_WITHOUT_REDUNDANCY:
         return ()
     causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
-    stiffness_step = step_score(candidate_set.comparison, modal) if measurement.one_sweep else None
+    stiffness_step = (
+        best_stiffness_step(candidate_set.comparison, modal)
+        if measurement.is_single_sweep
+        else None
+    )
     return (explanation_finding(test, causes, stiffness_step),)
 
 
@@ -490,7 +515,7 @@ def _setting_findings(
     """Return findings on settings that differ from the file, if the record can show them."""
     if "implausible" in kinds or len(result.visible_modes) < _MODES_WITHOUT_REDUNDANCY:
         return ()
-    return tuple(of_settings(candidate_set, result))
+    return tuple(setting_findings(candidate_set, result))
 
 
 def _is_linear_and_constant(
@@ -510,26 +535,26 @@ def _fit_further_effects(
     the record.
     """
     if not test_amplitude_effects:
-        candidate_set, changes = along_time(linear.with_orders_free())
+        candidate_set, changes = find_temporal_changes(linear.fit_with_free_orders())
         return candidate_set, (), changes
-    candidate_set = linear if linear.misread else with_air_drag(linear)
+    candidate_set = linear if linear.misread else refit_with_air_drag(linear)
     visible_numbers = visible_modes(linear.comparison, linear.noise, linear.best.fit)
     candidate_set, forces = (
         (candidate_set, ())
         if candidate_set.misread
-        else nonlinear_forces(candidate_set, visible_numbers)
+        else add_nonlinear_forces(candidate_set, visible_numbers)
     )
     if forces and candidate_set.drag is not None:
         # A stiffness that depends on the deflection may have been mistaken for weak drag.
-        without_drag, forces_without_drag = nonlinear_forces(linear, visible_numbers)
+        without_drag, forces_without_drag = add_nonlinear_forces(linear, visible_numbers)
         if forces_without_drag and without_drag.bic < candidate_set.bic:
             candidate_set, forces = without_drag, forces_without_drag
-    candidate_set, changes = along_time(candidate_set.with_orders_free())
-    one_sweep = linear.comparison.measurement.one_sweep
-    if not one_sweep and (forces or candidate_set.drag is not None):
+    candidate_set, changes = find_temporal_changes(candidate_set.fit_with_free_orders())
+    is_single_sweep = linear.comparison.measurement.is_single_sweep
+    if not is_single_sweep and (forces or candidate_set.drag is not None):
         # A change along the record may have been mistaken for a dependence on the amplitude.
-        with_changes, other_changes = along_time(
-            linear.with_orders_free(), rival_bic=candidate_set.bic
+        with_changes, other_changes = find_temporal_changes(
+            linear.fit_with_free_orders(), rival_bic=candidate_set.bic
         )
         if other_changes and with_changes.bic < candidate_set.bic:
             return with_changes, (), other_changes
@@ -538,9 +563,9 @@ def _fit_further_effects(
 
 def _likely_stiffness_step(
     linear: CandidateSet, modal: ModalFit, small_linear_effect: SmallEffect | None
-) -> Step | None:
+) -> StiffnessStep | None:
     """Return the step of the stiffness if it explains more than any effect of the amplitude."""
-    stiffness_step = step_score(linear.comparison, modal)
+    stiffness_step = best_stiffness_step(linear.comparison, modal)
     rival_reduction = 0.0 if small_linear_effect is None else small_linear_effect.saved
     return (
         stiffness_step
@@ -549,7 +574,7 @@ def _likely_stiffness_step(
     )
 
 
-def freest_alone(
+def fit_freest_alone(
     measurement: Measurement, band_hz: tuple[float, float] = BAND_HZ
 ) -> tuple[Headline, tuple[Finding, ...], RecordAnalysis]:
     """Fit only the freest structure on a uniform beam, in a quarter of `select`'s time.
@@ -573,7 +598,7 @@ def freest_alone(
     findings : tuple of Finding
         Findings that need no comparison of candidates.
     analysis : RecordAnalysis
-        Fit of the freest structure, then the fit of `INTEGER`, with the noise spectrum.
+        Fit of the freest structure, then the fit of `ORDER_ONE_STRUCTURE`, with the noise spectrum.
 
     Raises
     ------
@@ -589,13 +614,13 @@ def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
     """Fit only the freest structure to a record whose known impacts are part of the measurement."""
-    misread = tuple(wrong_scale(Comparison.of(measurement, band_hz)))
-    additional = () if misread else (INTEGER,)
+    misread = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
+    additional = () if misread else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
-        CandidateSet.of_freest(measurement, (), band_hz, additional), misread=misread
+        CandidateSet.fit_freest_structure(measurement, (), band_hz, additional), misread=misread
     )
     if not misread:
-        candidate_set = candidate_set.with_special_cases()
+        candidate_set = candidate_set.fit_special_cases()
     modal = _fit_modal_model(candidate_set)
     visible_numbers = _visible_mode_numbers(candidate_set, modal)
     whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
@@ -603,18 +628,18 @@ def _fit_freest_with_known_impacts(
     kinds = {finding.kind for finding in all_findings}
     explained = whiteness_test.white and not input_test.related
     model_reason = _wrong_model_reason(kinds, explained=explained)
-    result = of_fit(
+    result = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
         visible_numbers,
         {} if misread else _unidentifiable_orders(candidate_set, visible_numbers),
         unexplained=model_reason,
-        both=None if misread else candidate_set.with_both_dampings(candidate_set.best),
+        both=None if misread else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     doubt = model_reason or (_CLIPPED_TORQUE_REASON if "clipping" in kinds else None)
     beam_test = _uniform_beam_test(measurement, modal)
     result = _add_modal_model(result, measurement, modal, beam_test, doubt, doubt)
-    if model_reason == MISREAD:
+    if model_reason == CONTRADICTED_FILE_REASON:
         all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
     else:
         all_findings += _setting_findings(candidate_set, result, kinds)
@@ -625,7 +650,9 @@ def _fit_freest_with_known_impacts(
             candidate_set, all_findings, whiteness_test, input_test
         )
     result = result.doubted(_CLIPPED_TORQUE_REASON) if "clipping" in kinds else result
-    other_fits = (each.fit for each in candidate_set.candidates if each.structure is INTEGER)
+    other_fits = (
+        each.fit for each in candidate_set.candidates if each.structure is ORDER_ONE_STRUCTURE
+    )
     analysis = RecordAnalysis.of(
         (result.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
@@ -641,7 +668,9 @@ def _unidentifiable_orders(
     reasons = {}
     for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
         low, high = freest.fit.interval[name] or (-math.inf, math.inf)
-        interval_too_wide = high - low > WIDEST_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+        interval_too_wide = high - low > MAX_IDENTIFIABLE_FRACTION * (
+            ORDER_RANGE[1] - ORDER_RANGE[0]
+        )
         # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
         at_local_minimum = not low <= 1 <= high and any(
             each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
@@ -654,24 +683,24 @@ def _unidentifiable_orders(
             or at_local_minimum
             or freest.fit.interval[COEFFICIENT_OF[name]] is None
         ):
-            reasons[name] = reason or NOT_DETERMINED
+            reasons[name] = reason or ORDER_NOT_DETERMINED_REASON
     return reasons
 
 
 def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
     """Return the reason why findings or residual refute the model, or None if they do not."""
     if not _CONTRADICTING_KINDS.isdisjoint(kinds):
-        return MISREAD
+        return CONTRADICTED_FILE_REASON
     return UNEXPLAINED_REASON if "harmonics" in kinds or not explained else None
 
 
-def _doubt_reason(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> str | None:
+def _doubt_reason(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> str | None:
     """Return why changes along the record make every parameter doubtful, or None if they do not.
 
     With a change along the record, the mode parameters are those at the time when the sweep passed
     each mode.
     """
-    if established(changes, one_sweep=one_sweep):
+    if established(changes, is_single_sweep=is_single_sweep):
         return None
     return next((f"{change.name} would explain the record as well" for change in changes), None)
 
@@ -712,11 +741,11 @@ def _add_impacts_and_unexplained(
     findings_of_model: tuple[Finding, ...],
     whiteness_test: Whiteness,
     input_test: InputRelation,
-    stiffness_step: Step | None = None,
+    stiffness_step: StiffnessStep | None = None,
 ) -> tuple[Finding, ...]:
     """Add impacts before the other findings, and the unexplained residual after them."""
     explained = whiteness_test.white and not input_test.related
-    findings_of_impacts = of_knocks(
+    findings_of_impacts = impact_findings(
         candidate_set.comparison.measurement.knocks, explained=explained
     )
     unexplained_findings = (

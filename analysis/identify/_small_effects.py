@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._drag import small_drag
+from analysis.identify._drag import small_drag_spectrum
 from analysis.identify._finding import Finding
-from analysis.identify._nonlinear import ModalForces, Term
+from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
 from analysis.identify._time_varying import UNIT_PLAY_RAD, play_spectrum
 
 if TYPE_CHECKING:
@@ -95,7 +95,7 @@ def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> Small
     The effects are computed for the motion of `plant`, a beam close to the modal model.
     """
     effects = list(_possible_effects(comparison, modal, plant))
-    reductions = modal.saved_by(np.array([column for _, _, column in effects]))
+    reductions = modal.cost_reduction_by_spectrum(np.array([column for _, _, column in effects]))
     best_index = int(np.argmax(reductions))
     if reductions[best_index] < MIN_DEVIANCE_REDUCTION:
         return None
@@ -107,19 +107,19 @@ def _possible_effects(
     comparison: Comparison, modal: ModalFit, plant: Plant
 ) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
     """Yield kind, description and torque spectrum, shape (K,), of each possible small effect."""
-    forces = ModalForces(comparison, plant)
+    forces = NonlinearForceSpectra(comparison, plant)
     for mode in modal.visible:
         yield (
             "nonlinear stiffness",
             f"A stiffness of mode {mode} that depends on the deflection",
-            forces.column(Term("cubic stiffness", mode)),
+            forces.column(NonlinearTerm("cubic stiffness", mode)),
         )
         yield (
             "nonlinear stiffness",
             f"A stiffness of mode {mode} that differs from side to side",
-            forces.column(Term("quadratic stiffness", mode)),
+            forces.column(NonlinearTerm("quadratic stiffness", mode)),
         )
-    (drag,) = small_drag(comparison, plant)
+    (drag,) = small_drag_spectrum(comparison, plant)
     yield "air drag", "Air drag", drag
     yield (
         "play",

@@ -42,7 +42,7 @@ on s = sigma + j omega the part that wraps round has decayed."""
 
 
 @dataclass(frozen=True, slots=True)
-class Step:
+class StiffnessStep:
     """Step of the stiffness in time that best explains a residual.
 
     Attributes
@@ -83,12 +83,12 @@ class Step:
         }
 
 
-def step_score(comparison: Comparison, fit: ModalFit) -> Step:
+def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
     """Return the stiffness step that best explains the residual of the modal model."""
     residual = fit.residual.view(np.float64)
     step_torque = _StiffnessStepTorque(comparison, fit)
     best_step, instants = (
-        Step(0.0, 0.0, 0.0),
+        StiffnessStep(0.0, 0.0, 0.0),
         np.linspace(0, comparison.samples, _COARSE_INSTANTS + 2)[1:-1],
     )
     spacing = float(instants[1] - instants[0])
@@ -102,7 +102,7 @@ def step_score(comparison: Comparison, fit: ModalFit) -> Step:
         scores = correlation**2 / squares
         best_index = int(np.argmax(scores))
         if scores[best_index] > best_step.score:
-            best_step = Step(
+            best_step = StiffnessStep(
                 score=float(scores[best_index]),
                 instant_s=comparison.first_s
                 + float(instants[best_index]) / comparison.decimation.rate_hz,

@@ -30,8 +30,8 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
-from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel
-from analysis.identify._refit import MANY, Refit
+from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel_response
+from analysis.identify._refit import DESCENT_EVALUATIONS, Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
@@ -118,7 +118,7 @@ class TemporalChange:
         return self.bic_difference < -BIC_DECISIVE
 
 
-def along_time(
+def find_temporal_changes(
     candidate_set: CandidateSet, rival_bic: float = math.inf
 ) -> tuple[CandidateSet, tuple[TemporalChange, ...]]:
     """Search for changes along the record. Refit all candidates with a change that is certain.
@@ -165,7 +165,7 @@ def along_time(
     )
     if not best_change.certain or len(changes) > 1:
         return candidate_set, changes
-    return candidate_set.with_columns(refit.columns, refit.noise_here()), changes
+    return candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise()), changes
 
 
 def _has_possible_size(change: TemporalChange) -> bool:
@@ -196,7 +196,7 @@ def _promising_changes(
     """
     refit = candidate_set.refit(candidate, 1)
     columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
-    reductions = refit.saved_by(np.array(list(columns.values())))
+    reductions = refit.cost_reduction_by_spectrum(np.array(list(columns.values())))
     for effect, reduction in zip(columns, reductions.tolist(), strict=True):
         remaining_cost = max(refit.cost - reduction, 1e-3 * refit.cost)
         deviance_reduction = candidate.values * math.log(refit.cost / remaining_cost)
@@ -225,7 +225,7 @@ def _fit_with_change(
             refit.x,
             candidate_set.noise,
             columns,
-            max_evaluations=MANY,
+            max_evaluations=DESCENT_EVALUATIONS,
         )
         previous_size, size = size, float(refit.amplitudes()[0][-1])
         converged = abs(size - previous_size) < _SIZE_TOLERANCE * abs(size)
@@ -271,7 +271,7 @@ def _torque_spectrum(
     `slopes` is the result of `_torque_slopes`, if it is known already.
     """
     if effect == "play":
-        return comparison.spectrum(comparison.prediction.of_other(play_angle).torque(plant)[0])
+        return comparison.spectrum(comparison.prediction.with_angle(play_angle).torque(plant)[0])
     if effect == "clock":
         return comparison.spectrum(_clock_torque(comparison, plant, size))
     ramp = np.linspace(-0.5, 0.5, comparison.samples)
@@ -362,7 +362,7 @@ def memory_torque(
     external = damping.gamma * s**damping.lambda_
     inertial = beam.density_over_stiffness * s * s + external
     changing_factor = internal + 1 if effect == "stiffness" else internal
-    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel(plant, s)
+    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel_response(plant, s)
     total_torque = np.zeros(n)
 
     def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -425,7 +425,7 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 """Kind of the finding on each effect."""
 
 
-def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool:
+def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
     """Return whether one change, and no other model, explains the record.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
@@ -440,10 +440,12 @@ def established(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> bool
     """
     if len(changes) != 1 or not changes[0].certain:
         return False
-    return changes[0].what == "play" or not one_sweep
+    return changes[0].what == "play" or not is_single_sweep
 
 
-def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterator[Finding]:
+def temporal_change_findings(
+    changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+) -> Iterator[Finding]:
     """Yield a finding on each change along the record.
 
     Parameters
@@ -455,7 +457,7 @@ def changing(changes: tuple[TemporalChange, ...], *, one_sweep: bool) -> Iterato
     """
     for change in changes:
         finding = _established_finding(change)
-        if established(changes, one_sweep=one_sweep):
+        if established(changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
             others = "the others named" if len(changes) > 1 else "any other model"

@@ -13,9 +13,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import LOGARITHMIC
+from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
-from analysis.identify.free_decay import decay_columns
+from analysis.identify.free_decay import count_decay_spectra
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -115,7 +115,7 @@ def parameter_uncertainty(
     derivatives = unknowns.estimates_by_unknowns(x)
     parameter_covariance = derivatives @ unknown_covariance @ derivatives.T
     names, values = unknowns.names, unknowns.parameters(x)
-    logarithmic = np.array([name in LOGARITHMIC for name in names])
+    logarithmic = np.array([name in LOGARITHMIC_PARAMETERS for name in names])
     is_determined = is_determined & ~(
         logarithmic & (np.diag(parameter_covariance) > _UNDETERMINED_LN_STD**2)
     )
@@ -126,7 +126,7 @@ def parameter_uncertainty(
     std: dict[str, float | None] = dict.fromkeys(values, 0.0) | dict.fromkeys(names, None)
     intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(names, None)
     for name, spread in zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True):
-        std[name] = values[name] * spread if name in LOGARITHMIC else spread
+        std[name] = values[name] * spread if name in LOGARITHMIC_PARAMETERS else spread
         intervals[name] = interval(name, values[name], spread)
     first_omega_rad_s, _second = unknowns.omega_rad_s
     return ParameterUncertainty(
@@ -146,10 +146,10 @@ def parameter_uncertainty(
 def interval(name: str, value: float, std: float) -> tuple[float, float]:
     """Return the 95 % interval of a parameter.
 
-    `std` is the standard deviation of the logarithm for parameters in `LOGARITHMIC`.
+    `std` is the standard deviation of the logarithm for parameters in `LOGARITHMIC_PARAMETERS`.
     """
     half_width = NORMAL_95 * std
-    if name in LOGARITHMIC:
+    if name in LOGARITHMIC_PARAMETERS:
         return value * math.exp(-half_width), value * math.exp(half_width)
     return value - half_width, value + half_width
 
@@ -293,7 +293,7 @@ def ringing(
     and of the other projected terms. `hum`, shape (h, K), are the whitened spectra of the lines.
     `scatter` is the variance of real and imaginary parts of the residual.
     """
-    count = decay_columns(poles)
+    count = count_decay_spectra(poles)
     columns, decays = columns[:count], projected.amplitudes[:count]
     explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
     if len(hum) and decays.size:

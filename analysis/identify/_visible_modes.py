@@ -78,7 +78,7 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     return tuple(visible)
 
 
-def driven(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
+def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
     """Return whether the excitation near a frequency is almost as large as near another one."""
     measurement = comparison.measurement
     reference = measurement.reference_rad

@@ -49,8 +49,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import fast_length
-from analysis.identify._plant import OF_BEAM
-from analysis.identify._predictor import eigenvalues, torque_channel
+from analysis.identify._plant import BEAM_PARAMETERS
+from analysis.identify._predictor import eigenvalues, torque_channel_response
 from analysis.identify.free_decay import mode_poles
 from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
@@ -87,7 +87,7 @@ _PAST_FORCES: Final = 3
 """Number of earlier forces, besides the present one, that the interpolation polynomial passes
 through."""
 
-HALF_DENSITY: Final = 0.5 * AIR_DENSITY_KG_PER_M3
+HALF_AIR_DENSITY_KG_PER_M3: Final = 0.5 * AIR_DENSITY_KG_PER_M3
 """Half the density of air, in kg/m³."""
 
 _LOWEST_MODE_INDICES: Final = [0, 1]
@@ -212,7 +212,7 @@ class DragResponse:
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
-        self._torque_channel = torque_channel(plant, s)
+        self._torque_channel = torque_channel_response(plant, s)
         angle_transform = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
             self._inertial_response * s * angle_transform
@@ -321,8 +321,8 @@ class DragResponse:
         output = np.zeros(len(step))
         drag_speed, free_state = output[:DRAG_POINTS], output[DRAG_POINTS:]
         constant_factor, slowing_factor = (
-            -HALF_DENSITY * law.constant_m,
-            -HALF_DENSITY * law.slowing,
+            -HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m,
+            -HALF_AIR_DENSITY_KG_PER_M3 * law.slowing,
         )
         step_dot, force_dot = step.dot, state_by_force.dot
         add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
@@ -366,14 +366,18 @@ class DragResponse:
             chunk = slice(first_step, first_step + _STEPS_PER_CHUNK)
             now, magnitude = force_changes[chunk], np.abs(speed[chunk])
             cube_root = np.cbrt(magnitude)
-            slope = -2 * HALF_DENSITY * law.constant_m * magnitude
+            slope = -2 * HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m * magnitude
             if law.slowing:
-                slope -= (1 + _SLOWING_EXPONENT) * HALF_DENSITY * law.slowing * cube_root
+                slope -= (
+                    (1 + _SLOWING_EXPONENT) * HALF_AIR_DENSITY_KG_PER_M3 * law.slowing * cube_root
+                )
             by_speed = (slope @ coupling).reshape(-1, len(force_weights), DRAG_MODES)
             for run, (mode, added_speed) in enumerate(sources):
                 np.multiply(by_speed[:, :, mode], added_speed[chunk, None], out=now[:, :, run])
             for run, power in (-2, magnitude), (-1, cube_root):
-                now[:, :, run] = (-HALF_DENSITY * power * speed[chunk]) @ force_weights.T
+                now[:, :, run] = (
+                    -HALF_AIR_DENSITY_KG_PER_M3 * power * speed[chunk]
+                ) @ force_weights.T
             for at, matrix in zip(now, by_speed, strict=True):
                 dot(step, state, out)
                 dot(matrix, modal_speed, force)
@@ -497,7 +501,7 @@ def _drag_force(speed: Real, law: DragLaw) -> Real:
     per_speed = law.constant_m * magnitude
     if law.slowing:
         per_speed += law.slowing * np.cbrt(magnitude)
-    force: Real = -HALF_DENSITY * per_speed * speed
+    force: Real = -HALF_AIR_DENSITY_KG_PER_M3 * per_speed * speed
     return force
 
 
@@ -627,7 +631,7 @@ class DragExpansion:
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         steps.append(np.log(other_density / own_density))
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
-        slopes.append(_parameter_rows(parameter_slopes, names, OF_BEAM).sum(axis=0))
+        slopes.append(_parameter_rows(parameter_slopes, names, BEAM_PARAMETERS).sum(axis=0))
         for by_external, values in zip(
             self.by_external, self._external_damping_change(plant), strict=True
         ):

@@ -55,7 +55,7 @@ class Pole:
         return self.at_rad_s.imag != 0
 
 
-def decay_columns(poles: Sequence[Pole]) -> int:
+def count_decay_spectra(poles: Sequence[Pole]) -> int:
     """Return the number of decay spectra of some poles: two for each that oscillates."""
     return sum(1 + pole.oscillates for pole in poles)
 
@@ -198,7 +198,7 @@ class DecaySpectra:
         self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
         """Return one spectrum for each real pole, two for each oscillating one, shape (m, K)."""
-        rows = np.empty((decay_columns(poles), self._sample_rotation.size), complex)
+        rows = np.empty((count_decay_spectra(poles), self._sample_rotation.size), complex)
         index = 0
         for pole in poles:
             pole_spectrum = spectrum_of_pole(pole.at_rad_s)

@@ -14,8 +14,13 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-from analysis.identify._plant import OF_BEAM
-from analysis.identify.verdict import ANOTHER_DAMPING, BIC_DECISIVE, EXCLUDED, WITH_DRAG_REASON
+from analysis.identify._plant import BEAM_PARAMETERS
+from analysis.identify.verdict import (
+    BIC_DECISIVE,
+    EXCLUSION_DEVIANCES,
+    SECOND_DAMPING_REASON,
+    WITH_DRAG_REASON,
+)
 from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
 
@@ -30,13 +35,13 @@ if TYPE_CHECKING:
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify.verdict import OrderVerdict
 
-EXACT_CONDITION: Final = "if the beam is uniform to 1e-5"
+EXACTLY_UNIFORM_CONDITION: Final = "if the beam is uniform to 1e-5"
 """Condition of the estimates on an exactly uniform beam."""
 
 UNEXPLAINED_REASON: Final = "part of the record is unexplained"
 """Reason against all numbers if the residual is more than noise."""
 
-MISREAD: Final = "the record contradicts its file"
+CONTRADICTED_FILE_REASON: Final = "the record contradicts its file"
 """Reason against all numbers if a sign or unit of the file is wrong."""
 
 _EMPTY_MAPPING: Final[Mapping[str, Any]] = MappingProxyType({})
@@ -69,7 +74,7 @@ StructureStatus = Literal["selected", "compatible", "excluded"]
 Damping = Literal["internal", "external"]
 """Kind of damping: of the material, or of the surroundings."""
 
-NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
+DAMPING_PARAMETER_NAMES: Final[Mapping[Damping, tuple[str, str]]] = {
     "internal": ("zeta", "alpha"),
     "external": ("gamma", "lambda"),
 }
@@ -142,7 +147,7 @@ class ReportedLossFactor:
     @property
     def order(self) -> str:
         """Return the name of the order of this damping: "alpha" or "lambda"."""
-        return NAMES[self.damping][1]
+        return DAMPING_PARAMETER_NAMES[self.damping][1]
 
     def flagged(self, flag: str | None) -> ReportedLossFactor:
         """Return the loss factor with a flag, unless it already has one.
@@ -349,9 +354,9 @@ def headline(
         for each in orders
         if each.profile.is_computed and each.order in freest.structure.free
     }
-    result = of_fit(
+    result = headline_of_fit(
         freest.name, freest.fit, visible_numbers, reasons, intervals, unexplained,
-        candidate_set.with_both_dampings(freest),
+        candidate_set.fit_with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag = candidate_set.drag
@@ -376,7 +381,7 @@ def headline(
     )
 
 
-def of_fit(
+def headline_of_fit(
     name: str,
     fit: RecordFit,
     visible_numbers: Collection[int],
@@ -402,17 +407,17 @@ def of_fit(
     unexplained : str, optional
         Reason against all numbers.
     both : tuple of (RecordFit, bool), optional
-        Result of `CandidateSet.with_both_dampings`: the fit with both dampings, for the modes.
+        Result of `CandidateSet.fit_with_both_dampings`: the fit with both dampings, for the modes.
     """
     with_both, uses_both = both or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
-    if ANOTHER_DAMPING in reasons.values():
-        damping_reason = ANOTHER_DAMPING
+    if SECOND_DAMPING_REASON in reasons.values():
+        damping_reason = SECOND_DAMPING_REASON
     flags: dict[str, str] = {
         name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
     }
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        flags |= dict.fromkeys(OF_BEAM, _NOT_SEPARABLE_FLAG)
+        flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
     return Headline(
         name=name,
         fit=fit,
@@ -425,11 +430,15 @@ def of_fit(
         },
         sizes=tuple(
             # A loss factor is valid without its order. A coefficient is valid with its order only.
-            size_of(
+            reported_loss_factor(
                 each,
                 size,
                 unexplained
-                or (reasons.get(NAMES[each][1]) if size.omega_rad_s is None else None)
+                or (
+                    reasons.get(DAMPING_PARAMETER_NAMES[each][1])
+                    if size.omega_rad_s is None
+                    else None
+                )
                 or damping_reason,
             )
             for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
@@ -481,7 +490,7 @@ def _structure_status(
         return "selected"
     is_special_case = set(candidate.structure.free) < set(freest.structure.free)
     if not is_special_case:
-        is_less_likely = candidate.deviance - freest.deviance > EXCLUDED[0]
+        is_less_likely = candidate.deviance - freest.deviance > EXCLUSION_DEVIANCES[0]
         has_worse_bic = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
         return "excluded" if is_less_likely and has_worse_bic else "compatible"
     if any(
@@ -490,7 +499,7 @@ def _structure_status(
     ):
         return "excluded"
     missing_parameters = freest.parameters - candidate.parameters
-    limit = EXCLUDED[min(missing_parameters, len(EXCLUDED)) - 1]
+    limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
     return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
 
 
@@ -538,7 +547,9 @@ def _reported_parameter(
     return ReportedValue(fit.parameters[name], fit.std[name] if is_free else 0.0, interval_95, flag)
 
 
-def size_of(damping: Damping, size: DampingSize, reason: str | None) -> ReportedLossFactor:
+def reported_loss_factor(
+    damping: Damping, size: DampingSize, reason: str | None
+) -> ReportedLossFactor:
     """Return the reported loss factor of a damping, with its 95 % interval.
 
     Parameters
@@ -582,13 +593,13 @@ def _reported_mode(
         reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
         mode.number,
-        symmetric(mode.frequency_hz, mode.frequency_std_hz, reason),
-        symmetric(mode.damping_ratio, mode.damping_ratio_std, reason),
+        symmetric_value(mode.frequency_hz, mode.frequency_std_hz, reason),
+        symmetric_value(mode.damping_ratio, mode.damping_ratio_std, reason),
         is_visible,
     )
 
 
-def symmetric(
+def symmetric_value(
     value: float, std: float, reason: str | None, half_width: float = NORMAL_95
 ) -> ReportedValue:
     """Return a reported value with a symmetric 95 % interval.

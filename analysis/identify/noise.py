@@ -88,7 +88,7 @@ class NoiseSpectrum:
         return weight
 
 
-def noise_of(
+def estimate_noise(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
     samples: int,
@@ -163,7 +163,7 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
     return smooth
 
 
-def with_peaks(
+def noise_power_with_peaks(
     residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
     """Return the noise power with peaks that are narrower than the smoothing blocks, (K,).

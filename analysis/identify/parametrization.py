@@ -259,7 +259,8 @@ class Unknowns:
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the derivatives of the free parameters by the unknowns, shape (k, k).
 
-        The indices are [parameter, unknown]. Parameters in `LOGARITHMIC` count as logarithms.
+        The indices are [parameter, unknown]. Parameters in `LOGARITHMIC_PARAMETERS` count as
+        logarithms.
         """
         derivative: NDArray[np.float64] = self._values_and_derivatives(x)[1]
         return derivative
@@ -343,7 +344,7 @@ def _ln_damping_size(ln_loss: float, order: float) -> tuple[float, float]:
 _MAX_ORDER_STEP_FRACTION: Final = 0.5
 """Longest step of an order, as a fraction of its distance to 0 or 2."""
 
-NEXT_TO_NOTHING: Final = 1e-4
+VANISHING_LOSS: Final = 1e-4
 """Loss, relative to stiffness or inertia, below which one step may remove the damping."""
 
 _MAX_GROWTH_EXPONENT: Final = 50.0
@@ -465,7 +466,7 @@ def _loss_and_phase_after_step(
     ln_tan_step = (
         step + size / math.sin(phase_before) * (phase_after - phase_before)
     ) / math.hypot(real_part, loss)
-    if ln_tan_step <= -1 and loss < NEXT_TO_NOTHING:
+    if ln_tan_step <= -1 and loss < VANISHING_LOSS:
         return (
             0.0,
             phase_after,

@@ -15,8 +15,8 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND
-from analysis.identify._refit import MISSED, Refit
+from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
+from analysis.identify._refit import MISSED_COST_FRACTION, Refit
 from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
 
 if TYPE_CHECKING:
@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Order = Literal["alpha", "lambda"]
 """Name of a damping order: alpha of internal, lambda of external damping."""
 
-WIDEST_FRACTION: Final = 0.25
+MAX_IDENTIFIABLE_FRACTION: Final = 0.25
 """Largest 95 % interval of an identifiable order, as a fraction of the range 0 to 2: an order with
 ±0.25 does not distinguish materials."""
 
@@ -105,7 +105,7 @@ class LikelihoodProfile:
     @property
     def identifiable(self) -> bool:
         """Return whether the record determines this order to a useful precision."""
-        is_narrow = self.relative_width <= WIDEST_FRACTION and not (
+        is_narrow = self.relative_width <= MAX_IDENTIFIABLE_FRACTION and not (
             self.open_below or self.open_above
         )
         return is_narrow and len(self.local_minima) < 2
@@ -241,7 +241,7 @@ def profile_both_orders(
         for profile_fit in profiles.values():
             if _may_improve(candidate_set, profile_fit):
                 for plant in profile_fit.plants:
-                    candidate_set = candidate_set.restarted_from(plant)
+                    candidate_set = candidate_set.restart_from_plant(plant)
         if [candidate.fit.cost for candidate in candidate_set.candidates] == costs_before:
             break
     alpha_profile, lambda_profile = (
@@ -263,7 +263,7 @@ def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) ->
         for candidate in candidate_set.candidates
         if free_parameters <= set(candidate.structure.free)
     ]
-    return bool(costs) and profile_fit.cost < min(costs) * (1 - MISSED)
+    return bool(costs) and profile_fit.cost < min(costs) * (1 - MISSED_COST_FRACTION)
 
 
 # Profile of one order
@@ -409,7 +409,9 @@ class OrderProfiler:
             start = self._minimum.x.copy()
             start[self._order_index] = value
             trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
-        highest_cost = min(self.costs.values()) * math.exp(FAR_BEHIND / self._value_count)
+        highest_cost = min(self.costs.values()) * math.exp(
+            FAR_BEHIND_BIC_DIFFERENCE / self._value_count
+        )
         for value in coarse_minima_values({value: trial.cost for value, trial in trials.items()}):
             minimum = self._descend(
                 trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, highest_cost)
@@ -487,7 +489,8 @@ class OrderProfiler:
         """Fit all other parameters at a fixed order. Return the square root of the deviance."""
         hold, highest_cost = (
             (self.order,),
-            self.costs[self._minimum_order] * math.exp(FAR_BEHIND / self._value_count),
+            self.costs[self._minimum_order]
+            * math.exp(FAR_BEHIND_BIC_DIFFERENCE / self._value_count),
         )
         refit = self._descend(
             self._tangent(value, nearest_refit),

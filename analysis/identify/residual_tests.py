@@ -33,7 +33,7 @@ SIGNIFICANT_STD: Final = 5.0
 tests together."""
 
 
-def largest_of(count: int) -> float:
+def largest_deviate_limit(count: int) -> float:
     """Return the significance limit of x²/2 for the largest x of `count` normal deviates."""
     return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
 
@@ -103,7 +103,7 @@ class Whiteness:
         return self.probability > _NOT_WHITE_PROBABILITY and not self.loud
 
     @property
-    def all_but_white(self) -> bool:
+    def is_nearly_white(self) -> bool:
         """Return whether noise alone gives such a residual in at least one record of 100."""
         return self.probability > _DOUBTFUL_PROBABILITY and not self.loud
 
@@ -240,7 +240,7 @@ def input_relation(
     # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
     ln_chance = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
     least_likely = int(np.argmax(ln_chance))
-    local = bool(ln_chance[least_likely] > largest_of(used_blocks.size))
+    local = bool(ln_chance[least_likely] > largest_deviate_limit(used_blocks.size))
     deviate = chi_square_deviate(2 * float(ln_chance.sum()), 2 * used_blocks.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
@@ -260,7 +260,9 @@ def input_relation(
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
         related=bool(
-            local or deviate > SIGNIFICANT_STD or correlation[at] ** 2 / 2 > largest_of(lag_count)
+            local
+            or deviate > SIGNIFICANT_STD
+            or correlation[at] ** 2 / 2 > largest_deviate_limit(lag_count)
         ),
     )
 
@@ -362,7 +364,7 @@ def harmonics(
                 drive_hz=float(drive_hz[usable_blocks][largest]),
                 present=bool(
                     deviate > SIGNIFICANT_STD
-                    or chi_square[largest] / 2 > largest_of(chi_square.size)
+                    or chi_square[largest] / 2 > largest_deviate_limit(chi_square.size)
                 ),
             )
         )

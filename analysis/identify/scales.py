@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import LOGARITHMIC
+from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.statistics import NORMAL_95
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ _DENSITY_EXPONENTS: Final = {"torque_scale": 1, "length": -3}
 to."""
 
 
-def scales_absorbed(fit: RecordFit) -> bool:
+def parameters_compensate_scales(fit: RecordFit) -> bool:
     """Return whether free parameters of a fit compensate a wrong scale exactly.
 
     Parameters
@@ -66,7 +66,7 @@ def scales_absorbed(fit: RecordFit) -> bool:
     return all(name in fit.interval for name in _COMPENSATING_PARAMETERS) and not held_tool
 
 
-def with_scales(
+def with_scale_uncertainty(
     parameters: Mapping[str, ReportedValue], uncertainty: Mapping[str, float]
 ) -> dict[str, ReportedValue]:
     """Combine the statistical uncertainties of parameters with those of the scales.
@@ -85,7 +85,7 @@ def with_scales(
         combined standard uncertainty and 95 % interval.
     """
     return {
-        name: _with_scale_uncertainty(each, relative, logarithmic=name in LOGARITHMIC)
+        name: _with_scale_uncertainty(each, relative, logarithmic=name in LOGARITHMIC_PARAMETERS)
         for name, each in parameters.items()
         if each.interval_95 is not None
         and (relative := _relative_scale_uncertainty(SCALE_EXPONENTS.get(name, {}), uncertainty))

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._visible_modes import driven
-from analysis.identify.headline import EXACT_CONDITION, ONE_MODE_REASON
-from analysis.identify.verdict import ANOTHER_DAMPING, deviance_of_one
+from analysis.identify._visible_modes import is_excited
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION, ONE_MODE_REASON
+from analysis.identify.verdict import SECOND_DAMPING_REASON, deviance_of_order_one
 from analysis.statistics import NORMAL_95
 from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
@@ -42,7 +42,7 @@ _MIN_MODES_TO_SEPARATE_DAMPINGS: Final = 2
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Damping to which each order belongs, in words."""
 
-LOSSES: Final[Mapping[Order, str]] = {
+LOSS_NAMES: Final[Mapping[Order, str]] = {
     "alpha": "internal loss",
     "lambda": "external damping torque",
 }
@@ -111,7 +111,7 @@ def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerd
         return [f"Excluded by the losses: {_list_structures(excluded)}."] if excluded else []
     structure = headline.fit.structure
     dampings = _DAMPING_PHRASES[structure.name]
-    if any(each.reason == ANOTHER_DAMPING for each in orders):
+    if any(each.reason == SECOND_DAMPING_REASON for each in orders):
         dampings = dampings.replace("only", "alone would do")
     sentences = [f"{dampings}. Numbers are those of type {headline.name}, all orders free."]
     excluded = headline.structures_with_status("excluded")
@@ -138,12 +138,12 @@ def order_slope_sentence(headline: Headline, verdict: OrderVerdict) -> str:
     if verdict.value is None or verdict.interval is None:
         return f"The order {name} of the {damping_name} is not identifiable: {verdict.reason}."
     shown_hz = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
-    return slope_of_loss(
+    return loss_slope_sentence(
         name, verdict.value, verdict.interval, shown_hz, estimate, verdict.status, verdict.reason
     )
 
 
-def slope_of_loss(
+def loss_slope_sentence(
     order: Order,
     value: float,
     interval: tuple[float, float],
@@ -177,7 +177,7 @@ def slope_of_loss(
     if estimate.basis == "geometry":
         condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
     sentence = (
-        f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSSES[order]} grows as "
+        f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSS_NAMES[order]} grows as "
         f"f^{value_text} ({order}; 95 %: {low_text} to {high_text}), {condition}"
     )
     if reason is not None:
@@ -201,7 +201,7 @@ def _exact_order_sentences(headline: Headline) -> list[str]:
     ]
     if not numbers:
         return []
-    return [f"{EXACT_CONDITION.capitalize()}: {', '.join(numbers)}."]
+    return [f"{EXACTLY_UNIFORM_CONDITION.capitalize()}: {', '.join(numbers)}."]
 
 
 def order_sentence(verdict: OrderVerdict) -> str:
@@ -233,7 +233,7 @@ def order_sentence(verdict: OrderVerdict) -> str:
         return f"The order {name} of the {damping_name} is {value}; 1 is excluded."
     return (
         f"The order {name} of the {damping_name} is {value}: 1 is doubtful, but not excluded (p = "
-        f"{math.erfc(math.sqrt(deviance_of_one(profile) / 2)):.1g})."
+        f"{math.erfc(math.sqrt(deviance_of_order_one(profile) / 2)):.1g})."
     )
 
 
@@ -367,7 +367,9 @@ def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[in
             "up to at "
             f"least {1.3 * at_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
-    if not driven(candidate_set.comparison, at_hz[missing_mode], relative_to_hz=at_hz[other_mode]):
+    if not is_excited(
+        candidate_set.comparison, at_hz[missing_mode], relative_to_hz=at_hz[other_mode]
+    ):
         return f"excite the {_MODE_ORDINALS[missing_mode]} mode as well: sweep " + (
             f"up to at least {1.3 * at_hz[2]:.0f} Hz."
             if missing_mode == 2

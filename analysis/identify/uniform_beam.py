@@ -16,10 +16,10 @@ from typing import TYPE_CHECKING, Any, Final, Literal
 
 import numpy as np
 
-from analysis.identify._altered_beam import Alteration, mode_terms
-from analysis.identify._modal_model import CONSTANTS
-from analysis.identify._plant import LOGARITHMIC
-from analysis.identify._predictor import torque_channel
+from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
+from analysis.identify._modal_model import MODE_CONSTANT_NAMES
+from analysis.identify._plant import LOGARITHMIC_PARAMETERS
+from analysis.identify._predictor import torque_channel_response
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
 from rigd.beam import Beam, Damping, clamped_free_eigenvalues
@@ -90,7 +90,7 @@ TestStatus = Literal["passed", "refused", "not tested"]
 EstimateBasis = Literal["geometry", "losses", "none"]
 """Data that an estimate with tolerance uses."""
 
-REFUSED_BELOW: Final = 0.01
+MIN_P_VALUE_OF_UNIFORM_BEAM: Final = 0.01
 """p-value below which the test refuses a uniform beam."""
 
 _PLAUSIBLE_P_VALUE: Final = 0.3
@@ -131,7 +131,7 @@ _MAX_EXPONENT: Final = 300.0
 """Largest exponent of an interval end, which keeps `exp` finite."""
 
 
-class ConstantsProblem:
+class UniformBeamProblem:
     """Least-squares fit of a uniform beam's parameters to the measured modal constants.
 
     Unknowns are the contribution of internal damping to the stiffness at the highest visible mode
@@ -168,17 +168,17 @@ class ConstantsProblem:
         self.nominal = nominal
         self.uniformity = uniformity
         self.measured = fit.constants[rows]
-        tolerance_std = np.zeros((mode_count, len(CONSTANTS)))
-        tolerance_std[:, CONSTANTS.index("ln_frequency")] = uniformity
-        tolerance_std[:, CONSTANTS.index("ln_residue")] = 3 * uniformity
+        tolerance_std = np.zeros((mode_count, len(MODE_CONSTANT_NAMES)))
+        tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
+        tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = 3 * uniformity
         self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(tolerance_std.ravel() ** 2)
-        self.compared = mode_count * len(CONSTANTS)
+        self.compared = mode_count * len(MODE_CONSTANT_NAMES)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
         length = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self.stated = Alteration.stated(nominal, tilt_deg)
-        self.terms = mode_terms(self.stated, nominal.beam, self.modes)
-        constants = self.measured.reshape(-1, len(CONSTANTS))
+        self.terms = galerkin_mode_terms(self.stated, nominal.beam, self.modes)
+        constants = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
         self._omega_rad_s = 2 * np.pi * np.exp(constants[:, 0])
         self._damping_ratios = np.exp(constants[:, 1])
         self._poles = self._omega_rad_s * (1j - self._damping_ratios)
@@ -212,7 +212,8 @@ class ConstantsProblem:
                 _DELAY_UNKNOWN_LIMIT,
             ]
         )
-        # Linear map from the unknowns to `PARAMETERS`, with those in `LOGARITHMIC` as logarithms.
+        # Linear map from the unknowns to `PARAMETERS`, with those in `LOGARITHMIC_PARAMETERS` as
+        # logarithms.
         ln_first_omega, ln_last_omega = (
             math.log(self._omega_rad_s[0]),
             math.log(self._omega_rad_s[-1]),
@@ -228,7 +229,7 @@ class ConstantsProblem:
     def parameters(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Convert unknowns, shape (..., 7), to the values of `PARAMETERS`.
 
-        Those in `LOGARITHMIC` are returned as natural logarithms.
+        Those in `LOGARITHMIC_PARAMETERS` are returned as natural logarithms.
         """
         return x @ self.transform.T + self._offset
 
@@ -291,7 +292,9 @@ class ConstantsProblem:
             if np.abs(step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
         s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
-        channel = torque_channel(replace(self.nominal, delay_s=0.0), s) * np.exp(-delay * s)
+        channel = torque_channel_response(replace(self.nominal, delay_s=0.0), s) * np.exp(
+            -delay * s
+        )
         channel = channel * terms.alteration.channel(s)
         rotation = external * terms.turn_by_medium
         rotation = rotation + internal / terms.stiffness * terms.turn_by_internal
@@ -321,7 +324,9 @@ class ConstantsProblem:
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
             deviations = self.constants(x, terms) - self.measured
-        phases = deviations[:, CONSTANTS.index("residue_phase_rad") :: len(CONSTANTS)]
+        phases = deviations[
+            :, MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
+        ]
         phases -= 2 * np.pi * np.round(phases / (2 * np.pi))
         return deviations
 
@@ -384,7 +389,7 @@ class ConstantsProblem:
         """Minimize chi-square from all start vectors. Return the minima, the lowest first."""
         minima = self._minimize_from(self.starts())
         for _ in range(_SHAPE_UPDATES if self.stated != Alteration() else 0):
-            self.terms = mode_terms(self.stated, self.plant(minima[0].x).beam, self.modes)
+            self.terms = galerkin_mode_terms(self.stated, self.plant(minima[0].x).beam, self.modes)
             minima = self._minimize_from([each.x for each in minima])
         return minima
 
@@ -471,8 +476,8 @@ class UniformBeamTest:
     modes : tuple of int
         Numbers of the compared modes.
     measured, predicted, std : ndarray, shape (4 n,)
-        Measured and predicted `CONSTANTS`, mode by mode, and the standard deviations of the
-        measured ones.
+        Measured and predicted `MODE_CONSTANT_NAMES`, mode by mode, and the standard deviations of
+        the measured ones.
     """
 
     status: TestStatus
@@ -497,8 +502,8 @@ class UniformBeamTest:
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[index // len(CONSTANTS)],
-                    "name": CONSTANTS[index % len(CONSTANTS)],
+                    "mode": self.modes[index // len(MODE_CONSTANT_NAMES)],
+                    "name": MODE_CONSTANT_NAMES[index % len(MODE_CONSTANT_NAMES)],
                     "measured": measured,
                     "std": std,
                     "predicted": predicted,
@@ -538,7 +543,7 @@ class TolerantEstimate:
         95 % intervals by the profile of chi-square. An end that the modes do not bound is infinite
         or the edge of the range.
     covariance : ndarray, shape (7, 7)
-        Covariance of `PARAMETERS`, with those in `LOGARITHMIC` as logarithms.
+        Covariance of `PARAMETERS`, with those in `LOGARITHMIC_PARAMETERS` as logarithms.
     first_rad_s : float
         Frequency of the first visible mode, in rad/s.
     deviance_of_one : mapping of str to float
@@ -557,12 +562,12 @@ class TolerantEstimate:
     interval: Mapping[str, tuple[float, float]]
     covariance: NDArray[np.float64]
     first_rad_s: float
-    deviance_of_one: dict[str, float]
-    deviance_without: dict[str, float]
+    deviance_of_order_one: dict[str, float]
+    deviance_without_damping: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
         """Return names and covariance matrix of the parameters as a JSON-ready dict."""
-        names = [f"ln_{name}" if name in LOGARITHMIC else name for name in PARAMETERS]
+        names = [f"ln_{name}" if name in LOGARITHMIC_PARAMETERS else name for name in PARAMETERS]
         return {"names": names, "matrix": self.covariance.tolist()}
 
 
@@ -588,12 +593,12 @@ def uniform_beam_test(
     if degrees_of_freedom <= 0:
         no_prediction = np.full(measured.size, np.nan)
         return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, no_prediction, std)
-    problem = ConstantsProblem(fit, modes, nominal, tilt_deg=tilt_deg)
+    problem = UniformBeamProblem(fit, modes, nominal, tilt_deg=tilt_deg)
     best_minimum = problem.minima()[0]
     degrees_of_freedom += _count_idle_unknowns(problem, best_minimum)
     p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
     return UniformBeamTest(
-        status="passed" if p_value >= REFUSED_BELOW else "refused",
+        status="passed" if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM else "refused",
         chi_square=best_minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         p_value=p_value,
@@ -636,10 +641,10 @@ def tolerant_estimate(
     attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
         ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
         ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
-        ("losses", _LOOSE_TOLERANCE, REFUSED_BELOW),
+        ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
     for basis, tolerance, least_p_value in attempts:
-        problem = ConstantsProblem(fit, modes, nominal, tolerance, tilt_deg)
+        problem = UniformBeamProblem(fit, modes, nominal, tolerance, tilt_deg)
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
         constant_count = problem.compared // (2 if basis == "losses" else 1)
@@ -664,7 +669,7 @@ def tolerant_estimate(
     if not orders_without_one:
         return estimate
     if basis == "geometry":
-        problem = ConstantsProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
+        problem = UniformBeamProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
     best_minimum = minima[0]
     deviances = {
@@ -672,10 +677,10 @@ def tolerant_estimate(
         - best_minimum.cost
         for order in orders_without_one
     }
-    return replace(estimate, deviance_of_one=estimate.deviance_of_one | deviances)
+    return replace(estimate, deviance_of_order_one=estimate.deviance_of_order_one | deviances)
 
 
-def _count_idle_unknowns(problem: ConstantsProblem, minimum: Minimum) -> int:
+def _count_idle_unknowns(problem: UniformBeamProblem, minimum: Minimum) -> int:
     """Count the unknowns that do not affect chi-square at a minimum.
 
     Absent damping has such unknowns.
@@ -686,7 +691,7 @@ def _count_idle_unknowns(problem: ConstantsProblem, minimum: Minimum) -> int:
 
 
 def _estimate_at_minimum(
-    problem: ConstantsProblem,
+    problem: UniformBeamProblem,
     minima: Sequence[Minimum],
     basis: EstimateBasis,
     p_value: float | None,
@@ -698,7 +703,7 @@ def _estimate_at_minimum(
     covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
     values = problem.parameters(best_minimum.x)
     spreads = np.sqrt(np.diag(covariance))
-    deviance_without = {
+    deviance_without_damping = {
         name: problem.minimize_without_damping(PARAMETERS.index(name), best_minimum.x).cost
         - best_minimum.cost
         for name in _DAMPING_COEFFICIENTS
@@ -716,7 +721,7 @@ def _estimate_at_minimum(
             lower_end, upper_end = min(lower_end, *other_values), max(upper_end, *other_values)
         else:
             lower_end, upper_end = value - NORMAL_95 * spread, value + NORMAL_95 * spread
-        if name in LOGARITHMIC:
+        if name in LOGARITHMIC_PARAMETERS:
             value, spread = math.exp(value), math.exp(value) * spread
             lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
         intervals[name], std[name] = (lower_end, upper_end), spread
@@ -730,13 +735,13 @@ def _estimate_at_minimum(
         interval=intervals,
         covariance=covariance,
         first_rad_s=float(2 * np.pi * np.exp(problem.measured[0])),
-        deviance_of_one={"alpha": 0.0, "lambda": 0.0},
-        deviance_without=deviance_without,
+        deviance_of_order_one={"alpha": 0.0, "lambda": 0.0},
+        deviance_without_damping=deviance_without_damping,
     )
 
 
 def _interval_end(
-    problem: ConstantsProblem, index: int, best_minimum: Minimum, spread: float
+    problem: UniformBeamProblem, index: int, best_minimum: Minimum, spread: float
 ) -> float:
     """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
 

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._drag import DampingAt
+    from analysis.identify._drag import DampingAtAmplitude
     from analysis.identify._finding import Finding
     from analysis.identify.profile_likelihood import LikelihoodProfile, Order
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
@@ -30,12 +30,12 @@ Statistical Association 90 (1995) 773-795)."""
 BIC_TIE: Final = 6.0
 """Difference of BIC below which the data do not distinguish two structures."""
 
-EXCLUDED: Final = (10.828, 13.816, 16.266, 18.467)
+EXCLUSION_DEVIANCES: Final = (10.828, 13.816, 16.266, 18.467)
 """Deviance above that of the freest structure from which a simpler one is excluded, by the number
 of missing parameters (1 to 4): the 0.1 % limit of chi-square. A true structure is excluded once in
 a thousand records."""
 
-NOT_DETERMINED: Final = "the record does not determine the order"
+ORDER_NOT_DETERMINED_REASON: Final = "the record does not determine the order"
 """Reason against an order whose profile is too wide or has several minima."""
 
 WITH_DRAG_REASON: Final = "air drag contributes to it, and its law is known to a few per cent only"
@@ -52,7 +52,9 @@ _MIN_MODES_FOR_A_SINGLE_DAMPING: Final = 3
 """Number of visible modes that show whether there is a second damping: two loss factors are
 explained by coefficient and order of one damping as well as by two dampings."""
 
-ANOTHER_DAMPING: Final = "from two modes it cannot be told whether there is another damping as well"
+SECOND_DAMPING_REASON: Final = (
+    "from two modes it cannot be told whether there is another damping as well"
+)
 """Reason against the order of a single damping if the record shows two modes."""
 
 
@@ -149,11 +151,11 @@ def too_few_modes(structure: Structure, mode_count: int) -> str | None:
     if mode_count < _MIN_MODES_FOR_AN_ORDER:
         return "a single mode determines the amount of damping, not its order"
     if structure.internal != structure.external and mode_count < _MIN_MODES_FOR_A_SINGLE_DAMPING:
-        return ANOTHER_DAMPING
+        return SECOND_DAMPING_REASON
     return None
 
 
-def deviance_of_one(profile: LikelihoodProfile) -> float:
+def deviance_of_order_one(profile: LikelihoodProfile) -> float:
     """Return the deviance of order 1 above the lowest, or infinity outside of the profile.
 
     Parameters
@@ -179,14 +181,16 @@ def _order_status(
     if not freest.structure.has(order):
         return "absent", "no such damping shows"
     if not profile.identifiable:
-        return "not identifiable", NOT_DETERMINED
+        return "not identifiable", ORDER_NOT_DETERMINED_REASON
     if doubt is not None:
         return "open", doubt
     if order == "lambda" and candidate_set.drag is not None:
         return "open", WITH_DRAG_REASON
     if profile.admits_one:
         return "compatible", None
-    return ("fractional" if deviance_of_one(profile) > EXCLUDED[0] else "open"), None
+    return (
+        "fractional" if deviance_of_order_one(profile) > EXCLUSION_DEVIANCES[0] else "open"
+    ), None
 
 
 # Verdict on a record
@@ -268,7 +272,7 @@ class Verdict:
     harmonics: tuple[Harmonic, ...]
     sentences: tuple[str, ...]
     experiments: tuple[str, ...]
-    damping_with_amplitude: tuple[DampingAt, ...] = ()
+    damping_with_amplitude: tuple[DampingAtAmplitude, ...] = ()
 
     def as_json(self) -> dict[str, object]:
         """Return the verdict as a JSON-ready dict, in which non-finite numbers are None."""

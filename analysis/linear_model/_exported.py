@@ -19,10 +19,10 @@ if TYPE_CHECKING:
 
     from analysis.linear_model._dynamics import Dynamics, UncertainDynamics
     from analysis.linear_model._identified import IdentifiedModel
-    from analysis.linear_model._pole_fit import Input, PoleStructure
+    from analysis.linear_model._pole_fit import InputKind, PoleStructure
     from analysis.linear_model._state_space import StateSpace
 
-SAMPLES: Final = 50
+DEFAULT_SAMPLES: Final = 50
 """Default number of samples of the posterior distribution of the parameters."""
 
 _RANDOM_SEED: Final = 0
@@ -57,10 +57,10 @@ class ModelOptions:
     """
 
     beam: bool = False
-    given: Input = "acceleration"
+    given: InputKind = "acceleration"
     order: int | None = None
     rate_hz: float | None = None
-    samples: int = SAMPLES
+    samples: int = DEFAULT_SAMPLES
 
 
 @dataclass(frozen=True, slots=True, eq=False)

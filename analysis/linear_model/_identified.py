@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify import BACKGROUND, ModalModel, Plant
+from analysis.identify import BACKGROUND_COEFFICIENTS, ModalModel, Plant
 from analysis.linear_model._dynamics import (
     LinearModelError,
     UncertainDynamics,
@@ -117,13 +117,13 @@ class IdentifiedModel:
             raise self._error("modal_model", "is not a modal model") from error
         numbers = [*modal.poles_rad_s, *modal.residues, *modal.background]
         stable = all(pole.real < 0 < pole.imag for pole in modal.poles_rad_s)
-        if len(modal.background) != BACKGROUND or not (
+        if len(modal.background) != BACKGROUND_COEFFICIENTS or not (
             len(modal.poles_rad_s) == len(modal.residues) <= _MAX_MODES
         ):
             raise self._error(
                 "modal_model",
                 f"must have up to {_MAX_MODES} poles, a residue for each of them, and "
-                f"{BACKGROUND} coefficients of the background",
+                f"{BACKGROUND_COEFFICIENTS} coefficients of the background",
             )
         if not stable or not all(map(_is_finite, numbers)):
             raise self._error(

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.linear_model._pole_fit import Input, PoleFit
+    from analysis.linear_model._pole_fit import InputKind, PoleFit
     from analysis.linear_model._state_space import StateSpace
 
 MAX_RELATIVE_ERROR: Final = 1e-3
@@ -32,7 +32,7 @@ _MAX_INTEGRATORS: Final = 2
 
 
 def realise_response(
-    fit: PoleFit, order: int | None, input_kind: Input
+    fit: PoleFit, order: int | None, input_kind: InputKind
 ) -> tuple[PoleStructure, StateSpace]:
     """Realise a response by a state space with a given number of states, or the fewest.
 
@@ -104,7 +104,9 @@ def _real_poles_suffice(fit: PoleFit, pairs: int, real_poles: int) -> bool:
     return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in structures)
 
 
-def _structures_with_states(pairs: int, states: int, input_kind: Input) -> Iterator[PoleStructure]:
+def _structures_with_states(
+    pairs: int, states: int, input_kind: InputKind
+) -> Iterator[PoleStructure]:
     """Yield the structures with a number of pairs and a total number of states.
 
     `states` does not count the states that all structures have.
@@ -134,7 +136,7 @@ def _structures_with_real_poles(
 def _best_realisation(
     fit: PoleFit,
     states: int,
-    input_kind: Input,
+    input_kind: InputKind,
     least_real_poles: Mapping[int, int],
     tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:

@@ -28,10 +28,10 @@ if TYPE_CHECKING:
 
     Real = NDArray[np.float64]
 
-Input = Literal["acceleration", "angle"]
+InputKind = Literal["acceleration", "angle"]
 """Input of an exported model."""
 
-INPUTS: Final[tuple[Input, ...]] = ("acceleration", "angle")
+INPUT_KINDS: Final[tuple[InputKind, ...]] = ("acceleration", "angle")
 """Possible inputs of an exported model."""
 
 _INPUT_SIGNALS: Final = SignalNames(
@@ -184,7 +184,7 @@ class PoleFit:
         return coefficients, float(np.abs(residual[self._in_band]).max())
 
     def system(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
@@ -232,7 +232,7 @@ class PoleFit:
         return bool(np.linalg.eigvals(coupled).real.max(initial=0.0) <= _MAX_GROWTH_PER_S)
 
     def _system_without_filters(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: Input
+        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
     ) -> StateSpace:
         """Return the state space of a fit with tool inertia, without filters and delay."""
         upper_poles, real_poles = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)

@@ -4,7 +4,7 @@ from ._estimate import estimate as estimate
 from ._fit import fit_frf as fit_frf
 from ._fit import fit_many as fit_many
 from ._fit import thinned as thinned
-from ._route import LARGEST_SHIFT as LARGEST_SHIFT
+from ._route import LARGEST_FREQUENCY_SHIFT as LARGEST_FREQUENCY_SHIFT
 from ._route import FittedModel as FittedModel
 from ._route import Indices as Indices
 from ._route import Peak as Peak
@@ -12,7 +12,7 @@ from ._route import WelchAnalysis as WelchAnalysis
 from ._route import analyse as analyse
 from ._route import band_limited as band_limited
 from ._route import fit_indices as fit_indices
-from ._route import loudest_moment_s as loudest_moment_s
+from ._route import largest_oscillation_time_s as largest_oscillation_time_s
 from ._route import modelled_torque as modelled_torque
 from ._route import peak_deviation as peak_deviation
 from ._route import resonant_peaks as resonant_peaks

@@ -46,7 +46,7 @@ from analysis.models import (
     weighting_name,
     weights,
 )
-from analysis.optimizer import Box, Minimum, NormalEquations, Recent, descend
+from analysis.optimizer import Box, Minimum, NormalEquations, RecentValues, descend
 from rigd.beam import Beam, Damping
 
 # Fits
@@ -225,7 +225,7 @@ class _FrfProblem:
     def __init__(self, unknowns: DampingUnknowns, grid: _FrequencyGrid) -> None:
         self.unknowns = unknowns
         self.grid = grid
-        self._recent_linearizations: Recent[_Linearization] = Recent()
+        self._recent_linearizations: RecentValues[_Linearization] = RecentValues()
 
     def cost(self, x: NDArray[np.float64]) -> float:
         """Return the cost (Eq. 26) at the unknowns x."""

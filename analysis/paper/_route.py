@@ -252,7 +252,9 @@ _ENVELOPE_HALF_WIDTH: Final = 0.1
 """Half width of the band in which an envelope is computed, relative to its centre frequency."""
 
 
-def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: float) -> float:
+def largest_oscillation_time_s(
+    values: NDArray[np.float64], rate_hz: float, frequency_hz: float
+) -> float:
     """Return the time at which a signal's oscillation near a frequency is largest.
 
     Parameters
@@ -292,7 +294,7 @@ def loudest_moment_s(values: NDArray[np.float64], rate_hz: float, frequency_hz: 
 MODES: Final = 3
 """Number of modes whose peaks and poles are evaluated."""
 
-LARGEST_SHIFT: Final = 0.1
+LARGEST_FREQUENCY_SHIFT: Final = 0.1
 """Largest relative difference between the frequency of a fitted mode and the undamped beam's. A
 damping ratio of 0.4 causes such a difference."""
 
@@ -313,8 +315,8 @@ class FittedModel:
         Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
         mode without a pole.
     followed : tuple of bool
-        Whether each mode vibrates at a frequency within `LARGEST_SHIFT` of the undamped beam's. If
-        not, the fit does not describe that resonance of the antenna.
+        Whether each mode vibrates at a frequency within `LARGEST_FREQUENCY_SHIFT` of the undamped
+        beam's. If not, the fit does not describe that resonance of the antenna.
     peaks : tuple of Peak or None
         Resonant peaks of `response`, one for each mode.
     deviations : tuple of PeakDeviation or None
@@ -474,7 +476,7 @@ def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[
     """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
-        mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_SHIFT
+        mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_FREQUENCY_SHIFT
         for mode, own_hz in zip(fitted_modes, undamped_hz[: len(fitted_modes)], strict=True)
     )
 

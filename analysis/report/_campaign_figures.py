@@ -6,8 +6,8 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.campaigns import best_models, by_model
-from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, title, with_unit
+from analysis.campaigns import best_models, group_errors_by_model
+from analysis.campaigns.sentences import MIXTURE_MARK, label, probability, symbol_with_unit, title
 from analysis.models import STRUCTURES
 from analysis.report import _style as style
 from analysis.report._frf_figure import line_styles
@@ -194,7 +194,7 @@ def _draw_parameter_panel(
     marks += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
     axes.set_title(f"{symbol}{marks}   {p_value_text}")
-    axes.set_ylabel(with_unit(parameter.name))
+    axes.set_ylabel(symbol_with_unit(parameter.name))
     axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
     axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
     axes.ticklabel_format(axis="y", useOffset=False)
@@ -371,7 +371,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     """Draw the prediction error of every left-out session by model, the best model at the top."""
     from matplotlib.lines import Line2D
 
-    models = by_model(campaign.validation)
+    models = group_errors_by_model(campaign.validation)
     weightings = campaign.settings.weightings
     colors = {w: line_style["color"] for w, line_style in line_styles(weightings).items()}
     width_in, height_in = 9.0, _ROW_HEIGHT_IN * len(models) + 1.75

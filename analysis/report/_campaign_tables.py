@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from analysis.campaigns import by_model
+from analysis.campaigns import group_errors_by_model
 from analysis.campaigns.sentences import label, lost_trials
 from analysis.report._paper_tables import FIT_NAME_COLUMNS, paper_tables
 from analysis.report._pooled_tables import (
@@ -218,7 +218,7 @@ def validation_table(campaign: CampaignResult) -> Table:
 def validation_summary(campaign: CampaignResult) -> Table:
     """Return the table of each model's fit and leave-one-out error, the best model first."""
     rows: list[Row] = []
-    for method, name, weighting, errors in by_model(campaign.validation):
+    for method, name, weighting, errors in group_errors_by_model(campaign.validation):
         values = [session_error.error for session_error in errors]
         own_errors = [
             session_error.own_error

@@ -5,7 +5,7 @@ from __future__ import annotations
 from functools import reduce
 from typing import TYPE_CHECKING, Final, NamedTuple
 
-from analysis.identify import BACKGROUND
+from analysis.identify import BACKGROUND_COEFFICIENTS
 from analysis.models import STRUCTURES
 from analysis.report.table import ABSENT_TEXT, TEXT_FORMAT, Column, Table
 
@@ -193,7 +193,7 @@ def _measured_equation(fit: RecordFit) -> Formula:
 
 def _modal_equation() -> Formula:
     """Return the equation of the modal model: poles and residues, and background terms."""
-    k, n, background = _variable("k"), _variable("n"), BACKGROUND - 1
+    k, n, background = _variable("k"), _variable("n"), BACKGROUND_COEFFICIENTS - 1
     over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
     highest_power = _number_formula(str(background))
     from_zero = _join(n, _EQUALS_SIGN, _number_formula("0"))

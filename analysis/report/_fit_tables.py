@@ -7,9 +7,9 @@ from dataclasses import asdict, replace
 from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import QUANTITIES
-from analysis.paper import LARGEST_SHIFT
+from analysis.paper import LARGEST_FREQUENCY_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
     ABSENT_TEXT,
@@ -105,7 +105,7 @@ def _marked_row(whole_record: WholeRecord) -> str:
     return (
         "the one reported"
         if whole_record.headline.exact is None
-        else f"of the values {EXACT_CONDITION}"
+        else f"of the values {EXACTLY_UNIFORM_CONDITION}"
     )
 
 
@@ -343,8 +343,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     notes = ["From the poles of the fitted model; ξ is the damping ratio."]
     if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in mode_pairs):
         notes.append(
-            f"{_FAR_MODE_MARK} more than {100 * LARGEST_SHIFT:g} % off the undamped beam's: the "
-            "fit does not follow this resonance. The number only describes the fitted curve."
+            f"{_FAR_MODE_MARK} more than {100 * LARGEST_FREQUENCY_SHIFT:g} % off the undamped "
+            "beam's: the fit does not follow this resonance. The number only describes the fitted curve."
         )
     if not all(is_underdamped) or not all(model.modes for model in models):
         notes.append(f"{ABSENT_TEXT} overdamped in this fit.")

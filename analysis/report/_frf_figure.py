@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.models import ESTIMATOR_WORDS, estimate_text
+from analysis.models import ESTIMATOR_NAMES, estimate_text
 from analysis.report import _style as style
 from rigd.view.frequency_charts import magnitude_db, phase_deg
 
@@ -106,14 +106,14 @@ def _draw_type_panel(
         whole_record = analysis.whole_record
         curves.append(
             (
-                f"measured, {ESTIMATOR_WORDS['fft']}", whole_record.frequency_hz,
+                f"measured, {ESTIMATOR_NAMES['fft']}", whole_record.frequency_hz,
                 whole_record.response, {"color": style.FAINT, "linewidth": 0.6},
             )
         )  # fmt: skip
     measured_frf = analysis.response
     curves.append(
         (
-            f"measured, {ESTIMATOR_WORDS[analysis.settings.estimator]}", measured_frf.frequency_hz,
+            f"measured, {ESTIMATOR_NAMES[analysis.settings.estimator]}", measured_frf.frequency_hz,
             measured_frf.response, {"color": style.GREY, "linewidth": 1.3},
         )
     )  # fmt: skip

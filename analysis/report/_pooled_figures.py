@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.sentences import title
-from analysis.models import ESTIMATOR_WORDS, STRUCTURES
+from analysis.models import ESTIMATOR_NAMES, STRUCTURES
 from analysis.report import _style as style
 from analysis.report._campaign_figures import (
     INTERVAL_COLOR,
@@ -263,7 +263,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
         "coupling torque over motor angle, without delays  ·  pooled: type "
         f"{pooled_estimate.name}{exact_condition_text(campaign)}"
         + (
-            f"  ·  sessions: {ESTIMATOR_WORDS[campaign.settings.estimator]}, which a fast sweep "
+            f"  ·  sessions: {ESTIMATOR_NAMES[campaign.settings.estimator]}, which a fast sweep "
             "biases at the resonances"
             if is_measured
             else ""

@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.campaigns import campaign_numbers, fact_text, in_dispute
+from analysis.campaigns import campaign_numbers, differing_fact_keys, fact_text
 from analysis.campaigns.sentences import (
     MIXTURE_MARK,
     MIXTURE_NOTE,
     label,
     percent,
     probability,
+    symbol_with_unit,
     title,
-    with_unit,
 )
-from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import STRUCTURES
 from analysis.report.table import (
     NOT_REPORTED_MARK,
@@ -118,7 +118,7 @@ def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> st
 
 def exact_condition_text(campaign: CampaignResult) -> str:
     """Return the condition under which a pooled estimate holds; empty without a condition."""
-    return f", {EXACT_CONDITION}" if campaign.modal and campaign.modal.leads else ""
+    return f", {EXACTLY_UNIFORM_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
 def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None = None) -> Table:
@@ -224,7 +224,7 @@ def _pooled_row(
         "bic": pooled_estimate.bic,
         "misfit": pooled_estimate.misfit,
         "parameter": Cell(
-            parameter.name, with_mark(with_unit(parameter.name), parameter.name, homogeneity)
+            parameter.name, with_mark(symbol_with_unit(parameter.name), parameter.name, homogeneity)
         ),
         "value": value,
         "std": std,
@@ -252,7 +252,8 @@ def tolerance_table(campaign: CampaignResult) -> Table:
         Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
         Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
-        Column(EXACT_CONDITION, "exact"), Column("std", "exact_std", std_of_previous=True),
+        Column(EXACTLY_UNIFORM_CONDITION, "exact"),
+        Column("std", "exact_std", std_of_previous=True),
     )  # fmt: skip
     if modal_result is None or tolerant_estimate is None or numbers is None:
         return Table("parameters", "", columns, ())
@@ -272,7 +273,9 @@ def tolerance_table(campaign: CampaignResult) -> Table:
         )
         rows.append(
             {
-                "parameter": Cell(name, with_mark(with_unit(name), name, campaign.homogeneity)),
+                "parameter": Cell(
+                    name, with_mark(symbol_with_unit(name), name, campaign.homogeneity)
+                ),
                 "value": mark_cell(value) if quantity.flag else replace(value, strong=True),
                 **dict(zip(("std", "low_95", "high_95"), others, strict=True)),
                 **dict(zip(("exact", "exact_std"), exact_cells, strict=True)),
@@ -397,7 +400,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
         "Specimens, as the files state them",
         (
             Column("this report's", "here", TEXT_FORMAT),
-            *(Column(key, key, TEXT_FORMAT) for key in in_dispute(specimens)),
+            *(Column(key, key, TEXT_FORMAT) for key in differing_fact_keys(specimens)),
             Column("files", "files"),
             Column("their names", "names", TEXT_FORMAT),
         ),
@@ -425,12 +428,12 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
         return {
             "quantity": Cell(
                 scatter.quantity,
-                with_mark(with_unit(scatter.quantity), scatter.quantity, homogeneity),
+                with_mark(symbol_with_unit(scatter.quantity), scatter.quantity, homogeneity),
             ),
             "sessions": len(scatter.values),
             "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", factor),
             "between_std": number_cell(scatter.between_std, ".2g", factor),
-            "between_in_own_std": scatter.own_stds,
+            "between_in_own_std": scatter.between_std_in_own_stds,
             "cochran_q": scatter.cochran_q,
             "i_squared": replace(number_cell(scatter.i_squared), text=percent(scatter.i_squared)),
             "p_value": chance_cell(scatter.chance),

@@ -497,7 +497,7 @@ The second figure is omitted if too few modes are visible for the test."""
 
 
 def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
-    """Yield the figures of a whole record, drawn one after the other; call it within `styled`."""
+    """Yield the figures of a whole record one after the other; call it within `figure_style`."""
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline

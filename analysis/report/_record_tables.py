@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
@@ -92,7 +92,7 @@ def exact_modes_table(whole_record: WholeRecord) -> Table | None:
         return None
     return Table.of(
         "exact_geometry_modes",
-        f"Modes {EXACT_CONDITION}: type {exact_estimates.name}",
+        f"Modes {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         _MODE_COLUMNS,
         ((mode.number, *_mode_cells(mode)) for mode in modes),
         ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
@@ -231,7 +231,7 @@ def _condition_text(headline: Headline) -> str:
     """Return the condition under which a table's parameters hold, for the table's caption."""
     tolerant_estimate = headline.tolerant
     if tolerant_estimate is None:
-        exact = "" if headline.modal is None else f", {EXACT_CONDITION}"
+        exact = "" if headline.modal is None else f", {EXACTLY_UNIFORM_CONDITION}"
         return f", type {headline.name}{exact}"
     if tolerant_estimate.basis == "geometry":
         percent = 100 * tolerant_estimate.uniformity
@@ -252,7 +252,7 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     flags = [parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag]
     return Table.of(
         "exact_geometry",
-        f"Parameters {EXACT_CONDITION}: type {exact_estimates.name}",
+        f"Parameters {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
         (
             _parameter_row(
@@ -349,7 +349,7 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
         rows,
         (
             "The intervals on the left hold only if the assumption is true"
-            + (f", and both {EXACT_CONDITION}." if whole_record.headline.exact else "."),
+            + (f", and both {EXACTLY_UNIFORM_CONDITION}." if whole_record.headline.exact else "."),
         ),
     )
 
@@ -390,9 +390,11 @@ def _parameter_row(
     )
     if values_with_scales:
         # A parameter that depends on no scale has the same interval with scales.
-        with_scales = values_with_scales.get(name, parameter)
+        with_scale_uncertainty = values_with_scales.get(name, parameter)
         cells += estimate_cells(
-            (with_scales.std or None, *_interval_ends(with_scales)), with_scales.std, factor
+            (with_scale_uncertainty.std or None, *_interval_ends(with_scale_uncertainty)),
+            with_scale_uncertainty.std,
+            factor,
         )
     if parameter.flag is not None:
         cells = (mark_cell(cells[0]), *map(grey_cell, cells[1:]))

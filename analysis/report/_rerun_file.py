@@ -13,7 +13,7 @@ from analysis.report._text import analysis_tables, as_text, damping_sentences, r
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
 from rigd.view import chart_page, chart_view
-from rigd.view.chart import Chart, LegendEntry, Thinning
+from rigd.view.chart import Chart, CurveDecimation, LegendEntry
 from rigd.view.frequency_charts import (
     COHERENCE_AXIS,
     COHERENCE_ENTRY,
@@ -211,7 +211,7 @@ def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
 
 def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
     """Draw the charts of a page with their curves, reduced to the pixels of a view."""
-    thinning = Thinning.logarithmic(page.frequency_hz, *page.band_hz, _FREQUENCY_GROUPS)
+    thinning = CurveDecimation.logarithmic(page.frequency_hz, *page.band_hz, _FREQUENCY_GROUPS)
     for graph in page.graphs:
         graph.chart.draw_frame(stream)
         for order, curve in enumerate(graph.curves):

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed
+from analysis.identify.scales import SCALE_EXPONENTS, density_check, parameters_compensate_scales
 from analysis.models import QUANTITIES
 from analysis.report.table import estimate_cells
 
@@ -21,7 +21,7 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 
 def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the scales: which uncertainties the intervals include, and which not."""
-    if not scales_absorbed(whole_record.fit):
+    if not parameters_compensate_scales(whole_record.fit):
         held_parameters = ", ".join(QUANTITIES[name][0] for name in whole_record.fixed)
         yield (
             f"Intervals are statistical only: the file's values of {held_parameters}, "

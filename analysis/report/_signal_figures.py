@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import Measurement, TorquePredictor
-from analysis.paper import band_limited, loudest_moment_s, modelled_torque
+from analysis.paper import band_limited, largest_oscillation_time_s, modelled_torque
 from analysis.report import _style as style
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -67,7 +67,7 @@ def resonance_intervals(record: Record, count: int) -> tuple[RecordInterval, ...
     for number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
         if frequency_hz >= record.rate_hz / 2:
             break
-        centre_s = loudest_moment_s(record.torque_nm, record.rate_hz, frequency_hz)
+        centre_s = largest_oscillation_time_s(record.torque_nm, record.rate_hz, frequency_hz)
         length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
         length_s = max(length_s, _LEAST_DETAIL_S)
         samples = min(round(length_s * record.rate_hz), len(record.time_s))

@@ -112,7 +112,7 @@ _MATPLOTLIB_SETTINGS: Final[dict[Any, Any]] = {
 
 
 @contextmanager
-def styled() -> Iterator[None]:
+def figure_style() -> Iterator[None]:
     """Provide a context in which figures are made and saved in the style of this module."""
     with rc_context(_MATPLOTLIB_SETTINGS), warnings.catch_warnings():
         # A file name may hold characters that the font lacks; a box in a title does no harm.
@@ -181,7 +181,7 @@ class Picture:
 
 
 def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
-    """Return a figure as the bytes of a PNG, SVG or PDF file; call it within `styled`.
+    """Return a figure as the bytes of a PNG, SVG or PDF file; call it within `figure_style`.
 
     Parameters
     ----------
@@ -212,7 +212,7 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
 
 
 def save(figure: Figure, path: Path) -> bytes:
-    """Write a figure in the format of the file's suffix; call it within `styled`.
+    """Write a figure in the format of the file's suffix; call it within `figure_style`.
 
     Parameters
     ----------
@@ -240,7 +240,7 @@ def save(figure: Figure, path: Path) -> bytes:
 def save_picture(
     figure: Figure, stem: Path, description: str, formats: Collection[FigureFormat]
 ) -> Picture:
-    """Write a figure in several formats and return it for a page; call it within `styled`.
+    """Write a figure in several formats and return it for a page; call it within `figure_style`.
 
     Parameters
     ----------

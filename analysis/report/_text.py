@@ -10,11 +10,11 @@ from rich.console import Console, Group
 from rich.padding import Padding
 from rich.text import Text
 
-from analysis.identify.headline import EXACT_CONDITION, MISREAD
+from analysis.identify.headline import CONTRADICTED_FILE_REASON, EXACTLY_UNIFORM_CONDITION
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report.table import NOT_REPORTED_MARK, estimate_cells, terminal_table
-from analysis.suited import LEFT_OUT
+from analysis.suited import WELCH_OMITTED_TEXT
 from rigd.printable import listed
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     else:
         # The reason for missing Welch fits was reported before.
         parts += _warning_lines(
-            warning for warning in result.warnings if not warning.startswith(LEFT_OUT)
+            warning for warning in result.warnings if not warning.startswith(WELCH_OMITTED_TEXT)
         )
     return Group(*parts)
 
@@ -219,7 +219,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
         Sentences with 95 % intervals in brackets.
     """
     sentences = []
-    if any(mode.damping_ratio.flag == MISREAD for mode in headline.modes):
+    if any(mode.damping_ratio.flag == CONTRADICTED_FILE_REASON for mode in headline.modes):
         return ()
     visible_modes = [_mode_text(mode) for mode in headline.modes if mode.shown]
     if not headline.explained:
@@ -290,7 +290,7 @@ def _order_text(headline: Headline, damping: ReportedLossFactor) -> str:
     if headline.tolerant is not None:
         return ""  # the verdict has the slope of the loss, with its condition
     value, low, high = estimate_cells((order.value, *order.interval_95), order.std)
-    condition = f", {EXACT_CONDITION}" if headline.modal is not None else ""
+    condition = f", {EXACTLY_UNIFORM_CONDITION}" if headline.modal is not None else ""
     return (
         f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"
     )

@@ -34,7 +34,7 @@ _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE
 
 
 def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustration]:
-    """Yield a map of all contact points and a figure of each touch; call it within `styled`."""
+    """Yield a map of all contacts and a figure of each touch; call it within `figure_style`."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
             "map",

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from analysis.identify import CONSTANTS
+from analysis.identify import MODE_CONSTANT_NAMES
 from analysis.report import _style as style
 from analysis.report.table import TEXT_FORMAT, Cell, Column, Table, estimate_cells, number_cell
 from analysis.statistics import NORMAL_95
@@ -39,8 +39,8 @@ _PERCENT: Final = 100.0
 
 def _deviations(test: UniformBeamTest) -> NDArray[np.float64]:
     """Return measured minus predicted constants, shape (modes, 4); phases within half a turn."""
-    deviations = (test.measured - test.predicted).reshape(-1, len(CONSTANTS))
-    phase = CONSTANTS.index("residue_phase_rad")
+    deviations = (test.measured - test.predicted).reshape(-1, len(MODE_CONSTANT_NAMES))
+    phase = MODE_CONSTANT_NAMES.index("residue_phase_rad")
     deviations[:, phase] -= 2 * np.pi * np.round(deviations[:, phase] / (2 * np.pi))
     return deviations
 
@@ -53,13 +53,13 @@ def uniformity_figure(test: UniformBeamTest) -> Figure:
     test : UniformBeamTest
         Result of the test, with at least one degree of freedom.
     """
-    deviations, std = _deviations(test), test.std.reshape(-1, len(CONSTANTS))
+    deviations, std = _deviations(test), test.std.reshape(-1, len(MODE_CONSTANT_NAMES))
     figure = style.new_figure(9.0, 4.0)
     grid = figure.add_gridspec(
-        2, len(CONSTANTS), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
+        2, len(MODE_CONSTANT_NAMES), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
         wspace=0.34,
     )  # fmt: skip
-    for column, name in enumerate(CONSTANTS):
+    for column, name in enumerate(MODE_CONSTANT_NAMES):
         std_axes, percent_axes = (figure.add_subplot(grid[row, column]) for row in range(2))
         std_axes.set_title(_CONSTANT_TITLES[name], fontsize=8.5)
         std_axes.axhspan(
@@ -132,12 +132,12 @@ def uniformity_table(test: UniformBeamTest) -> Table:
             strict=True,
         )
     ):  # fmt: skip
-        name = CONSTANTS[index % len(CONSTANTS)]
+        name = MODE_CONSTANT_NAMES[index % len(MODE_CONSTANT_NAMES)]
         name_cell = Cell(name, name.removesuffix("_rad").replace("_", " "))
         cells = estimate_cells((measured_value, std, predicted_value), std)
         rows.append(
             (
-                test.modes[index // len(CONSTANTS)], name_cell, *cells,
+                test.modes[index // len(MODE_CONSTANT_NAMES)], name_cell, *cells,
                 number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )
         )  # fmt: skip

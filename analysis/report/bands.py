@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC, ResponseGrid
+from analysis.identify import LOGARITHMIC_PARAMETERS, ResponseGrid
 from analysis.identify.uniform_beam import PARAMETERS
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
@@ -254,7 +254,7 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     )
     gradient = np.empty((len(parameter_names), frequency_hz.size), dtype=np.complex128)
     for gradient_row, name, derivative in zip(gradient, parameter_names, derivatives, strict=True):
-        scale_by_value = name in LOGARITHMIC and name not in _GRADIENT_NAMES
+        scale_by_value = name in LOGARITHMIC_PARAMETERS and name not in _GRADIENT_NAMES
         gradient_row[:] = derivative * (fit.parameters[name] if scale_by_value else 1.0) / response
     covariance = fit.covariance[np.ix_(indices, indices)]
     return ResponseBand(

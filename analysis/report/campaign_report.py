@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.text import Text
 
 from analysis.campaigns.sentences import lost_trials, specimens
-from analysis.identify.headline import EXACT_CONDITION
+from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
@@ -239,7 +239,7 @@ def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
             "modes and parameters",
             "modal constants (frequency, damping ratio, residue of each mode) pooled over the "
             "sessions; a beam fitted to these, with the tolerance of the geometry added to their "
-            f"covariance; {EXACT_CONDITION}: the pooled estimates of the types",
+            f"covariance; {EXACTLY_UNIFORM_CONDITION}: the pooled estimates of the types",
         )
     ]
 
@@ -282,7 +282,7 @@ def write_campaign(
 
     pictures = []
     for name, (draw_figure, description) in _figures_with_data(campaign).items():
-        with style.styled():
+        with style.figure_style():
             figure = draw_figure()
             pictures.append(
                 style.save_picture(figure, folder / "figures" / name, description, formats)

@@ -6,7 +6,7 @@ import hashlib
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Final
 
-from analysis.models import ESTIMATOR_WORDS
+from analysis.models import ESTIMATOR_NAMES
 from analysis.report import _fit_tables as fit_tables
 from analysis.report import _record_tables as tables
 from analysis.report._document import document, document_text
@@ -218,7 +218,7 @@ def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
     settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
     facts = [
-        ("estimator", ESTIMATOR_WORDS[settings.estimator]),
+        ("estimator", ESTIMATOR_NAMES[settings.estimator]),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {len(response.frequency_hz)} bins"),
         ("types", ", ".join(settings.types)),
         ("weights", ", ".join(settings.weightings)),
@@ -262,7 +262,7 @@ def _write_page(
     from analysis.report._record_figures import illustrations
 
     pictures = []
-    with style.styled():
+    with style.figure_style():
         for illustration in illustrations(whole_record):
             stem = folder / "figures" / illustration.name
             pictures.append(
@@ -358,7 +358,7 @@ def write_report(
     whole_record = result.whole
     pictures: list[Picture] = []
     if result.welch is not None:
-        names = figures_of_paper(paper=True, whole_record=whole_record is not None)
+        names = welch_figure_names(paper=True, whole_record=whole_record is not None)
         pictures = _write_welch_figures(result.welch, names, folder / "figures", on_step, formats)
     write_new(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
@@ -366,7 +366,7 @@ def write_report(
     write_new(folder / "analysis.json", document_text(document([result])))
 
 
-def figures_of_paper(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
+def welch_figure_names(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
     """Return the names of the Welch fits' figures in a report.
 
     Parameters
@@ -398,7 +398,7 @@ def _write_welch_figures(
     )
     pictures = []
     for name in names:
-        with style.styled():
+        with style.figure_style():
             figure = drawing_functions[name](analysis)
             pictures.append(style.save_picture(figure, folder / name, _WELCH_DESCRIPTION, formats))
         on_step(f"figure {name}")

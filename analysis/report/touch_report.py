@@ -194,7 +194,7 @@ def write_touch_report(
     from analysis.report._touch_figures import touch_illustrations
 
     pictures = []
-    with style.styled():
+    with style.figure_style():
         for illustration in touch_illustrations(sessions):
             stem = folder / "figures" / illustration.name
             picture = style.save_picture(

@@ -3,7 +3,7 @@ from . import tip as tip
 from ._air_drag import AIR_DENSITY_KG_PER_M3 as AIR_DENSITY_KG_PER_M3
 from ._air_drag import DragGrid as DragGrid
 from ._deflection import DeflectionFilter as DeflectionFilter
-from ._force_realisation import check_order as check_order
+from ._force_realisation import check_force_damping_order as check_force_damping_order
 from ._force_realisation import realise_force as realise_force
 from ._model import PARAMETERS as PARAMETERS
 from ._model import Beam as Beam

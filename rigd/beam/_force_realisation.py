@@ -115,7 +115,7 @@ def realise_force(
     >>> print(static.round(3))  # m/N, N·m/N, N/N
     [ 0.797 -0.6   -1.   ]
     """
-    check_order(damping)
+    check_force_damping_order(damping)
     x = np.append(output_at_m, force_at_m) / beam.length_m
     poles, residues = _modal_poles_and_residues(beam, damping, x, highest_rad_s)
     if poles.size == _MAX_MODES and -poles[-1].real < _RESONANT_DAMPING_RATIO * np.abs(poles[-1]):
@@ -189,7 +189,7 @@ def realise_force(
     return ForceRealisation(a, poles.size, b, rows, fitted[:, -1])
 
 
-def check_order(damping: Damping) -> None:
+def check_force_damping_order(damping: Damping) -> None:
     """Raise RealisationError if the damping's order is too high for point forces on the beam.
 
     Parameters

@@ -678,7 +678,7 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
     return exponential[:n, :n], exponential[:n, n]
 
 
-def held_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
+def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
     """Return the state that each constant unit input causes after a duration, shape (n, inputs).
 
     Parameters

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 import numpy as np
 
 from rigd.bench.measure import LoopMeasurement
-from rigd.engine.realtime import WAKE_UP_US
+from rigd.engine.realtime import MAX_WAKE_UP_US
 from rigd.errors import FailureError
 
 NAME = "cyclictest"
@@ -45,7 +45,7 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> LoopMeasu
         *(NAME, "--quiet", "--threads=1", f"--affinity={cpu}", "--mlockall"),
         *(f"--priority={priority}", f"--policy={'fifo' if priority else 'other'}"),
         *(f"--interval={round(1e6 / rate_hz)}", f"--loops={round(rate_hz * seconds)}"),
-        *(f"--histogram={_HISTOGRAM_US}", f"--latency={WAKE_UP_US}"),
+        *(f"--histogram={_HISTOGRAM_US}", f"--latency={MAX_WAKE_UP_US}"),
     ]
     try:
         completed = subprocess.run(

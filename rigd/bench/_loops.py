@@ -16,7 +16,7 @@ from rigd.bench.measure import LoopMeasurement, UsageMeter, record_measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
 from rigd.engine.messages import Finished, SessionJob
-from rigd.engine.reference import put_reference
+from rigd.engine.reference import write_reference
 from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
@@ -117,7 +117,7 @@ def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> L
         meter = UsageMeter(group.control.pid)
         shared_state[StateField.STOP] = Stop.NO
         shared_state[StateField.GO] = 1
-        reference = put_reference(channels.reference_fd, excitation.reference_rad)
+        reference = write_reference(channels.reference_fd, excitation.reference_rad)
         group.control.send(SessionJob(profile, reference))
         blocks = []
         finished = None

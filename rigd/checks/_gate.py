@@ -126,7 +126,7 @@ class FailedCheck:
 
 
 @dataclass(frozen=True, slots=True)
-class Clearance:
+class PaperCheckResult:
     """Result of the checks on paper for a session."""
 
     failed: tuple[FailedCheck, ...] = ()
@@ -157,7 +157,7 @@ class Clearance:
             raise CheckFailedError("\n".join(self.refusals), wrong_use=never_acceptable)
 
 
-def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
+def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> PaperCheckResult:
     """Run the checks on paper for a session, and return which rows failed or are accepted.
 
     Parameters
@@ -191,7 +191,7 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> Clearance:
                 row_name, text, not check.not_acceptable, row_name in accept
             )
     accepted_needlessly = [row_name for row_name in dict.fromkeys(accept) if row_name not in failed]
-    return Clearance(
+    return PaperCheckResult(
         tuple(failed.values()),
         tuple(
             f"--accept {row_name}: it did not fail; nothing was accepted."

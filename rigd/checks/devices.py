@@ -22,7 +22,7 @@ from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import find_simulator
 from rigd.engine.timing import RealClock
 from rigd.profile import Profile
-from rigd.safety.probing_move import MEASURED
+from rigd.safety.probing_move import PROBED_KEYS
 
 _SCALE_OBJECTS = {"gear_ratio": "6091", "encoder_step_rad": "608F, 6092"}
 """Map from a position scale that a drive need not state to the CiA 402 objects that state it."""
@@ -399,7 +399,7 @@ def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRo
     """Yield the row on whether scales and signs are known or need a probing move."""
     if target is ActuationTarget.SIMULATED:
         return
-    not_measured = [key for key in MEASURED if profile.sources.get(key) != "measured"]
+    not_measured = [key for key in PROBED_KEYS if profile.sources.get(key) != "measured"]
     if not not_measured:
         found, verdict = "motor and encoder are measured", CheckResult.OK
     else:
@@ -460,7 +460,7 @@ def _check_devices(
         yield from calibration_rows(sensor.calibration(), rig)
 
     def rate_rows() -> Iterator[CheckRow]:
-        if not isinstance(sensor, MeasurableSensor) or target.any_clock:
+        if not isinstance(sensor, MeasurableSensor) or target.allows_virtual_clock:
             yield CheckRow(
                 "sensor", "rate", f"not measured: {target.value}", "", CheckResult.SKIPPED
             )

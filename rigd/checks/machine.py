@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from rigd.checks.rows import CheckResult, CheckRow, grade
-from rigd.engine.realtime import LOCKED, REFUSED, isolated_cores
+from rigd.engine.realtime import MEMORY_LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime import OWN_PYTHON
 
@@ -88,7 +88,7 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
     for name, text in granted.items():
         not_granted = (
             text.startswith(REFUSED)
-            or (name == "memory" and text != LOCKED)
+            or (name == "memory" and text != MEMORY_LOCKED)
             or (name == "supervision" and not text.startswith("SCHED_RR"))
         )
         wanted = _REQUIRED_SETTINGS.get(name, "granted") if not_granted else ""

@@ -10,7 +10,7 @@ import typer
 
 from rigd.cli.daemon import reset_by_daemon
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, AsJson, ProfileName, fail, profile_named
-from rigd.runtime import raise_on
+from rigd.runtime import raise_on_signals
 
 if TYPE_CHECKING:
     from rigd.bench import Results
@@ -127,7 +127,7 @@ def _openable_profile(name: str) -> "Profile":
 
 def _interrupt_on_end_signals() -> None:
     """Make SIGTERM and SIGHUP act as Ctrl-C, so that the devices are closed."""
-    raise_on(signal.SIGTERM, signal.SIGHUP)
+    raise_on_signals(signal.SIGTERM, signal.SIGHUP)
 
 
 def bench(
@@ -155,7 +155,7 @@ def bench(
 
     Example: rigd bench --seconds 10
     """
-    raise_on(signal.SIGTERM, signal.SIGHUP)
+    raise_on_signals(signal.SIGTERM, signal.SIGHUP)
     rig_profile = profile_named(profile)
     from rigd.bench import as_json as document_of
     from rigd.bench import report_lines

@@ -9,7 +9,7 @@ import sys
 from collections.abc import Callable
 
 from rigd.printable import readable_message
-from rigd.runtime import raise_on
+from rigd.runtime import raise_on_signals
 
 EXIT_FAILED = 1
 """Exit code of a valid request that failed."""
@@ -21,7 +21,7 @@ EXIT_INTERRUPTED = 130
 
 def run_command(command: Callable[[], object]) -> None:
     """Run a command; Ctrl-C and system errors end the process with a message and an exit code."""
-    raise_on(signal.SIGINT)
+    raise_on_signals(signal.SIGINT)
     for stream in (sys.stdout, sys.stderr):
         # A terminal that cannot encode "·" or "²" gets a "?" instead of an error.
         if isinstance(stream, io.TextIOWrapper):

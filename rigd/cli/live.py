@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, fail, progress
-from rigd.runtime import raise_on
+from rigd.runtime import raise_on_signals
 from rigd.view.rrd_file import SUFFIX, RrdFileError, check_new, check_rrd_file, new_rrd_file
 
 if TYPE_CHECKING:
@@ -58,7 +58,7 @@ def interrupted_by_end_signals() -> Iterator[None]:
     """Make SIGTERM and SIGHUP act as Ctrl-C in this context, to remove temporary files."""
     numbers = (signal.SIGTERM, signal.SIGHUP)
     previous_handlers = [signal.getsignal(number) for number in numbers]
-    raise_on(*numbers)
+    raise_on_signals(*numbers)
     try:
         yield
     finally:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.errors import RigdError
-from rigd.excitation import FROM_THE_RIG, KINDS, Value
+from rigd.excitation import KINDS, RIG_ARGUMENTS, Value
 from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
@@ -269,7 +269,7 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
     function_parameters = {
         name: parameter
         for name, parameter in inspect.signature(function).parameters.items()
-        if name not in FROM_THE_RIG
+        if name not in RIG_ARGUMENTS
     }
     values: dict[str, Value] = {}
     for name, given in given_parameters.items():

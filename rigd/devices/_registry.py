@@ -45,7 +45,7 @@ class ActuationTarget(Enum):
     """A rig simulated by ``rigd simulate`` whose time advances with each SYNC."""
 
     @property
-    def any_clock(self) -> bool:
+    def allows_virtual_clock(self) -> bool:
         """Whether the target can also run under the virtual clock."""
         return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
@@ -115,7 +115,7 @@ def simulated_differently(rig: RigParameters) -> list[str]:
     return [] if simulator is None else differences(rig, simulator)
 
 
-def objections(rig: RigParameters) -> list[str]:
+def bus_conflicts(rig: RigParameters) -> list[str]:
     """Return the reasons why the devices of a rig cannot use one CAN bus; nothing is sent."""
     if rig.can is None:
         return []

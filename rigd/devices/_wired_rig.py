@@ -5,7 +5,7 @@ from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
 
-from rigd.devices._registry import ActuationTarget, objections, open_devices
+from rigd.devices._registry import ActuationTarget, bus_conflicts, open_devices
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
@@ -32,7 +32,7 @@ def open_wired_rig(rig: RigParameters) -> Devices:
     """
     bus = rig.can
     assert bus is not None
-    refusals = objections(rig)
+    refusals = bus_conflicts(rig)
     if refusals:
         raise DeviceError("\n".join(refusals))
     simulator = find_simulator(rig.name)

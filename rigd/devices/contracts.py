@@ -204,6 +204,6 @@ class Devices:
     restart."""
 
     @property
-    def on_lines(self) -> bool:
+    def uses_line(self) -> bool:
         """Whether the drive is connected by a bus or line, real or simulated."""
         return self.drive.health().bits is not None

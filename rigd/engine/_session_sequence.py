@@ -23,11 +23,11 @@ from rigd.engine.realtime import page_faults
 from rigd.engine.reference import ReferenceReader
 from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, Stop, write_event
 from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendWatch, TickScheduler
-from rigd.excitation.moves import quintic, still_path
+from rigd.excitation.moves import quintic, vibration_free_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety import SLOW_CHECK_TICKS
-from rigd.safety.limits import BY_NAME, OVERLOADED
+from rigd.safety.limits import INTERLOCKS_BY_NAME, OVERLOADED_ADVICE
 
 if TYPE_CHECKING:
     from rigd.engine._touch_watch import TouchWatch
@@ -42,11 +42,11 @@ _SUPERVISOR_TIMEOUT_S = 2.0
 """Longest time in s without a heartbeat of the supervisor. Only time in which this process ran
 counts, because a stalled computer is not the supervisor's fault."""
 _WRONG_SIGN_CHANNELS = tuple(
-    BY_NAME[name].channel for name in ("angle", "velocity", "tracking error")
+    INTERLOCKS_BY_NAME[name].channel for name in ("angle", "velocity", "tracking error")
 )
 """Channels of the limits that a wrong sign of angle or torque violates."""
 _ENCODER_CHANNELS = tuple(
-    BY_NAME[name].channel
+    INTERLOCKS_BY_NAME[name].channel
     for name in ("encoder jump", "frozen encoder", "stopped encoder", "repeated angle")
 )
 """Channels of the interlocks that detect a failed encoder."""
@@ -409,10 +409,10 @@ class SessionSequence:
         With devices on a bus or serial line, return after 1 s: the tick then holds the last angle,
         and shows the devices that their host still runs.
         """
-        on_lines = self._cycle.devices.on_lines
+        uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
         while reader.must_wait(tick) and self._stop_reason() is None:
-            if on_lines and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
+            if uses_line and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
             self._display.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
@@ -507,7 +507,7 @@ class SessionSequence:
                 "fault",
                 f"The loop stalled for {missed} ticks with the torque held, more than "
                 "limits.missed_ticks_in_a_row = "
-                f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED}",
+                f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED_ADVICE}",
             )
         self._switch_off_if_stopped()
         end = self._control_tick(reference_rad)
@@ -708,7 +708,7 @@ def _return_path(profile: Profile, ending: Ending) -> list[float]:
     """
     duration_s, rate_hz = profile.session.return_s, profile.rig.rate_hz
     if ending.poles_rad_s and duration_s <= _LONGEST_SHAPED_RETURN_S:
-        path = still_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
+        path = vibration_free_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
     else:
         path = quintic(duration_s, rate_hz)
     fractions: list[float] = path.tolist()

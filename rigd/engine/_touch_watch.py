@@ -4,7 +4,7 @@ from dataclasses import dataclass
 
 from rigd.engine.cycle import Cycle
 from rigd.engine.messages import TouchOrder
-from rigd.excitation import after_touch
+from rigd.excitation import reference_after_touch
 from rigd.session.layout import Status
 from rigd.touch import TouchDetector
 
@@ -113,7 +113,9 @@ class TouchWatch:
             reference_rad[tick],
         )
         start_rad = reference_rad[current_pass.begins - 1] if current_pass.begins else 0.0
-        path_rad = after_touch(self._approach, current_pass.ends, tick, last_angles_rad, start_rad)
+        path_rad = reference_after_touch(
+            self._approach, current_pass.ends, tick, last_angles_rad, start_rad
+        )
         reference_rad[tick + 1 : current_pass.ends] = memoryview(path_rad)  # type: ignore[arg-type] # numpy's stubs
 
     def _check_force_limit(self, shear_n: float) -> DetectedContact | None:

@@ -10,14 +10,16 @@ from math import ceil
 
 from rigd.engine._ring import Ring, RingSpec
 from rigd.engine.shared_state import EVENT_SIZE, SharedState, StateField, Stop
-from rigd.safety.limits import BUFFERED_S
+from rigd.safety.limits import RECORDER_BUFFER_S
 from rigd.session.layout import CONTROL_SIZE, SAMPLE_SIZE, TIMING_SIZE
 
 # Topics
 
 VIRTUAL_BUFFERED_S = 160.0
-"""Time in s whose records the rings hold under the virtual clock. It is longer than `BUFFERED_S`,
-because there a session takes about a second and observers lag behind."""
+"""Time in s whose records the rings hold under the virtual clock.
+
+It is longer than `RECORDER_BUFFER_S`, because there a session takes about a second
+and observers lag behind."""
 _EVENTS = 256
 """Number of log events that their ring holds."""
 
@@ -37,7 +39,7 @@ class Topic:
     live: bool
     """Whether the live publisher reads the records, and drops those it cannot show in time."""
 
-    def capacity(self, rate_hz: float, buffered_s: float = BUFFERED_S) -> int:
+    def capacity(self, rate_hz: float, buffered_s: float = RECORDER_BUFFER_S) -> int:
         """Return the number of records that a topic's ring must hold.
 
         Parameters
@@ -131,7 +133,9 @@ class Channels:
         self.shared_state.close()
 
 
-def create_channels(rate_hz: float, fds: Sequence[int], buffered_s: float = BUFFERED_S) -> Channels:
+def create_channels(
+    rate_hz: float, fds: Sequence[int], buffered_s: float = RECORDER_BUFFER_S
+) -> Channels:
     """Create the rings and the shared state of a rig's processes in shared memory.
 
     Parameters

@@ -21,11 +21,11 @@ from rigd.engine.cycle import (
     Cycle,
     RestReadings,
     StandstillMonitor,
-    make_observers,
-    make_watch,
+    make_limit_monitor,
+    make_reading_monitors,
     observe_rest,
-    recalled_heat_nm2,
-    remember_heat,
+    store_motor_heat,
+    stored_motor_heat_nm2,
 )
 from rigd.engine.messages import (
     Connected,
@@ -158,10 +158,12 @@ class _ControlServer:
         self._granted = granted
         self._zero_rad = 0.0
         self._silent_ticks = 0
-        self._on_lines = devices.on_lines
+        self._on_lines = devices.uses_line
         # A simulated motor starts cold.
         real_motor = not devices.simulated
-        self._watch = make_watch(profile, recalled_heat_nm2(profile) if real_motor else 0.0)
+        self._watch = make_limit_monitor(
+            profile, stored_motor_heat_nm2(profile) if real_motor else 0.0
+        )
         self._standstill = StandstillMonitor(profile)
         self._display = ReadingPublisher(channels.shared_state, devices)
         self._cycle = self._make_cycle(profile)
@@ -169,7 +171,7 @@ class _ControlServer:
     def store_heat(self) -> None:
         """Store the heat of a real motor in a file for the next connection to the rig."""
         if not self._devices.simulated:
-            remember_heat(self._profile, self._watch.heat_nm2)
+            store_motor_heat(self._profile, self._watch.heat_nm2)
 
     def observe_standstill(self) -> None:
         """Read the devices until the motor's angle and speed at rest are known, and publish them.
@@ -489,7 +491,7 @@ class _ControlServer:
             rig.sensor.projection,
             _make_controller(profile),
             self._watch,
-            make_observers(profile, self._devices),
+            make_reading_monitors(profile, self._devices),
         )
         cycle.zero_rad = self._zero_rad
         return cycle

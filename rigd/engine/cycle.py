@@ -24,7 +24,7 @@ from rigd.engine.timing import TickScheduler
 from rigd.profile import Profile
 from rigd.runtime.addresses import UnsafeFolderError, runtime_folder
 from rigd.safety import BeamPrediction, EncoderWatch, LimitWatch, ScaleWatch, SensorWatch
-from rigd.safety.limits import BY_NAME, Violation
+from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 from rigd.session.layout import WRENCH_FIELDS, Status
 
 ENCODER_REMEDY = (
@@ -42,10 +42,10 @@ _LIMIT_WARNING = int(Status.LIMIT_WARNING)
 _TORQUE_OFF = int(Status.TORQUE_OFF)
 
 _STALE_ANGLE_CHANNELS = tuple(
-    BY_NAME[name].channel for name in ("stale angle", "stale angle share")
+    INTERLOCKS_BY_NAME[name].channel for name in ("stale angle", "stale angle share")
 )
 _STALE_WRENCH_CHANNELS = tuple(
-    BY_NAME[name].channel for name in ("stale wrench", "stale wrench share")
+    INTERLOCKS_BY_NAME[name].channel for name in ("stale wrench", "stale wrench share")
 )
 
 _RECENT_TICKS = 32
@@ -549,7 +549,7 @@ def observe_rest(
 # The limits' watch, and the motor's heat
 
 
-def make_watch(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
+def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
     """Return the limit monitor of a rig, which is used as long as the rig is connected.
 
     Parameters
@@ -584,7 +584,7 @@ class ReadingMonitors:
     """Check that the sensor does not repeat its last reading."""
 
 
-def make_observers(profile: Profile, devices: Devices) -> ReadingMonitors:
+def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors:
     """Return the monitors that check a rig's encoder and sensor for plausible readings.
 
     Parameters
@@ -616,7 +616,7 @@ def make_observers(profile: Profile, devices: Devices) -> ReadingMonitors:
     return ReadingMonitors(encoder, SensorWatch(channels, is_noisy, rig.rate_hz))
 
 
-def remember_heat(profile: Profile, heat_nm2: float) -> None:
+def store_motor_heat(profile: Profile, heat_nm2: float) -> None:
     """Store the heat of the motor in a file for this user's next connection to the rig.
 
     If it cannot be stored, the next connection assumes a cold motor.
@@ -637,7 +637,7 @@ def remember_heat(profile: Profile, heat_nm2: float) -> None:
         temporary_path.replace(path)
 
 
-def recalled_heat_nm2(profile: Profile) -> float:
+def stored_motor_heat_nm2(profile: Profile) -> float:
     """Return the motor's remaining heat from the last connection, in (N·m)²; 0 if unknown.
 
     The motor cools with its thermal time constant.

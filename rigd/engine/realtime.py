@@ -16,13 +16,13 @@ from pathlib import Path
 
 REFUSED = "refused: "
 """Prefix of the text for a real-time setting that the system did not grant; the reason follows."""
-LOCKED = "locked"
+MEMORY_LOCKED = "locked"
 """Text for a process whose memory is locked, so that it causes no page faults."""
-WAKE_UP_US = 2
+MAX_WAKE_UP_US = 2
 """Longest exit latency in µs of the processor's idle states; deeper states are disabled. Halting is
 faster than that. With 0 an idle core would poll and consume power."""
 
-NICE = -10
+SUPERVISION_NICENESS = -10
 """Niceness of supervisor and recorder if the system grants no real-time priority."""
 
 _MCL_CURRENT = 1
@@ -170,11 +170,11 @@ class Precedence:
         return f"SCHED_RR {self._priority}"
 
     def _raise_by_niceness(self) -> str:
-        """Set the niceness `NICE` for all threads, and return its description."""
+        """Set the niceness `SUPERVISION_NICENESS` for all threads, and return its description."""
         self._set_nice(0)
         self._apply = self._set_nice
         self.cover()
-        return f"nice {NICE}"
+        return f"nice {SUPERVISION_NICENESS}"
 
     def _set_realtime(self, thread: int) -> None:
         """Set the real-time priority of a thread, and keep it off the loop's core."""
@@ -191,7 +191,7 @@ class Precedence:
 
     def _set_nice(self, thread: int) -> None:
         """Set the niceness of a thread under the ordinary scheduling policy."""
-        os.setpriority(os.PRIO_PROCESS, thread, NICE)
+        os.setpriority(os.PRIO_PROCESS, thread, SUPERVISION_NICENESS)
         _set_ordinary(thread)
 
     def _restore(self, thread: int) -> None:
@@ -211,12 +211,12 @@ def _set_ordinary(thread: int) -> None:
 def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
     """Return the processor cores that the kernel isolates (``isolcpus``); empty if unknown."""
     try:
-        return cores_of((root / _ISOLATED_CORES_FILE).read_text())
+        return parse_core_list((root / _ISOLATED_CORES_FILE).read_text())
     except (OSError, ValueError):
         return frozenset()
 
 
-def cores_of(text: str) -> frozenset[int]:
+def parse_core_list(text: str) -> frozenset[int]:
     """Return the numbers of the cores that a text in the kernel's format, as ``0-2,5``, lists.
 
     Raises
@@ -253,10 +253,10 @@ def lock_memory(libc: ctypes.CDLL) -> str:
     limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
     if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
         _check_return_code(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
-        return LOCKED
+        return MEMORY_LOCKED
     # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
     _check_return_code(libc.mlockall(_MCL_CURRENT))
-    return f"{LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
+    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -295,12 +295,12 @@ def _pin_to_loop_core(cpu: int, root: Path) -> str:
 def _limit_idle_states(root: Path) -> str:
     """Disable idle states that a core leaves slowly, until this process ends; return a text."""
     states = (root / _IDLE_STATES_FOLDER).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
-    if all(int(state.read_text()) <= WAKE_UP_US for state in states):
-        return f"none slower than {WAKE_UP_US} µs"
+    if all(int(state.read_text()) <= MAX_WAKE_UP_US for state in states):
+        return f"none slower than {MAX_WAKE_UP_US} µs"
     fd = os.open(root / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     # The bound holds while the descriptor is open, until this process ends.
-    os.write(fd, struct.pack("=i", WAKE_UP_US))
-    return f"those that are left within {WAKE_UP_US} µs"
+    os.write(fd, struct.pack("=i", MAX_WAKE_UP_US))
+    return f"those that are left within {MAX_WAKE_UP_US} µs"
 
 
 def _set_fifo_priority(priority: int) -> str:

@@ -101,7 +101,7 @@ def _record_until_closed(
         try:
             message = parent.poll(0.0 if transferred else _IDLE_PAUSE_S)
         except EOFError:
-            recorder.finish_orphaned()
+            recorder.close_without_supervisor()
             return
         match message:
             case FileHeader():
@@ -231,7 +231,7 @@ class Recorder:
         path = self._writer.close(outcome_with_counts, segments)
         return Closed(path, counts, outcome["outcome"], outcome["reason"])
 
-    def finish_orphaned(self) -> None:
+    def close_without_supervisor(self) -> None:
         """Wait until the loop has stopped, and close the file without the supervisor's order."""
         shared_state = self._channels.shared_state
         self.transfer()  # all of the record may still be in the rings

@@ -38,7 +38,7 @@ class ReferenceSpec:
     """Number of ticks that are planned at the start, before segments are appended; None: all."""
 
 
-def put_reference(
+def write_reference(
     fd: int, reference_rad: "NDArray[np.float64]", planned: int | None = None
 ) -> ReferenceSpec:
     """Write a reference to shared memory, and return the description with which others attach.

@@ -2,8 +2,8 @@ from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
-from ._named import FROM_THE_RIG as FROM_THE_RIG
 from ._named import KINDS as KINDS
+from ._named import RIG_ARGUMENTS as RIG_ARGUMENTS
 from ._named import Value as Value
 from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
@@ -23,7 +23,7 @@ from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
 from ._touch_passes import Approach as Approach
 from ._touch_passes import TouchPass as TouchPass
-from ._touch_passes import after_touch as after_touch
+from ._touch_passes import reference_after_touch as reference_after_touch
 from ._touch_passes import touch as touch
 from ._until import PAUSE_S as PAUSE_S
 from ._until import PrecisionSearch as PrecisionSearch

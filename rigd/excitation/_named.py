@@ -33,7 +33,7 @@ KINDS: Mapping[str, Callable[..., Excitation]] = {
 }
 """Functions that return an excitation, by its name on the command line and in session files."""
 
-FROM_THE_RIG = frozenset({"rate_hz", "rig", "tip_slope_rad"})
+RIG_ARGUMENTS = frozenset({"rate_hz", "rig", "tip_slope_rad"})
 """Names of arguments of these functions that are data or limits of the rig, not options of the
 excitation."""
 

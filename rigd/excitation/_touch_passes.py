@@ -1,9 +1,9 @@
 """Passes in search of an obstacle: out at a constant speed until the beam touches it, and back.
 
 Each pass has its own block of time: rest, way out, pause, way back without an obstacle. When the
-loop detects a touch, it replaces the rest of the reference in this block (`after_touch`): the motor
-brakes, holds, and returns to the beginning of the pass. A session therefore has the same number of
-ticks with and without a touch. Neither way excites a vibration.
+loop detects a touch, it replaces the rest of the reference in this block (`reference_after_touch`):
+the motor brakes, holds, and returns to the beginning of the pass. A session therefore has the same
+number of ticks with and without a touch. Neither way excites a vibration.
 """
 
 from dataclasses import dataclass, replace
@@ -25,7 +25,7 @@ from rigd.excitation._signals import (
     require_positive,
     require_within_turn,
 )
-from rigd.excitation.moves import Braking, slew, still_path
+from rigd.excitation.moves import Braking, slew, vibration_free_path
 from rigd.identified_beam import TOUCH
 
 Real = NDArray[np.float64]
@@ -153,7 +153,7 @@ def touch(
     return_duration_s = max(
         _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
     )
-    return_path = still_path(return_duration_s, rate_hz, plant.poles_rad_s)
+    return_path = vibration_free_path(return_duration_s, rate_hz, plant.poles_rad_s)
     rest_rad = np.zeros(ceil(settle_s * rate_hz))
     single_pass = np.concatenate(
         [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - return_path)]
@@ -196,7 +196,7 @@ def touch(
     return replace(excitation, model=plant.model)
 
 
-def after_touch(
+def reference_after_touch(
     approach: Approach,
     ends: int,
     tick: int,

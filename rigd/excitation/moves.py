@@ -59,7 +59,7 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
     return path
 
 
-def still_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
+def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
     """Return the path from 0 to 1 of least mean-square acceleration that leaves all modes at rest.
 
     The path has zeros of second order at the poles if the time suffices, else zeros of first order.

@@ -14,7 +14,7 @@ from typing import Final
 
 from rigd.errors import FailureError
 from rigd.live.address import LOOPBACK
-from rigd.view.rrd_file import without_settings
+from rigd.view.rrd_file import without_rerun_variables
 
 _REFUSING_PROXY = f"http://{LOOPBACK}:9"
 """Proxy that refuses all requests: no process listens on the discard port."""
@@ -76,7 +76,11 @@ class RerunProgram:
         try:
             self._process = subprocess.Popen(
                 command,
-                env={**without_settings(os.environ), **_OFFLINE_ENVIRONMENT, **(environment or {})},
+                env={
+                    **without_rerun_variables(os.environ),
+                    **_OFFLINE_ENVIRONMENT,
+                    **(environment or {}),
+                },
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
                 stderr=subprocess.STDOUT,

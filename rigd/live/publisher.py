@@ -44,7 +44,7 @@ from rigd.view.banner import (
     preparing,
 )
 from rigd.view.frequency_charts import LastResponse
-from rigd.view.rrd_file import settle_sdk
+from rigd.view.rrd_file import prepare_sdk_environment
 
 if TYPE_CHECKING:
     from rigd.live.messages import LiveJob
@@ -78,7 +78,7 @@ def main() -> None:
     # The watchdog needs the signal, whatever handlers and masks are inherited.
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
-    settle_sdk()
+    prepare_sdk_environment()
     parent = Parent()
     job: LiveJob = parent.receive_job()
     channels = attach_channels(job.channels)

@@ -36,7 +36,7 @@ from rigd.profile._schema import (
     key_types,
     section_fields,
 )
-from rigd.safety.limits import BUFFERED_S
+from rigd.safety.limits import RECORDER_BUFFER_S
 from rigd.session.user_metadata import NOTES, MetadataError, check_name
 from rigd.units import UNITS, is_usable_size, suffix_of, unit_of
 
@@ -276,10 +276,10 @@ def _unreachable_limits(values: Mapping[str, Any]) -> Iterator[str]:
             "peak torque gives the motor alone; choose some two to five times that."
         )
     lag = values["limits.recorder_lag_s"]
-    if lag >= BUFFERED_S:
+    if lag >= RECORDER_BUFFER_S:
         yield (
             f"limits.recorder_lag_s = {lag:g} s can never be exceeded: shared memory holds "
-            f"{BUFFERED_S:g} s, and the next sample is lost; choose less, 12 s for example."
+            f"{RECORDER_BUFFER_S:g} s, and the next sample is lost; choose less, 12 s for example."
         )
 
 

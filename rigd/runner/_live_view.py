@@ -18,8 +18,8 @@ from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
 from rigd.runtime import StopRequest
-from rigd.view import Subject, band_of, sweep_of
-from rigd.view.plots import OF_A_BUS, OF_REAL_TIME
+from rigd.view import Subject, linear_sweep_band_hz, sweep_ticks
+from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0
 """Maximum time in seconds for which a session waits for the start of the live view."""
@@ -197,21 +197,21 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
     rig, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
     if rig.devices.drive == rig.devices.sensor == "sim":
-        absent_plots |= OF_A_BUS
+        absent_plots |= BUS_PLOT_COMPONENTS
     if fast:
-        absent_plots |= OF_REAL_TIME
+        absent_plots |= REAL_TIME_PLOT_COMPONENTS
     return Subject(
         name=order.path.stem,
         rate_hz=rig.rate_hz,
         ticks=excitation.reference_rad.size,
-        sweep=sweep_of(excitation.segments),
+        sweep=sweep_ticks(excitation.segments),
         beam=rig.beam,
         damping=rig.damping,
         tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
         angle_delay_s=rig.encoder.delay_s,
         torque_delay_s=rig.sensor.delay_s,
         excitation=excitation.kind,
-        sweep_hz=band_of(excitation.kind, excitation.parameters),
+        sweep_hz=linear_sweep_band_hz(excitation.kind, excitation.parameters),
         back=excitation.segments.get("back"),
         specimen=dict(order.notes).get("specimen", ""),
         limits=gauge_limits(order.profile),

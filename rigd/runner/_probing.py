@@ -23,7 +23,7 @@ from rigd.runner.request import load_rig
 from rigd.runtime import RigLock, StopRequest
 from rigd.runtime.addresses import runtime_folder
 from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
-from rigd.safety.probing_move import MEASURED, ProbeEnd, plan_probe
+from rigd.safety.probing_move import PROBED_KEYS, ProbeEnd, plan_probe
 
 _VERIFIED_KEY_PREFIXES: Final = (
     "rate_hz", "beam.", "damping.", "motor.", "encoder.", "actuation.", "sensor.projection",
@@ -112,7 +112,7 @@ def verify_by_probing(
 
 def _is_identified(profile: Profile) -> bool:
     """Return whether a profile states that motor and encoder were measured."""
-    return all(profile.sources.get(key) == "measured" for key in MEASURED)
+    return all(profile.sources.get(key) == "measured" for key in PROBED_KEYS)
 
 
 def _is_simulated_with_profile(profile: Profile) -> bool:

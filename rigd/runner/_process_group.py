@@ -155,11 +155,11 @@ class ProcessGroup:
             If there is not enough shared memory.
         """
         from rigd.engine.channels import VIRTUAL_BUFFERED_S, create_channels
-        from rigd.safety.limits import BUFFERED_S
+        from rigd.safety.limits import RECORDER_BUFFER_S
 
         # Readers of samples, such as a live view or a fit, are slower than the virtual clock.
         is_faster_than_observers = fast and (self.live or self._also or may_be_observed)
-        buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else BUFFERED_S
+        buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else RECORDER_BUFFER_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
     def _start(self, process: Process) -> None:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rigd.beam import Beam, LoadedBeam
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
-from rigd.checks import Clearance, check_on_paper
+from rigd.checks import PaperCheckResult, check_on_paper
 from rigd.control import ClosedLoop, ControlDesignError, LoopResponse, stable_loop
 from rigd.control.damper import design_damper
 from rigd.engine.messages import Ending
@@ -91,7 +91,7 @@ class Plan:
     """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
     ending: Ending = field(default_factory=Ending)
     """Motion that the control process makes after the record, such as the return to the start."""
-    clearance: Clearance = field(default_factory=Clearance)
+    clearance: PaperCheckResult = field(default_factory=PaperCheckResult)
     """Results of the checks on the profile that need no device."""
 
 

@@ -21,9 +21,9 @@ from rigd.checks import FailedCheck
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
+    bus_conflicts,
     check_selection,
     describe_actuation_target,
-    objections,
     simulated_differently,
 )
 from rigd.devices.obstacles import with_obstacles
@@ -115,7 +115,7 @@ def load_rig(
     software_commit()  # called early, because it is slow and the motor is held during the header
     profile = load_profile(name)
     check_selection(profile.rig.devices, profile.path)
-    refusals = objections(profile.rig)
+    refusals = bus_conflicts(profile.rig)
     if refusals:
         raise RefusedError("\n".join(f"{profile.path}: {refusal}" for refusal in refusals))
     target = actuation_target(profile.rig)
@@ -126,7 +126,7 @@ def load_rig(
         )
     if target is ActuationTarget.HARDWARE and not hardware:
         _refuse_unreachable_simulators(profile)
-    if fast and not target.any_clock:
+    if fast and not target.allows_virtual_clock:
         raise RefusedError(
             f"--fast: {target.value} of {profile.path} moves in real time, which cannot be "
             "skipped; omit the option."

@@ -29,7 +29,7 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import CONTROL, RECORDER, ChildError, Heartbeat
 from rigd.engine.realtime import REFUSED
-from rigd.engine.reference import is_whole, put_reference
+from rigd.engine.reference import is_whole, write_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, Stop, read_events
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
@@ -289,7 +289,7 @@ class SessionRun:
         """Start the processes of the session, supervise them to the end, and close the file."""
         group, search = self._group, self._order.excitation.search
         try:
-            reference = put_reference(
+            reference = write_reference(
                 group.channels.reference_fd,
                 self._order.excitation.reference_rad,
                 None if search is None else search.planned_ticks,

@@ -8,8 +8,8 @@ from ._background import give_way as give_way
 from ._background import prefer_oom_kill as prefer_oom_kill
 from ._background import processor_use as processor_use
 from ._background import use_one_thread as use_one_thread
-from ._locks import HeldError as HeldError
-from ._locks import HeldFile as HeldFile
+from ._locks import LockFile as LockFile
+from ._locks import LockHeldError as LockHeldError
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
 from ._locks import held_rig as held_rig
@@ -20,6 +20,6 @@ from ._stop_signals import STOP_SIGNAL as STOP_SIGNAL
 from ._stop_signals import StopRequest as StopRequest
 from ._stop_signals import ignore as ignore
 from ._stop_signals import ignore_handled_signals as ignore_handled_signals
-from ._stop_signals import raise_on as raise_on
+from ._stop_signals import raise_on_signals as raise_on_signals
 from ._stop_signals import signal_when_orphaned as signal_when_orphaned
 from ._stop_signals import signals_blocked as signals_blocked

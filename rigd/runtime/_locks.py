@@ -18,11 +18,11 @@ _MAX_HOLDER_BYTES = 200
 _RIG_LOCK_PATTERN = re.compile(r"/(?:rigd-)?rig-([^/]*)\.lock(?: \(deleted\))?$")
 
 
-class HeldError(Exception):
+class LockHeldError(Exception):
     """Raised if another program holds a lock file; its text describes that program."""
 
 
-class HeldFile:
+class LockFile:
     """Lock file that contains the name of the program that holds it.
 
     Parameters
@@ -35,9 +35,9 @@ class HeldFile:
         folder.
     """
 
-    def __init__(self, name: str, *, everybody: bool) -> None:
+    def __init__(self, name: str, *, for_all_users: bool) -> None:
         file_stem = file_name(name)
-        is_common = everybody and os.access(_COMMON_LOCK_FOLDER, os.W_OK)
+        is_common = for_all_users and os.access(_COMMON_LOCK_FOLDER, os.W_OK)
         self.path = (
             _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"
             if is_common
@@ -99,7 +99,7 @@ def _lock_descriptor(fd: int, *, alone: bool) -> None:
         fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
         holder = os.pread(fd, _MAX_HOLDER_BYTES, 0).decode(errors="replace").strip() or "unknown"
-        raise HeldError(holder + _unnamed_holder_text(fd, holder)) from None
+        raise LockHeldError(holder + _unnamed_holder_text(fd, holder)) from None
 
 
 def _unnamed_holder_text(fd: int, holder: str) -> str:
@@ -159,7 +159,7 @@ class RigLock:
         self._rig = rig
         self._holder = holder
         self._is_exclusive = alone
-        self._file = HeldFile(f"rig-{rig}", everybody=hardware)
+        self._file = LockFile(f"rig-{rig}", for_all_users=hardware)
 
     def acquire(self) -> None:
         """Acquire the lock of the rig.
@@ -171,7 +171,7 @@ class RigLock:
         """
         try:
             self._file.acquire(self._holder, alone=self._is_exclusive)
-        except HeldError as holder:
+        except LockHeldError as holder:
             raise RigBusyError(
                 f"The rig {self._rig} is in use ({holder}). Wait until it is free; if a daemon has "
                 "it, use rigd start."

@@ -1,9 +1,9 @@
 r"""Signals that request the end of a program or of its session, and how the processes react.
 
 Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal send a signal to all processes of the terminal,
-and a service manager sends SIGTERM to all processes. A command ends by an exception (`raise_on`).
-The supervisor and the control process stop their session safely at each of these signals
-(`StopRequest`), because a suspended control process would leave its last torque on. The recorder
+and a service manager sends SIGTERM to all processes. A command ends by an exception
+(`raise_on_signals`). The supervisor and the control process stop their session safely at each of
+these signals (`StopRequest`), because a suspended control process would leave its last torque on. The recorder
 and the live publisher ignore the signals (`ignore`), and are ended by the supervisor.
 """
 
@@ -30,7 +30,7 @@ class Interruption(KeyboardInterrupt):
     """
 
 
-def raise_on(*numbers: int) -> None:
+def raise_on_signals(*numbers: int) -> None:
     """Make the given signals raise an :class:`Interruption` in the main thread."""
     if hasattr(signal, "SIGALRM"):  # not on Windows
         sys.unraisablehook = _repeat_dropped_signal

@@ -22,7 +22,7 @@ from math import copysign, inf, sqrt
 
 from rigd.safety._beam_prediction import BeamPrediction
 from rigd.safety._scale_watch import SPEED_TICKS, WINDOW_TICKS, ScaleWatch
-from rigd.safety.limits import BY_NAME, Violation
+from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 
 ENCODER_FAILURE_S = 0.004
 """Time in seconds for which the net torque may be large while the encoder shows no movement."""
@@ -349,7 +349,7 @@ class EncoderWatch:
         )
         if needed_nm <= allowed_nm:
             return None
-        return BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
+        return INTERLOCKS_BY_NAME["stopped encoder"].violated(needed_nm, allowed_nm)
 
     def _check_net_torque(self, ticks: int, max_turning_nm: float) -> Violation | None:
         """Return a violation if the mean net torque should have turned a shaft that seems at rest.
@@ -361,7 +361,7 @@ class EncoderWatch:
         limit_nm = self._breakaway_nm + _TORQUE_RELATIVE_ERROR * abs(coupling_nm) + max_turning_nm
         if -limit_nm < net_nm < limit_nm:
             return None
-        return BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
+        return INTERLOCKS_BY_NAME["frozen encoder"].violated(net_nm, limit_nm)
 
     def _compare_coupling_torque(self, ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
@@ -402,7 +402,7 @@ class EncoderWatch:
         repeats.append(self._count)
         if len(repeats) < _MAX_REPEATS or self._count - repeats[0] >= _REPEAT_WINDOW_TICKS:
             return None
-        return BY_NAME["repeated angle"].violated(len(repeats), _MAX_REPEATS - 1)
+        return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeats), _MAX_REPEATS - 1)
 
     def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
         """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from math import exp, inf, isfinite, sqrt
 
-from rigd.safety.limits import BY_NAME, OVERLOADED, Limits, Violation
+from rigd.safety.limits import INTERLOCKS_BY_NAME, OVERLOADED_ADVICE, Limits, Violation
 
 SLOW_CHECK_TICKS = 64
 """Number of ticks from one check of slowly changing quantities to the next."""
@@ -195,7 +195,7 @@ class LimitWatch:
         ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
         if missed < _MIN_STALL_S * self._rate_hz:
             return f"It came after {ticks}."
-        return f"It came after {ticks}. {OVERLOADED}"
+        return f"It came after {ticks}. {OVERLOADED_ADVICE}"
 
     def check(
         self,
@@ -493,7 +493,7 @@ class LimitWatch:
         near_limit = []
         for checked in checked_values:
             name, _, _, value, limit, warning = checked
-            if BY_NAME[name].below:
+            if INTERLOCKS_BY_NAME[name].below:
                 ratio, is_near = limit / value if value > 0.0 else inf, value <= warning
             else:
                 size = abs(value) if isfinite(value) else inf
@@ -516,16 +516,16 @@ class LimitWatch:
     def _violation_with_cause(self, checked: _CheckedValue) -> Violation:
         """Return the violation of a limit, with advice that mentions ticks missed just before."""
         violation, missed = _make_violation(checked, warns=False), self.after_missed
-        if not missed or not BY_NAME[checked[0]].follows_missed_ticks:
+        if not missed or not INTERLOCKS_BY_NAME[checked[0]].follows_missed_ticks:
             return violation
-        if OVERLOADED not in missed:
+        if OVERLOADED_ADVICE not in missed:
             missed = f"{missed} {violation.remedy}"
         return replace(violation, remedy=missed)
 
 
 def _warning_fraction(name: str) -> float:
     """Return the warning level of an interlock as a fraction of its limit."""
-    fraction = BY_NAME[name].warning
+    fraction = INTERLOCKS_BY_NAME[name].warning
     assert isinstance(fraction, float)
     return fraction
 
@@ -538,7 +538,7 @@ def _checked_value(name: str, value: float, limit: float) -> _CheckedValue:
 def _make_violation(checked: _CheckedValue, *, warns: bool) -> Violation:
     """Return a reading's violation of its limit, or with `warns` of its warning level."""
     name, channel, unit, value, limit, warning = checked
-    row = BY_NAME[name]
+    row = INTERLOCKS_BY_NAME[name]
     return Violation(
         channel or row.channel,
         value,

@@ -14,7 +14,7 @@ from math import copysign, inf, sqrt
 
 import numpy as np
 
-from rigd.safety.limits import BY_NAME, Violation
+from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 
 WINDOW_TICKS = 8
 """Length of a window in ticks, from the first mean speed to the second one.
@@ -123,7 +123,7 @@ class ScaleWatch:
     def _check_ratio(self) -> Violation | None:
         """Return a violation if the ratio is significantly beyond its limit."""
         ratio, deviation = self.estimate()
-        row = BY_NAME["scales"]
+        row = INTERLOCKS_BY_NAME["scales"]
         lower_bound, upper_bound = (
             ratio - _SIGNIFICANT_STDS * deviation,
             ratio + _SIGNIFICANT_STDS * deviation,

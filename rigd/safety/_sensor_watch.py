@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from math import ceil, log, sqrt
 from operator import eq
 
-from rigd.safety.limits import BY_NAME, Violation
+from rigd.safety.limits import INTERLOCKS_BY_NAME, Violation
 
 _MIN_FROZEN_S = 0.02
 """Shortest duration in seconds of identical readings that is a fault."""
@@ -126,7 +126,7 @@ class SensorWatch:
         self._repeat_counts = [0] * len(fractions)
         self._counted_ticks = 0
         if self._has_noise[-1] and fractions[-1] > _NO_NOISE_FRACTION:
-            return BY_NAME["frozen sensor"].violated(self._runs[-1], min_run)
+            return INTERLOCKS_BY_NAME["frozen sensor"].violated(self._runs[-1], min_run)
         for channel, fraction, noisy in zip(
             self._channels[:-1], fractions, self._has_noise, strict=False
         ):
@@ -163,7 +163,7 @@ class SensorWatch:
         runs, limits = self._runs, self._limits
         assert limits is not None
         if runs[-1] > limits[-1]:
-            return BY_NAME["frozen sensor"].violated(runs[-1], limits[-1])
+            return INTERLOCKS_BY_NAME["frozen sensor"].violated(runs[-1], limits[-1])
         self._counted_ticks += 1
         if self._counted_ticks >= _COUNT_TICKS:
             repeat_counts, self._repeat_counts, self._counted_ticks = (
@@ -182,7 +182,7 @@ class SensorWatch:
                     repeated_part = (
                         "whole wrench" if all_channels else self._channels[channel_index]
                     )
-                    return BY_NAME["repeated wrench"].violated(
+                    return INTERLOCKS_BY_NAME["repeated wrench"].violated(
                         100.0 * fraction, 100.0 * limit, repeated_part
                     )
         if max(runs) <= min(limits):
@@ -191,14 +191,14 @@ class SensorWatch:
             if run <= limit:
                 continue
             if run > _FAULT_TO_WARNING_FACTOR * limit:
-                return BY_NAME["frozen channel"].violated(
+                return INTERLOCKS_BY_NAME["frozen channel"].violated(
                     run, _FAULT_TO_WARNING_FACTOR * limit, channel
                 )
             if channel not in self._warned_channels:
                 self._warned_channels.add(channel)
                 self._notices.append(
                     f"The sensor's {channel} has not changed for {run} ticks. "
-                    f"{BY_NAME['frozen channel'].remedy}"
+                    f"{INTERLOCKS_BY_NAME['frozen channel'].remedy}"
                 )
         return None
 

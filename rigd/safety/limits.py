@@ -18,7 +18,7 @@ Positive = Annotated[float, Gt(0)]
 PercentageBelow100 = Annotated[float, Gt(0), Lt(100)]
 """Type of a percentage above 0 and below 100."""
 
-BUFFERED_S = 16.0
+RECORDER_BUFFER_S = 16.0
 """Seconds of samples that shared memory buffers, so that no stall of the disk loses a sample."""
 
 
@@ -213,7 +213,7 @@ class Interlock:
         return Violation(channel, value, limit, self.unit, self.remedy, self.limit, below=below)
 
 
-OVERLOADED: Final = "The computer is overloaded: close other programs."
+OVERLOADED_ADVICE: Final = "The computer is overloaded: close other programs."
 """Advice for the operator on a violation caused by a busy computer."""
 
 _ENCODER_FAILED: Final = (  # Advice for the operator on a failed encoder.
@@ -445,7 +445,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        OVERLOADED,
+        OVERLOADED_ADVICE,
     ),
     Interlock(
         "missed share",
@@ -455,7 +455,7 @@ INTERLOCKS: Final = (
         0.8,
         Checked.TICK,
         Action.FAULT,
-        OVERLOADED,
+        OVERLOADED_ADVICE,
     ),
     Interlock(
         "bus-off",
@@ -522,5 +522,5 @@ INTERLOCKS: Final = (
 
 """Table of interlocks, in the order of docs/safety.md."""
 
-BY_NAME: Final = {row.name: row for row in INTERLOCKS}
+INTERLOCKS_BY_NAME: Final = {row.name: row for row in INTERLOCKS}
 """Map from an interlock's name to its row of `INTERLOCKS`."""

@@ -17,7 +17,7 @@ from math import inf, pi
 
 from rigd.beam import Beam, Damping, participation, poles
 
-MEASURED = ("motor.inertia_kg_m2", "motor.rated_torque_nm", "encoder.resolution_rad")
+PROBED_KEYS = ("motor.inertia_kg_m2", "motor.rated_torque_nm", "encoder.resolution_rad")
 """Keys of the profile that a probing move verifies.
 
 The move is not needed if all of them have the source "measured"."""

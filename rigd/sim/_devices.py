@@ -17,7 +17,7 @@ from typing import IO, TypeVar, cast
 
 import numpy as np
 
-from rigd.beam import check_order
+from rigd.beam import check_force_damping_order
 from rigd.devices import fresh_seed
 from rigd.devices.contracts import DeviceError, Devices, LineHealth, Wrench, wired_stop_dropped
 from rigd.devices.obstacles import Disturbance, ObstacleError, describe_obstacle, with_obstacles
@@ -161,7 +161,7 @@ class SimulatedRig:
             If the disturbance cannot be simulated; the message states the reason.
         """
         with_obstacles(self._parameters, [describe_obstacle(disturbance)])
-        check_order(self._parameters.damping)
+        check_force_damping_order(self._parameters.damping)
         if len(self._added_disturbances) == _MOST_ADDED_DISTURBANCES:
             raise ObstacleError(
                 f"{_MOST_ADDED_DISTURBANCES} obstacles and knocks were added while the simulated "

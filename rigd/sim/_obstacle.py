@@ -23,7 +23,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, Damping, PointForceGrid, realise_force
-from rigd.beam.realisation import CoupledModel, Realisation, held_inputs, propagator, state_output
+from rigd.beam.realisation import (
+    CoupledModel,
+    Realisation,
+    propagator,
+    state_output,
+    states_after_constant_inputs,
+)
 from rigd.devices.obstacles import Disturbance, ImpactSpecification, Obstacle
 
 Real = NDArray[np.float64]
@@ -217,7 +223,7 @@ class AttachedObstacles:
 
         # State j substeps after a force of 1 N that acted for one substep.
         decayed_states = np.empty((steps, n, bodies))
-        decayed_states[0] = held_inputs(model, of_force, step_s)
+        decayed_states[0] = states_after_constant_inputs(model, of_force, step_s)
         for j in range(1, steps):
             decayed_states[j] = phi @ decayed_states[j - 1]
         kernel = displacement_rows @ decayed_states

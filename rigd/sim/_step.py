@@ -17,10 +17,10 @@ from rigd.beam.realisation import (
     Realisation,
     RealisationError,
     couple,
-    held_inputs,
     propagator,
     realise,
     state_output,
+    states_after_constant_inputs,
     with_filter,
 )
 from rigd.devices.parameters import RigParameters, Simulation
@@ -283,7 +283,7 @@ def constant_force_effect(
     """
 
     def state_at(instant_s: float) -> Real:
-        return held_inputs(model, of_force, instant_s)
+        return states_after_constant_inputs(model, of_force, instant_s)
 
     end = state_at(period_s)
     return np.vstack(

@@ -14,6 +14,6 @@ from ._scene import Scene as Scene
 from ._session_info import Health as Health
 from ._session_info import Note as Note
 from ._session_info import Subject as Subject
-from ._session_info import band_of as band_of
+from ._session_info import linear_sweep_band_hz as linear_sweep_band_hz
 from ._session_info import outcome_note as outcome_note
-from ._session_info import sweep_of as sweep_of
+from ._session_info import sweep_ticks as sweep_ticks

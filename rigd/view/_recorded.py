@@ -18,9 +18,16 @@ from rigd.text_table import decode_text
 from rigd.units import unit_of
 from rigd.view._layout import blueprint
 from rigd.view._scene import Scene
-from rigd.view._session_info import Health, Note, Subject, band_of, outcome_note, sweep_of
+from rigd.view._session_info import (
+    Health,
+    Note,
+    Subject,
+    linear_sweep_band_hz,
+    outcome_note,
+    sweep_ticks,
+)
 from rigd.view.banner import ended
-from rigd.view.plots import AGES, FAULTY_TICKS, HEALTH, OF_REAL_TIME, TIMELINE
+from rigd.view.plots import AGES, FAULTY_TICKS, HEALTH, REAL_TIME_PLOT_COMPONENTS, TIMELINE
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
@@ -85,7 +92,7 @@ def subject_of_session(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
         ticks=max(end, *(segment_end for _, segment_end in session.segments.values()), 0),
-        sweep=sweep_of({"sweep": (first_tick, end), **session.segments}),
+        sweep=sweep_ticks({"sweep": (first_tick, end), **session.segments}),
         beam=Beam(
             _number_in_range(session, "beam_length_m", 1e-3, 1e3),
             _number_in_range(session, "beam_density_kg_per_m", 1e-6, 1e3),
@@ -96,7 +103,7 @@ def subject_of_session(
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
         excitation=session.metadata.get("excitation", ""),
-        sweep_hz=band_of(session.metadata.get("excitation", ""), session.metadata),
+        sweep_hz=linear_sweep_band_hz(session.metadata.get("excitation", ""), session.metadata),
         back=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
         limits=_stated_limits(attachments[-1]),
@@ -138,7 +145,7 @@ def _components_without_values(session: Session, timings: Records | None) -> fro
     if timings is None or len(timings) == 0:
         components.add(AGES.component)
     if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
-        components |= OF_REAL_TIME
+        components |= REAL_TIME_PLOT_COMPONENTS
     return frozenset(components)
 
 

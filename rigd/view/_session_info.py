@@ -113,7 +113,7 @@ class Subject:
         return sweep_frequency_hz(segments, self.sweep_hz, tick)
 
 
-def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
+def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
     """Return the ticks (first, end) over which the frequency response of a record is estimated.
 
     Parameters
@@ -126,7 +126,9 @@ def sweep_of(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
     return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
 
 
-def band_of(kind: str, parameters: Mapping[str, float | int | str]) -> tuple[float, float] | None:
+def linear_sweep_band_hz(
+    kind: str, parameters: Mapping[str, float | int | str]
+) -> tuple[float, float] | None:
     """Return the frequencies at the start and end of a linear sweep; None for other excitations.
 
     Parameters

@@ -4,7 +4,7 @@ Rerun plots over time only. A two-dimensional view shows a canvas of any size wi
 ratio. Each chart therefore has the size in points of its view in a window of 1280 × 800, and is
 scaled with the view. The size of text does not change with the scale.
 
-`Thinning` reduces the points of a curve without losing its peaks.
+`CurveDecimation` reduces the points of a curve without losing its peaks.
 """
 
 from collections.abc import Sequence
@@ -467,7 +467,7 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Thinning:
+class CurveDecimation:
     """Decimation of a curve that retains the least and greatest value of each group of points.
 
     Attributes
@@ -483,7 +483,7 @@ class Thinning:
     groups: npt.NDArray[np.intp]
 
     @classmethod
-    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "Thinning":
+    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "CurveDecimation":
         """Return the decimation with groups of equal frequency ratio; empty groups are omitted.
 
         Parameters

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from rigd.beam import Beam, Damping, transfer
 from rigd.session.layout import Status
 from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
-from rigd.view.chart import Axis, Chart, LegendEntry, Thinning, decades, steps
+from rigd.view.chart import Axis, Chart, CurveDecimation, LegendEntry, decades, steps
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
@@ -247,7 +247,7 @@ class ResponseCharts:
             "input_delay_s": subject.angle_delay_s,
             "output_delay_s": subject.torque_delay_s,
         }
-        thinning = response_thinning(frequency_hz)
+        thinning = response_decimation(frequency_hz)
         magnitude_strips = thinning.strips(model_db)
         self._models = (
             {
@@ -261,7 +261,7 @@ class ResponseCharts:
         self._last_curves = (
             {} if last is None else _last_response_curves(last, self._response_curves)
         )
-        self._thinning: Thinning | None = None
+        self._thinning: CurveDecimation | None = None
         self._t_ns = 0
         self._last_update: tuple[Real, Complex] | None = None
         self._curves: dict[str, Sequence[Real]] = {}
@@ -314,7 +314,7 @@ class ResponseCharts:
         response = estimate.response.without_delays(**self._delays_s)
         frequency_hz = response.frequency_hz
         if self._thinning is None or self._thinning.grid.size != frequency_hz.size:
-            self._thinning = response_thinning(frequency_hz)
+            self._thinning = response_decimation(frequency_hz)
         is_excited = estimate.excited
         self._t_ns = t_ns
         self._last_update = frequency_hz, np.where(is_excited, response.response, np.nan)
@@ -372,7 +372,7 @@ def _last_response_curves(
     last: LastResponse, response_curves: "Sequence[_ResponseCurve]"
 ) -> dict[str, Sequence[Real]]:
     """Return the curves of an earlier session's response, by the entity path of their chart."""
-    thinning = response_thinning(last.frequency_hz)
+    thinning = response_decimation(last.frequency_hz)
     return {
         response_curve.chart.entity: thinning.strips(response_curve.from_complex(last.response))
         for response_curve in response_curves
@@ -440,7 +440,7 @@ def nominal_response(
     return frequency_hz, transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
 
 
-def response_thinning(frequency_hz: Real) -> Thinning:
+def response_decimation(frequency_hz: Real) -> CurveDecimation:
     """Return the decimation of curves over frequency for the charts.
 
     Parameters
@@ -449,7 +449,7 @@ def response_thinning(frequency_hz: Real) -> Thinning:
         Increasing frequencies of the curves' points, shape (n,). Points outside the band of the
         charts are dropped.
     """
-    return Thinning.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _FREQUENCY_GROUPS)
+    return CurveDecimation.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _FREQUENCY_GROUPS)
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:

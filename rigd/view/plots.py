@@ -293,9 +293,11 @@ DISK = Plot(
     least_span=1.0,
 )
 """Plot of the free disk space."""
-OF_A_BUS: Final = frozenset(plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS))
+BUS_PLOT_COMPONENTS: Final = frozenset(
+    plot.component for plot in (BUS_LOAD, BUS_ERRORS, SENSOR_STATUS)
+)
 """Component names of the plots that have values only with a bus."""
-OF_REAL_TIME: Final = frozenset(plot.component for plot in (LOOP, AGES))
+REAL_TIME_PLOT_COMPONENTS: Final = frozenset(plot.component for plot in (LOOP, AGES))
 """Component names of the plots that have no values with the virtual clock of a simulation."""
 HEALTH = Source("/health", (FAULTY_TICKS, BACKLOG, BUS_LOAD, BUS_ERRORS, SENSOR_STATUS, DISK))
 """Plots of the health readings."""

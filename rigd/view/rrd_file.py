@@ -28,7 +28,7 @@ _OS_ERROR_PATTERN: Final = re.compile(r"os error (\d+)")
 """Pattern of the operating system's error number in messages of Rerun's SDK."""
 
 
-def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
+def without_rerun_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without Rerun's variables, such as ``RERUN=off``."""
     return {
         name: value
@@ -37,13 +37,13 @@ def without_settings(environment: Mapping[str, str]) -> dict[str, str]:
     }
 
 
-def settle_sdk() -> None:
+def prepare_sdk_environment() -> None:
     """Prepare the environment of this process for Rerun's SDK, before the SDK is imported.
 
     Rerun's variables are removed. The SDK's log is switched off, because the callers report a lost
     server or a full disk themselves.
     """
-    for name in os.environ.keys() - without_settings(os.environ).keys():
+    for name in os.environ.keys() - without_rerun_variables(os.environ).keys():
         del os.environ[name]
     os.environ["RUST_LOG"] = "off"
 
@@ -63,7 +63,7 @@ def new_rrd_file(path: Path) -> Iterator["RecordingStream"]:
     RrdFileError
         If the name is in use, or the file cannot be written.
     """
-    settle_sdk()
+    prepare_sdk_environment()
     import rerun as rr
 
     from rigd.session import rename_new

@@ -18,12 +18,12 @@ from aiohttp import web
 
 from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
-from rigd.excitation import FROM_THE_RIG, KINDS
+from rigd.excitation import KINDS, RIG_ARGUMENTS
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.units import UNITS, unit_of
-from rigd.view import Subject, sweep_of
+from rigd.view import Subject, sweep_ticks
 from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_object, refusal_response
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
@@ -240,7 +240,7 @@ class OperatorPageServer:
         """Prepare the frequency responses that the pages show during a new session."""
         plan, rate_hz = series["plan"], self._job["rate_hz"]
         self._nominal_response = self._nominal_message(plan)
-        first, end = sweep_of(plan["segments"])
+        first, end = sweep_ticks(plan["segments"])
         self._shown = self._last_response = None
         self._response = None
         if series["excitation"] != "hold":
@@ -332,7 +332,7 @@ def _excitations() -> Iterator[tuple[str, list[Document]]]:
                 }
                 | ({"text": True} if option.annotation is str else {})
                 for option in signature(function).parameters.values()
-                if option.name not in FROM_THE_RIG
+                if option.name not in RIG_ARGUMENTS
             ],
         )
 

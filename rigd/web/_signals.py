@@ -14,8 +14,8 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
 from rigd.view import Subject
-from rigd.view.chart import Thinning
-from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response, response_thinning
+from rigd.view.chart import CurveDecimation
+from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response, response_decimation
 
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
@@ -153,7 +153,7 @@ class SessionResponse:
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
         self._sweep = SweepResponse(subject, LAST_HZ, every=_BIN_STEP)
-        self._thinning: Thinning | None = None
+        self._thinning: CurveDecimation | None = None
         self._queued_blocks: list[PageSignalBlock] = []
         self._has_new_data = False
         self._reached_hz = 0.0
@@ -198,7 +198,7 @@ class SessionResponse:
         )
         grid = response.frequency_hz
         if self._thinning is None:
-            self._thinning = response_thinning(grid)
+            self._thinning = response_decimation(grid)
         shown = np.where(estimate.excited, response.response, np.nan)
         # The unknown values at both ends of a gap interrupt the line.
         size = np.abs(shown)
@@ -224,7 +224,7 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
         Inertia between sensor and beam.
     """
     grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
-    shown_points = response_thinning(grid).extremes(np.abs(model))
+    shown_points = response_decimation(grid).extremes(np.abs(model))
     return {"type": "nominal", **_response_document(grid[shown_points], model[shown_points])}
 
 

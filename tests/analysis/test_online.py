@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Measurement, freest_alone, select
+from analysis.identify import Measurement, fit_freest_alone, select
 from analysis.online import OnlineEstimate, OnlineEstimator, serve
 from analysis.record import load_record
 from analysis.results import whole_record
@@ -85,7 +85,7 @@ def test_the_last_estimate_is_that_of_the_file(session):
 def test_the_quick_estimate_is_that_of_the_file(session):
     live = fed(session).estimate()
     record = load_record(session.path)
-    told, found, _ = freest_alone(Measurement.of_record(record), record_band_hz(record))
+    told, found, _ = fit_freest_alone(Measurement.of_record(record), record_band_hz(record))
     assert live.headline.parameters == told.parameters
     assert live.headline.modes == told.modes
     assert live.findings == found
@@ -126,7 +126,7 @@ def test_a_fit_that_fails_is_a_problem_of_this_estimate_alone(session, monkeypat
         raise np.linalg.LinAlgError("Singular matrix")
 
     with monkeypatch.context() as patched:
-        patched.setattr("analysis.identify.freest_alone", fails)
+        patched.setattr("analysis.identify.fit_freest_alone", fails)
         estimate = fit.estimate()
     assert estimate.problem.startswith("The record so far cannot be fitted")
     assert "Singular matrix" in estimate.problem

@@ -12,7 +12,7 @@ import pytest
 from processes import eventually, has_ended
 
 from analysis import quick_look
-from analysis.identify import Measurement, freest_alone
+from analysis.identify import Measurement, fit_freest_alone
 from analysis.quick_look import QuickLookError, make_quick_look, write_quick_look
 from analysis.record import load_record
 from analysis.results import whole_record
@@ -211,12 +211,12 @@ def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection
 def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
     measurement = Measurement.of_record(load_record(short_chirps[0]))
     cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
-    told, found, _ = freest_alone(replace(measurement, torque_nm=cubic))
+    told, found, _ = fit_freest_alone(replace(measurement, torque_nm=cubic))
     assert {mode.frequency_hz.flag for mode in told.modes if mode.shown} == {
         "part of the record is unexplained"
     }
     assert found
-    told, found, _ = freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
+    told, found, _ = fit_freest_alone(replace(measurement, torque_nm=-measurement.torque_nm))
     assert {mode.frequency_hz.flag for mode in told.modes} == {"the record contradicts its file"}
     assert [finding.kind for finding in found] == ["sign"]
 

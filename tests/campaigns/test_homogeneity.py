@@ -43,7 +43,7 @@ def test_scatter_by_hand(of_frequencies):
     frequency = found.leading
     assert frequency.quantity == "frequency_hz_1"
     assert frequency.cochran_q == pytest.approx(100.0)
-    assert frequency.own_stds == pytest.approx(math.sqrt(97 / 3))
+    assert frequency.between_std_in_own_stds == pytest.approx(math.sqrt(97 / 3))
     assert frequency.between_std == pytest.approx(0.01 * math.sqrt(97 / 3))
     assert frequency.i_squared == pytest.approx(0.97)
     assert frequency.groups == (("0.mcap", "2.mcap"), ("1.mcap", "3.mcap"))
@@ -190,7 +190,7 @@ def test_the_groups_are_apart_as_their_frequencies_are(mixture, truth):
     assert stiff - soft == pytest.approx(apart_hz, abs=3 * own_hz)
     # Of two equal groups d apart the variance of four is d²/3, nearly all of it between sessions.
     assert frequency.between_std == pytest.approx((stiff - soft) / math.sqrt(3), rel=0.01)
-    assert frequency.own_stds > 10
+    assert frequency.between_std_in_own_stds > 10
 
 
 @pytest.mark.further  # as made by hand above

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from cauchy_residues import modal_constants
 
-from analysis.identify import CONSTANTS, ModalEstimate, ModalModel, Plant
+from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel, Plant
 from analysis.identify.sentences import uniformity
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
@@ -21,7 +21,7 @@ STD = np.tile([3e-5, 2e-3, 1e-3, 1e-3], len(MODES))
 """About those of a record of two minutes."""
 
 UNEVEN = np.zeros(TRUE.size)
-UNEVEN[:: len(CONSTANTS)] = 0.7e-3, -0.3e-3, -0.4e-3
+UNEVEN[:: len(MODE_CONSTANT_NAMES)] = 0.7e-3, -0.3e-3, -0.4e-3
 
 
 @pytest.fixture
@@ -68,7 +68,7 @@ def test_noise_averages_out_and_an_unevenness_does_not(sessions_of, pooled_modal
 
 def test_modes_are_those_of_the_sessions_whatever_the_beam(sessions_of, pooled_modal):
     found = pooled_modal(sessions_of(20, TRUE + UNEVEN, uniformity=0.0))
-    rows = (TRUE + UNEVEN).reshape(-1, len(CONSTANTS))
+    rows = (TRUE + UNEVEN).reshape(-1, len(MODE_CONSTANT_NAMES))
     for mode, (ln_frequency, ln_ratio, *_) in zip(found.modes, rows, strict=True):
         assert mode.source == "modal"
         assert abs(mode.frequency_hz - np.exp(ln_frequency)) < 4 * mode.frequency_std_hz
@@ -107,8 +107,8 @@ def test_the_largest_stated_uniformity_counts_and_is_named(sessions_of, pooled_m
 
 def test_a_mode_that_few_sessions_show_is_left_out(sessions_of, pooled_modal):
     first, *others = sessions_of(4, uniformity=0.0)
-    two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).of_visible())
-    assert two.modal.constants.size == 2 * len(CONSTANTS)
+    two = replace(first, modal=replace(first.modal, numbers=(1, 2, 0)).restrict_to_visible_modes())
+    assert two.modal.constants.size == 2 * len(MODE_CONSTANT_NAMES)
     assert two.modal.joint_covariance.shape == (13, 13)
     found = pooled_modal([two, *others])
     assert found.visible == (1, 2)
@@ -121,7 +121,7 @@ def test_a_mode_that_few_sessions_show_is_left_out(sessions_of, pooled_modal):
 def test_phases_are_pooled_modulo_whole_turns(sessions_of, pooled_modal):
     plain = sessions_of(4, uniformity=0.0)
     turn = np.zeros(TRUE.size)
-    turn[CONSTANTS.index("residue_phase_rad")] = 2 * np.pi
+    turn[MODE_CONSTANT_NAMES.index("residue_phase_rad")] = 2 * np.pi
     modal = plain[2].modal
     turned = replace(plain[2], modal=replace(modal, constants=modal.constants - turn))
     one, other = pooled_modal(plain), pooled_modal([*plain[:2], turned, plain[3]])
@@ -164,7 +164,7 @@ def test_sweeps_of_one_direction_say_nothing_of_changes(sessions_of, verdict_of)
 def test_opposite_sweeps_name_the_mode_that_changed(sessions_of, verdict_of, count):
     """The stiffness of mode 2 falls by 0.4 % after the rising sweep has passed it."""
     later = TRUE.copy()
-    later[len(CONSTANTS)] -= 2e-3
+    later[len(MODE_CONSTANT_NAMES)] -= 2e-3
     every = [*sessions_of(count, **UP), *sessions_of(count, later, first=50, **DOWN)]
     found = verdict_of(every)
     (changed,) = found.sweeps.changed

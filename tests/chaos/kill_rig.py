@@ -31,7 +31,7 @@ from typing import Any
 import numpy as np
 
 from rigd.devices.running_simulator import ask_simulator, find_simulator
-from rigd.safety.limits import OVERLOADED
+from rigd.safety.limits import OVERLOADED_ADVICE
 from rigd.session import read_session
 from rigd.session.layout import Status
 
@@ -441,7 +441,7 @@ class Scene:
             code, said = self._short_session()
             if code == 0:
                 return ", ".join([*steps, "complete"])
-            if OVERLOADED in said and "stalled" not in steps:
+            if OVERLOADED_ADVICE in said and "stalled" not in steps:
                 steps.append("stalled")  # which is said of the computer, not of the rig
             elif "rigd reset" not in said or "reset" in steps:
                 return ", ".join([*steps, f"exit {code}: {_line(said)}"])

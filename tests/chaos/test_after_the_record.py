@@ -48,7 +48,7 @@ def test_a_recorder_alone_knows_a_whole_record(channels, tmp_path, ticks, outcom
     shared_state[StateField.START_UTC_NS] = 10**18
     shared_state[StateField.SCHEDULED] = ticks
     shared_state[StateField.PHASE] = Phase.OFF
-    recorder.finish_orphaned()  # which finds all of it in the rings
+    recorder.close_without_supervisor()  # which finds all of it in the rings
     session = read_session(tmp_path / "alone.mcap")
     assert len(session.samples) == ticks
     assert session.outcome["outcome"] == outcome

@@ -6,7 +6,7 @@ import pytest
 
 from rigd import excitation
 from rigd.cli import run
-from rigd.excitation import FROM_THE_RIG
+from rigd.excitation import RIG_ARGUMENTS
 
 
 @pytest.mark.parametrize(
@@ -27,7 +27,7 @@ def test_defaults_agree(command, function):
         return {
             name.replace("phase_seed", "seed"): parameter.default
             for name, parameter in inspect.signature(thing).parameters.items()
-            if name not in {*FROM_THE_RIG, "path"}  # no file: None here, "" there
+            if name not in {*RIG_ARGUMENTS, "path"}  # no file: None here, "" there
         }
 
     assert defaults(command) == defaults(function)

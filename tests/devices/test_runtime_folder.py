@@ -6,7 +6,7 @@ import tempfile
 
 import pytest
 
-from rigd.runtime import HeldFile
+from rigd.runtime import LockFile
 from rigd.runtime.addresses import UnsafeFolderError, folder_fault, known_folders, runtime_folder
 
 
@@ -55,28 +55,28 @@ def test_a_folder_made_beside_another_user_s_is_found_after_that_one_is_gone(com
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o2770, 0o1777])
 def test_a_folder_that_others_can_write_to_is_refused(runtime_folder, mode):
     folder = runtime_folder / "rigd"
-    held = HeldFile("rig-a", everybody=False)  # before the mode is wrong
+    held = LockFile("rig-a", for_all_users=False)  # before the mode is wrong
     held.acquire("rigd run")
     held.release()
     folder.chmod(mode)
     with pytest.raises(UnsafeFolderError, match=rf"{folder} .*{mode:04o}.*chmod go-w {folder}"):
-        HeldFile("rig-a", everybody=False)
+        LockFile("rig-a", for_all_users=False)
     assert folder_fault(folder, shared=True)
     folder.chmod(0o2750)
     assert not folder_fault(folder)
-    assert HeldFile("rig-a", everybody=False).path.parent == folder
+    assert LockFile("rig-a", for_all_users=False).path.parent == folder
 
 
 def test_a_folder_whose_parent_others_can_write_to_is_refused(runtime_folder):
     runtime_folder.chmod(0o770)
     with pytest.raises(UnsafeFolderError, match=f"{runtime_folder} is writable by its group"):
-        HeldFile("rig-a", everybody=False)
+        LockFile("rig-a", for_all_users=False)
     runtime_folder.chmod(0o1777)  # as /tmp: nobody can replace what is another's
-    assert HeldFile("rig-a", everybody=False).path.parent == runtime_folder / "rigd"
+    assert LockFile("rig-a", for_all_users=False).path.parent == runtime_folder / "rigd"
 
 
 def test_a_lock_follows_no_link(runtime_folder):
-    held = HeldFile("rig-a", everybody=False)
+    held = LockFile("rig-a", for_all_users=False)
     held.path.parent.mkdir(parents=True)
     precious = runtime_folder / "precious"
     precious.write_text("precious")

@@ -39,7 +39,7 @@ def test_what_would_move(rig, stand_in):
 
 
 def test_only_where_nothing_waits_for_the_clock_may_time_be_skipped():
-    assert {each for each in ActuationTarget if each.any_clock} == {
+    assert {each for each in ActuationTarget if each.allows_virtual_clock} == {
         ActuationTarget.SIMULATED,
         ActuationTarget.LOCK_STEP,
     }

@@ -25,7 +25,7 @@ import numpy as np
 from run_viewers import Reading
 
 from rigd.live.address import running
-from rigd.safety.limits import OVERLOADED
+from rigd.safety.limits import OVERLOADED_ADVICE
 from rigd.session import read_session
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -76,7 +76,7 @@ def judge(result: dict[str, object], said: str, *, live: bool) -> Outcome:
     granted = "unknown"
     if "upervis" in reason or "Traceback" in said:
         complaints.append("ended for the supervisor's sake")
-    elif outcome != "complete" and not ("missed ticks" in reason or OVERLOADED in reason):
+    elif outcome != "complete" and not ("missed ticks" in reason or OVERLOADED_ADVICE in reason):
         complaints.append("what ended it does not name the computer")
     if result["path"]:
         session = read_session(str(result["path"]))

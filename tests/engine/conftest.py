@@ -12,7 +12,7 @@ from rigd.engine import shared_memory_fd
 from rigd.engine.channels import DESCRIPTORS, create_channels
 from rigd.engine.control_process import run_control
 from rigd.engine.messages import Finished, SessionJob
-from rigd.engine.reference import put_reference
+from rigd.engine.reference import write_reference
 from rigd.engine.shared_state import Phase, StateField, read_events
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import chirp
@@ -159,7 +159,7 @@ class Session:
     def order(self, excitation=None, seed=1):
         """Order a session: this one's, or one with another excitation."""
         reference_rad = (excitation or self.excitation).reference_rad
-        reference = put_reference(shared_memory_fd(), reference_rad)
+        reference = write_reference(shared_memory_fd(), reference_rad)
         return SessionJob(self.profile, reference, seed=seed)
 
     def obey(self, *orders):

@@ -9,7 +9,7 @@ import pytest
 
 from rigd.control import close_loop
 from rigd.devices.contracts import Devices
-from rigd.engine.cycle import make_watch
+from rigd.engine.cycle import make_limit_monitor
 from rigd.engine.messages import Finished, Tare
 from rigd.engine.shared_state import StateField
 from rigd.engine.timing import VirtualClock
@@ -258,19 +258,19 @@ ON_THE_WIRE = {
 }
 """Rows of docs/faults.md, which are tests of their own."""
 AT_REST = {"tare drift"}
-BY_NAME = {row.name: row for row in INTERLOCKS}
+INTERLOCKS_BY_NAME = {row.name: row for row in INTERLOCKS}
 
 
 def test_every_interlock_has_its_test():
-    assert len(BY_NAME) == len(INTERLOCKS)
-    assert CASES.keys() | ON_THE_WIRE.keys() | AT_REST == BY_NAME.keys()
+    assert len(INTERLOCKS_BY_NAME) == len(INTERLOCKS)
+    assert CASES.keys() | ON_THE_WIRE.keys() | AT_REST == INTERLOCKS_BY_NAME.keys()
     faults = (Path(__file__).parents[2] / "docs" / "faults.md").read_text("utf-8")
     assert all(f"\n| {row} | `" in faults for row in ON_THE_WIRE.values())
 
 
 @pytest.mark.parametrize("name", CASES)
 def test_an_interlock_ends_the_session_without_torque(make_session, name):
-    case, row = CASES[name], BY_NAME[name]
+    case, row = CASES[name], INTERLOCKS_BY_NAME[name]
     session = make_session()
     case.happens(session)
     session.run()
@@ -372,7 +372,7 @@ def test_the_paper_s_chirp_comes_near_no_limit(name):
     profile = load_profile(name)
     excitation = chirp(rate_hz=1000.0)
     response = close_loop(profile.loop_model()).simulate(excitation.reference_rad)
-    watch = make_watch(profile)
+    watch = make_limit_monitor(profile)
     resolution_rad = profile.rig.encoder.resolution_rad
     angles_rad = (response.angle_rad / resolution_rad).round() * resolution_rad
     rest, squares_nm2 = (0.0,) * 5, 0.0

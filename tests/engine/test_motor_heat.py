@@ -7,7 +7,7 @@ from math import exp
 import pytest
 
 from rigd.engine import cycle
-from rigd.engine.cycle import make_watch, recalled_heat_nm2, remember_heat
+from rigd.engine.cycle import make_limit_monitor, store_motor_heat, stored_motor_heat_nm2
 from rigd.engine.messages import Finished
 from rigd.excitation import chirp
 from rigd.profile import load_profile
@@ -37,20 +37,20 @@ def at(monkeypatch):
 
 
 def test_a_motor_cools_down_by_its_time_constant(profile, at):
-    assert recalled_heat_nm2(profile) == 0.0
-    remember_heat(profile, 0.5)
-    assert recalled_heat_nm2(profile) == pytest.approx(0.5)
+    assert stored_motor_heat_nm2(profile) == 0.0
+    store_motor_heat(profile, 0.5)
+    assert stored_motor_heat_nm2(profile) == pytest.approx(0.5)
     at(1007.0)
     time_constant_s = profile.rig.motor.thermal_time_constant_s
-    assert recalled_heat_nm2(profile) == pytest.approx(0.5 * exp(-7.0 / time_constant_s))
-    assert make_watch(profile, 0.25).heat_nm2 == 0.25
+    assert stored_motor_heat_nm2(profile) == pytest.approx(0.5 * exp(-7.0 / time_constant_s))
+    assert make_limit_monitor(profile, 0.25).heat_nm2 == 0.25
 
 
 def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile, at):
-    remember_heat(profile, 1e9)
-    assert recalled_heat_nm2(profile) == profile.rig.motor.peak_torque_nm**2
+    store_motor_heat(profile, 1e9)
+    assert stored_motor_heat_nm2(profile) == profile.rig.motor.peak_torque_nm**2
     at(999.0)
-    assert recalled_heat_nm2(profile) == 0.0
+    assert stored_motor_heat_nm2(profile) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -58,16 +58,16 @@ def test_one_of_before_a_restart_is_cold_and_none_is_warmer_than_can_be(profile,
              '{"heat_nm2": NaN, "boot_s": 1}', '{"heat_nm2": 1, "boot_s": NaN}'],
 )  # fmt: skip
 def test_a_file_that_says_nothing_is_a_cold_motor(profile, heat_file, text):
-    remember_heat(profile, 1.0)
+    store_motor_heat(profile, 1.0)
     heat_file().write_text(text)
-    assert recalled_heat_nm2(profile) == 0.0
+    assert stored_motor_heat_nm2(profile) == 0.0
 
 
 def test_without_a_folder_a_motor_is_cold(profile, monkeypatch, tmp_path):
     (tmp_path / "rigd").touch()
     monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
-    remember_heat(profile, 1.0)
-    assert recalled_heat_nm2(profile) == 0.0
+    store_motor_heat(profile, 1.0)
+    assert stored_motor_heat_nm2(profile) == 0.0
 
 
 @pytest.mark.parametrize("simulated", [False, True])

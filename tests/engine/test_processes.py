@@ -12,7 +12,7 @@ import pytest
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
 from rigd.engine.processes import Child, ChildError
-from rigd.engine.reference import map_reference, put_reference
+from rigd.engine.reference import map_reference, write_reference
 from rigd.profile import load_profile
 from rigd.session.limits import MAX_SAMPLES
 
@@ -29,14 +29,14 @@ def memory():
 def test_a_reference_is_found_where_it_was_placed(memory):
     for ticks in (1000, 10, 3000):  # each session has its own
         reference_rad = np.random.default_rng(ticks).standard_normal(ticks)
-        found = map_reference(put_reference(memory, reference_rad))
+        found = map_reference(write_reference(memory, reference_rad))
         assert len(found) == ticks
         assert type(found[0]) is float
         assert np.array_equal(np.array(found), reference_rad)
 
 
 def test_a_loop_takes_the_longest_session_without_waiting_for_its_bytes(memory):
-    job = SessionJob(load_profile("sim"), put_reference(memory, np.zeros(MAX_SAMPLES)))
+    job = SessionJob(load_profile("sim"), write_reference(memory, np.zeros(MAX_SAMPLES)))
     assert len(encode(job)) < PIPE_BYTES
 
 

@@ -11,12 +11,12 @@ from dataclasses import replace
 import pytest
 
 from rigd.engine.realtime import (
-    NICE,
-    WAKE_UP_US,
-    cores_of,
+    MAX_WAKE_UP_US,
+    SUPERVISION_NICENESS,
     isolated_cores,
     lock_memory,
     page_faults,
+    parse_core_list,
 )
 from rigd.profile import load_profile
 
@@ -130,7 +130,7 @@ def test_deep_idle_states_are_kept_away(machine):
     assert obtained_by_a_process(root=root)[0]["idle_states"].startswith("refused: ")
     bound = machine("dev/cpu_dma_latency", "") / "dev/cpu_dma_latency"
     assert "left within" in obtained_by_a_process(root=root)[0]["idle_states"]
-    assert struct.unpack("=i", bound.read_bytes()) == (WAKE_UP_US,)
+    assert struct.unpack("=i", bound.read_bytes()) == (MAX_WAKE_UP_US,)
 
 
 def test_where_no_idle_state_is_deep_none_is_bounded(machine):
@@ -143,7 +143,7 @@ def test_where_no_idle_state_is_deep_none_is_bounded(machine):
     [("\n", set()), ("3\n", {3}), ("0-2,5", {0, 1, 2, 5}), ("2-3,6-7", {2, 3, 6, 7})],
 )
 def test_lists_of_cores_are_read_as_the_kernel_writes_them(text, cores):
-    assert cores_of(text) == cores
+    assert parse_core_list(text) == cores
 
 
 def test_a_list_that_cannot_be_read_isolates_nothing(machine, tmp_path):
@@ -269,8 +269,10 @@ def test_without_any_right_the_refusal_is_told_and_nothing_changes():
 @ROOT
 def test_where_no_realtime_priority_is_granted_a_nice_value_is_tried():
     told = precedence_of_a_process(before=NICE_ONLY)
-    assert told["obtained"]["scheduling"].startswith(f"nice {NICE} (SCHED_RR refused: ")
-    assert told["with"][:2] == told["thread"][:2] == [os.SCHED_OTHER, NICE]
+    assert told["obtained"]["scheduling"].startswith(
+        f"nice {SUPERVISION_NICENESS} (SCHED_RR refused: "
+    )
+    assert told["with"][:2] == told["thread"][:2] == [os.SCHED_OTHER, SUPERVISION_NICENESS]
     assert told["child"] == [os.SCHED_OTHER, 0]
     assert told["after"] == told["before"]
 

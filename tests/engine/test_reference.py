@@ -18,7 +18,7 @@ from rigd.engine.reference import (
     ReferenceWriter,
     is_whole,
     map_reference,
-    put_reference,
+    write_reference,
 )
 from rigd.engine.shared_state import SharedState, StateField, Stop
 
@@ -39,7 +39,7 @@ def growing(planned=3, room=40):
     shared_state = SharedState.create(shared_memory_fd())
     reference_rad = np.zeros(planned + room)
     reference_rad[:planned] = UNIT_RAD * np.arange(1, planned + 1)
-    spec = put_reference(shared_memory_fd(), reference_rad, planned)
+    spec = write_reference(shared_memory_fd(), reference_rad, planned)
     reader = ReferenceReader(map_reference(spec), planned, shared_state)
     both = InUnits(ReferenceWriter(spec, shared_state), reader)
     return both, both, shared_state
@@ -180,7 +180,7 @@ def test_a_session_follows_pieces_that_come_while_it_runs(make_session):
     begun = np.zeros(400)
     pieces_rad = [0.01 * np.sin(np.linspace(0, 2 * np.pi, 301)) ** 3, np.zeros(100)]
     whole = np.concatenate([begun, np.zeros(2000)])
-    spec = put_reference(shared_memory_fd(), whole, begun.size)
+    spec = write_reference(shared_memory_fd(), whole, begun.size)
     writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
@@ -211,7 +211,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
     monkeypatch.setattr("rigd.engine._session_sequence.SIGN_OF_LIFE_S", 0.1)
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
-    spec = put_reference(shared_memory_fd(), np.zeros(2000), 300)
+    spec = write_reference(shared_memory_fd(), np.zeros(2000), 300)
     writer = ReferenceWriter(spec, session.shared_state)
 
     def plan():
@@ -232,7 +232,7 @@ def test_virtual_time_does_not_stand_still_for_long_where_a_drive_waits_for_sign
 
 def test_a_stop_ends_the_wait_for_a_piece(make_session):
     session = make_session()
-    spec = ReferenceSpec(put_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
+    spec = ReferenceSpec(write_reference(shared_memory_fd(), np.zeros(900)).fd, 900, 300)
     stopping = threading.Timer(
         0.5, lambda: session.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR)
     )

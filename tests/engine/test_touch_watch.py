@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from rigd.engine._touch_watch import TouchWatch
 from rigd.engine.messages import TouchOrder
-from rigd.excitation import Approach, TouchPass, after_touch
+from rigd.excitation import Approach, TouchPass, reference_after_touch
 from rigd.excitation.moves import braking_path, quintic
 from rigd.session.layout import Status
 
@@ -171,7 +171,7 @@ def test_what_follows_a_touch_is_smooth_and_ends_at_the_start(tick, speed, hold)
     approach = Approach((), BRAKING, hold, BACK, 1.0)
     recent = tuple(0.3 + speed * k / RATE_HZ for k in (-2, -1, 0))
     ends = 1000 + BACK.size
-    path = after_touch(approach, ends, tick, recent, -0.2)
+    path = reference_after_touch(approach, ends, tick, recent, -0.2)
     assert path.shape == (ends - tick - 1,)
     assert path[-1] == pytest.approx(-0.2)
     if ends - tick - 1 - BACK.size < 50:

@@ -27,7 +27,7 @@ NOMINAL = {
 }  # fmt: skip
 LENGTH_M = 0.98
 FEW = ("--samples", 0, "--order", 14)
-LOGARITHMIC = ("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2")
+LOGARITHMIC_PARAMETERS = ("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2")
 MODAL = ModalModel(
     (complex(-0.2, 16.0), complex(-0.9, 101.0), complex(-3.0, 282.0)),
     (complex(0.05, -1.9), complex(1.0, -12.0), complex(4.0, -33.0)),
@@ -83,7 +83,11 @@ def exact(values, s):
 
 def document(values=NOMINAL, *, gate="passed", covariance=True, modal=True, **more):
     """Results of one session, as `analyze --json` writes them."""
-    names = [f"ln_{name}" if name in LOGARITHMIC else name for name in NOMINAL if name in values]
+    names = [
+        f"ln_{name}" if name in LOGARITHMIC_PARAMETERS else name
+        for name in NOMINAL
+        if name in values
+    ]
     sizes = [1.0 if name.startswith("ln_") else values[name] for name in names]
     headline = {
         "file": "a.mcap",

@@ -14,7 +14,7 @@ from rigd.excitation.moves import (
     modal_state,
     quintic,
     slew,
-    still_path,
+    vibration_free_path,
 )
 from rigd.identified_beam import MOVE
 
@@ -66,7 +66,7 @@ def test_the_torque_of_a_mode_is_what_the_exact_model_rings_with(plant, ring_dow
 
 @pytest.mark.parametrize("duration_s", [0.5, 0.8, 2.0])
 def test_a_still_path_ends_at_1_and_leaves_nothing(plant, ring_down_nm, duration_s):
-    path = still_path(duration_s, RATE_HZ, plant.poles_rad_s)
+    path = vibration_free_path(duration_s, RATE_HZ, plant.poles_rad_s)
     assert path.size == duration_s * RATE_HZ
     assert path[-1] == pytest.approx(1.0, abs=1e-12)
     assert path[-1] - path[-2] == pytest.approx(0.0, abs=1e-3)
@@ -77,7 +77,7 @@ def test_a_still_path_ends_at_1_and_leaves_nothing(plant, ring_down_nm, duration
 
 
 def test_a_still_path_that_is_too_short_is_the_quintic(plant):
-    path = still_path(0.1, RATE_HZ, plant.poles_rad_s)
+    path = vibration_free_path(0.1, RATE_HZ, plant.poles_rad_s)
     assert np.array_equal(path, quintic(0.1, RATE_HZ))
 
 

@@ -12,7 +12,7 @@ from cases import further
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.devices.contracts import Devices
-from rigd.engine.cycle import Cycle, make_observers, make_watch
+from rigd.engine.cycle import Cycle, make_limit_monitor, make_reading_monitors
 from rigd.identification import with_cautious_controller, with_tuned_controller
 from rigd.identification.estimate import PassReadings, Timing, estimate_motor
 from rigd.identification.experiments import (
@@ -88,8 +88,8 @@ def record(profile, true_rig, scale, excitation):
         scaled,
         rig.sensor.projection,
         PidController(gains, profile.control, rig.rate_hz, motor.peak_torque_nm),
-        make_watch(profile),
-        make_observers(profile, scaled),
+        make_limit_monitor(profile),
+        make_reading_monitors(profile, scaled),
     )
     due = range(0, 10**12, round(1e9 / rig.rate_hz)).__iter__()
     wrenches = []

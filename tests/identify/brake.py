@@ -9,7 +9,7 @@ import numpy as np
 from rigd.beam import clamped_free_eigenvalues, mode_shape
 
 HIGHEST_HZ = 200.0
-HALF_DENSITY = 0.6
+HALF_AIR_DENSITY_KG_PER_M3 = 0.6
 
 
 def driven_speed(angle_rad, rate_hz, beam, damping, x_m):
@@ -65,7 +65,7 @@ def drag_torque(angle_rad, rate_hz, beam, damping, constant_m, slowing=0.0, mode
     def slope(q, v, air):
         speed = air + v @ shapes
         size = np.abs(speed)
-        force = -HALF_DENSITY * (constant_m * size + slowing * np.cbrt(size)) * speed
+        force = -HALF_AIR_DENSITY_KG_PER_M3 * (constant_m * size + slowing * np.cbrt(size)) * speed
         modal = force @ shares
         return (modal - viscous * v - elastic * q) / density, force, modal
 

@@ -279,7 +279,7 @@ def candidates_of():
 @pytest.fixture(scope="session")
 def freest_of():
     """Fit the freest structure alone to a measurement, in the usual band: its candidate set."""
-    return lambda measurement: CandidateSet.of_freest(measurement, (), BAND_HZ)
+    return lambda measurement: CandidateSet.fit_freest_structure(measurement, (), BAND_HZ)
 
 
 @pytest.fixture(scope="session")

@@ -7,8 +7,8 @@ import pytest
 from wrong_models import RIGS, Drag, drags
 
 from analysis.identify import select
-from analysis.identify._drag import damping_ratio_by_drag_law, with_air_drag
-from analysis.identify.drag_torque import HALF_DENSITY
+from analysis.identify._drag import damping_ratio_by_drag_law, refit_with_air_drag
+from analysis.identify.drag_torque import HALF_AIR_DENSITY_KG_PER_M3
 from analysis.models import STRUCTURES
 from rigd.beam import mode_shape
 
@@ -65,10 +65,10 @@ def test_the_beam_beside_the_drag_is_that_without_air(selection, plants, link):
 def test_drag_leaves_noise_only(braked, candidates_of):
     measured = braked.measured(noise_nm=NOISE_NM, seed=61)
     uniform = candidates_of(measured)
-    assert not uniform.all_but_white(uniform.likeliest)
-    found = with_air_drag(uniform)
+    assert not uniform.is_nearly_white(uniform.likeliest)
+    found = refit_with_air_drag(uniform)
     assert abs(found.drag.value_m - DRAG_M) < 3 * found.drag.std_m
-    assert found.all_but_white(found.likeliest)
+    assert found.is_nearly_white(found.likeliest)
     names = [candidate.name for candidate in found.candidates]
     assert sorted(names) == sorted(STRUCTURES)
 
@@ -76,7 +76,7 @@ def test_drag_leaves_noise_only(braked, candidates_of):
 def test_without_drag_nothing_is_fitted_for_it(sessions, candidates_of):
     measured = sessions("VI").measured(noise_nm=NOISE_NM, seed=62)
     field = candidates_of(measured)
-    assert with_air_drag(field) is field
+    assert refit_with_air_drag(field) is field
     assert field.drag is None
 
 
@@ -116,7 +116,7 @@ def test_the_air_takes_as_much_as_linear_damping_of_that_ratio(mode, number, pow
     turn = 2 * np.pi * (np.arange(720) + 0.5) / 720
     shape = mode_shape(mode, x) / mode_shape(mode, 1.0)
     speed = omega * amplitude * np.outer(shape, np.sin(turn))
-    taken = np.mean(HALF_DENSITY * np.abs(speed) ** (power + 1))
+    taken = np.mean(HALF_AIR_DENSITY_KG_PER_M3 * np.abs(speed) ** (power + 1))
     ratio = damping_ratio_by_drag_law(mode, omega, amplitude, density)[number]
     linear = np.mean(2 * ratio * omega * density * speed**2)
     assert taken == pytest.approx(linear, rel=1e-3)

@@ -12,7 +12,7 @@ from cauchy_residues import modal_constants
 
 from analysis.identify import ModalEstimate, ModalModel, Plant
 from analysis.identify._explanations import explanations, finding
-from analysis.identify._step_in_time import Step
+from analysis.identify._step_in_time import StiffnessStep
 from analysis.identify.uniform_beam import uniform_beam_test
 from rigd.beam import Beam, Damping
 
@@ -280,12 +280,12 @@ def test_causes_are_named_and_never_facts():
     assert 2 <= len(found) <= 5
     assert {each.name: each.size for each in found}["tilt"] == pytest.approx(2.0, rel=0.1)
     assert [each.p_value for each in found] == sorted((e.p_value for e in found), reverse=True)
-    said = finding(test, found, Step(25.0, 70.2, -0.0021))
+    said = finding(test, found, StiffnessStep(25.0, 70.2, -0.0021))
     assert (said.kind, said.value, said.interval) == ("rival explanations", None, None)
     assert "an axis 2° off plumb (the tip at rest lower than the axis)" in said.sentence
     assert "a step of the stiffness by about -0.2 % near 70 s" in said.sentence
     assert "None is established by this record" in said.sentence
-    assert "step of" not in finding(test, found, Step(13.0, 70.2, -0.0021)).sentence
+    assert "step of" not in finding(test, found, StiffnessStep(13.0, 70.2, -0.0021)).sentence
     alone = finding(test, found[:1]).sentence
     assert "It is not established by this record" in alone
 

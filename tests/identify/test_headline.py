@@ -7,7 +7,7 @@ import pytest
 
 from analysis.identify.headline import ReportedValue, structures
 from analysis.identify.profile_likelihood import LikelihoodProfile
-from analysis.identify.verdict import NOT_DETERMINED, order_verdict
+from analysis.identify.verdict import ORDER_NOT_DETERMINED_REASON, order_verdict
 from analysis.models import STRUCTURES
 
 ALPHA = LikelihoodProfile(
@@ -33,8 +33,8 @@ class Fitted:
 def test_the_first_flag_stays():
     number = ReportedValue(0.98, 0.01, (0.96, 1.0))
     assert number.flagged(None) is number
-    told = number.flagged(NOT_DETERMINED).flagged("part of the record is unexplained")
-    assert told.flag == NOT_DETERMINED
+    told = number.flagged(ORDER_NOT_DETERMINED_REASON).flagged("part of the record is unexplained")
+    assert told.flag == ORDER_NOT_DETERMINED_REASON
     assert (told.value, told.std, told.interval_95) == (0.98, 0.01, (0.96, 1.0))
 
 

@@ -10,9 +10,9 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Plant, fit_record
-from analysis.identify._hum import hum_near_modes
+from analysis.identify._hum import find_hum_near_modes
 from analysis.identify.free_decay import Pole
-from analysis.identify.noise import noise_of
+from analysis.identify.noise import estimate_noise
 from analysis.models import STRUCTURES
 from rigd.beam import Damping
 
@@ -85,8 +85,10 @@ def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
     comparison = Comparison.of(sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0))
     pole = Pole(3, complex(-2.0, 2 * np.pi * 80), np.zeros(0))
     plant, nothing = Plant(comparison.measurement.beam, Damping()), np.zeros(comparison.samples)
-    noise = noise_of(comparison.spectrum(nothing) + 1.0, comparison.frequency_hz, nothing.size)
-    assert hum_near_modes(comparison, plant, (pole,), noise, nothing) == ()
+    noise = estimate_noise(
+        comparison.spectrum(nothing) + 1.0, comparison.frequency_hz, nothing.size
+    )
+    assert find_hum_near_modes(comparison, plant, (pole,), noise, nothing) == ()
 
 
 @pytest.mark.parametrize("structure", ["II", "VI"])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import freest_alone, select
+from analysis.identify import fit_freest_alone, select
 from analysis.identify._knock import find_impact
 from rigd.beam import PointForceGrid, modes
 
@@ -61,7 +61,7 @@ def told(headline, plants, link):
 )
 def test_a_knock_is_named_with_its_instant(knocked, plants, link, force_n, at_s, duration_s):
     measurement = knocked(force_n, at_s, duration_s=duration_s).measured(NOISE_NM, 1)
-    headline, (finding,), analysis = freest_alone(measurement, BAND_HZ)
+    headline, (finding,), analysis = fit_freest_alone(measurement, BAND_HZ)
     assert finding.kind == "knock"
     low, high = finding.interval
     assert low < at_s + 0.01
@@ -77,7 +77,7 @@ def test_a_knock_is_named_with_its_instant(knocked, plants, link, force_n, at_s,
 def test_a_knock_with_torque_missing(knocked, plants, link):
     missing = np.random.default_rng(2).choice(70_000, 400, replace=False)
     measurement = knocked(1.0, 20.0).measured(NOISE_NM, 1, unknown_torque=missing)
-    headline, found, _ = freest_alone(measurement, BAND_HZ)
+    headline, found, _ = fit_freest_alone(measurement, BAND_HZ)
     assert [each.kind for each in found] == ["knock"]
     assert told(headline, plants, link) < 4
 
@@ -98,6 +98,6 @@ def test_noise_and_a_disturbed_sensor_are_no_knock(plain, freest_of):
         assert find_impact(freest_of(plain.measured(NOISE_NM, seed))) is None
     measurement = plain.measured(NOISE_NM, 1)
     measurement.torque_nm[30_000:30_020] += 5.0
-    _, found, _ = freest_alone(measurement, BAND_HZ)
+    _, found, _ = fit_freest_alone(measurement, BAND_HZ)
     assert found
     assert "knock" not in {each.kind for each in found}

@@ -4,17 +4,17 @@ import numpy as np
 import pytest
 
 from analysis.identify import Comparison, Measurement, Plant
-from analysis.identify._nonlinear import ModalForces, Term
+from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
 
 pytestmark = pytest.mark.fit
 
-MODE_1 = Term("cubic stiffness", 1)
+MODE_1 = NonlinearTerm("cubic stiffness", 1)
 
 
 @pytest.fixture(scope="module")
 def forces(sessions, plants, link):
     comparison = Comparison.of(sessions("III").measured(), (0.0, 50.0))
-    return comparison, ModalForces(comparison, Plant(link, plants["III"]))
+    return comparison, NonlinearForceSpectra(comparison, Plant(link, plants["III"]))
 
 
 def spectrum(comparison, torque_nm):
@@ -34,7 +34,9 @@ def test_a_rise_of_two_percent_is_found_by_substitution(forces, stiffening):
 
 def test_a_delay_delays_the_column(forces, plants, link):
     comparison, modal = forces
-    late = ModalForces(comparison, Plant(link, plants["III"], delay_s=2e-3)).column(MODE_1)
+    late = NonlinearForceSpectra(comparison, Plant(link, plants["III"], delay_s=2e-3)).column(
+        MODE_1
+    )
     turn = np.exp(-2j * np.pi * comparison.frequency_hz * 2e-3)
     assert deviation(late, modal.column(MODE_1) * turn) < 1e-3
 
@@ -51,7 +53,9 @@ def test_which_harmonics_a_force_makes(link, plants, kind, multiples):
     known = np.ones(t.size, dtype=bool)
     measurement = Measurement("m", angle, np.zeros(t.size), 1000.0, link, known, known, 0.0)
     comparison = Comparison.of(measurement, (0.0, 50.0))
-    column = ModalForces(comparison, Plant(link, plants["III"])).column(Term(kind, 1))
+    column = NonlinearForceSpectra(comparison, Plant(link, plants["III"])).column(
+        NonlinearTerm(kind, 1)
+    )
     samples = np.zeros(comparison.samples // 2 + 1, dtype=complex)
     samples[comparison.bins] = column
     late = np.fft.irfft(samples, comparison.samples)[-5000:]  # 40 s: 80 periods
@@ -73,6 +77,6 @@ def test_a_force_too_large_to_substitute_has_no_column(forces):
 def test_a_filter_of_the_torque_filters_the_column(forces, plants, link):
     comparison, modal = forces
     plant = Plant(link, plants["III"], filter_time_constant_s=3e-3)
-    filtered = ModalForces(comparison, plant).column(MODE_1)
+    filtered = NonlinearForceSpectra(comparison, plant).column(MODE_1)
     divisor = 1 + 2j * np.pi * comparison.frequency_hz * 3e-3
     assert deviation(filtered, modal.column(MODE_1) / divisor) < 1e-3

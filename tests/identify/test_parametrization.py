@@ -3,7 +3,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.identify import LOGARITHMIC, SETTINGS, Plant
+from analysis.identify import LOGARITHMIC_PARAMETERS, SETTINGS, Plant
 from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
@@ -29,8 +29,8 @@ def test_derivatives(name, free):
         )
 
     for derivative, logarithmic in (
-        (unknowns.estimates_by_unknowns(x), LOGARITHMIC),
-        (unknowns.plant_and_gradient(x)[1], LOGARITHMIC - {"zeta", "gamma"}),
+        (unknowns.estimates_by_unknowns(x), LOGARITHMIC_PARAMETERS),
+        (unknowns.plant_and_gradient(x)[1], LOGARITHMIC_PARAMETERS - {"zeta", "gamma"}),
     ):
         numeric = np.array(
             [

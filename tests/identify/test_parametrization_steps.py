@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from analysis.identify import SETTINGS, Plant
-from analysis.identify.parametrization import NEXT_TO_NOTHING, Steps, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
@@ -112,7 +112,7 @@ def test_without_a_free_order_steps_are_straight():
 @pytest.mark.parametrize("structure", ["VI", "III"])
 def test_from_next_to_nothing_a_loss_grows_by_what_is_asked_of_it(structure):
     unknowns = Unknowns.of(STRUCTURES[structure], NOMINAL, SETTINGS)
-    steps = Steps.of(unknowns, NEXT_TO_NOTHING)
+    steps = Steps.of(unknowns, VANISHING_LOSS)
     place = unknowns.names.index("zeta")
     x, step = unknowns.vector(NOMINAL), np.zeros(len(unknowns.names))
     # A loss of 1e-8 is to become 1e-5: a step of its logarithm by 999 would end at the upper bound.

@@ -8,10 +8,14 @@ import pytest
 from cases import further
 
 from analysis.identify import Comparison, Measurement, select
-from analysis.identify._channel_checks import clipping_findings, standstill_findings, wrong_scale
+from analysis.identify._channel_checks import (
+    clipping_findings,
+    sign_and_unit_findings,
+    standstill_findings,
+)
 from analysis.identify._leakage import repetition_period_s
-from analysis.identify._time_varying import along_time
-from analysis.identify.headline import MISREAD
+from analysis.identify._time_varying import find_temporal_changes
+from analysis.identify.headline import CONTRADICTED_FILE_REASON
 from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
 
 pytestmark = pytest.mark.fit
@@ -99,11 +103,11 @@ def test_a_rig_that_is_otherwise_has_its_cause_named_and_no_fact(more, ends, wor
 def test_clocks_of_different_rates_are_found_with_their_difference(candidates_of, clock):
     """A positive difference: the torque with a time stamp is that of a later time."""
     uniform = candidates_of(record(clock=clock))
-    with_clock, (change,) = along_time(uniform)
+    with_clock, (change,) = find_temporal_changes(uniform)
     assert change.what == "clock"
     assert abs(change.size - clock) < 3.5 * change.std
     assert change.std < 0.05 * abs(clock)
-    assert with_clock.all_but_white(with_clock.likeliest)
+    assert with_clock.is_nearly_white(with_clock.likeliest)
 
 
 def test_clocks_that_hardly_differ_leave_the_modes_right_and_refuse_the_uniform_beam():
@@ -140,7 +144,7 @@ def test_clocks_that_differ_much_are_named_and_leave_no_number_without_a_flag():
 )
 def test_a_sign_and_a_unit_are_seen_at_once(factor, kinds):
     comparison = Comparison.of(record(factor), (0.0, 50.0))
-    assert [finding.kind for finding in wrong_scale(comparison)] == kinds
+    assert [finding.kind for finding in sign_and_unit_findings(comparison)] == kinds
 
 
 def test_a_wrong_sign_comes_first():
@@ -151,7 +155,7 @@ def test_a_wrong_sign_comes_first():
     assert verdict.experiments == (verdict.findings[0].remedy,)
     assert not verdict.adequate
     quantities = [*told.parameters.values(), *(mode.frequency_hz for mode in told.modes)]
-    assert {each.flag for each in quantities} == {MISREAD}
+    assert {each.flag for each in quantities} == {CONTRADICTED_FILE_REASON}
 
 
 def test_a_clipped_torque_leaves_no_number_without_a_flag():
@@ -196,7 +200,7 @@ def test_a_drifting_zero_is_no_hum():
     assert verdict.adequate
 
 
-def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
+def temporal_change_findings(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
     """Chirp, of a beam that changes by so much from beginning to end: its modes step by step."""
     dt, modes = 1 / (finer * RATE_HZ), 6
     t = np.arange(round(seconds / dt)) * dt
@@ -253,19 +257,19 @@ def changing(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
     torque_nm = torque[::finer] + noise
     return Measurement(
         "x", angle[::finer], torque_nm, RATE_HZ, LINK, known, known, uniformity=0.0,
-        one_sweep=not back,
+        is_single_sweep=not back,
     )  # fmt: skip
 
 
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
-    uniform = candidates_of(changing(damping=0.2))
-    with_change, (change,) = along_time(uniform)
+    uniform = candidates_of(temporal_change_findings(damping=0.2))
+    with_change, (change,) = find_temporal_changes(uniform)
     assert change.what == "damping"
     saved = uniform.bic - with_change.bic
-    again, changes = along_time(uniform, rival_bic=uniform.bic - saved)
+    again, changes = find_temporal_changes(uniform, rival_bic=uniform.bic - saved)
     assert changes == (change,)
     assert again.bic == with_change.bic
-    assert along_time(uniform, rival_bic=uniform.bic - 2 * saved) == (uniform, ())
+    assert find_temporal_changes(uniform, rival_bic=uniform.bic - 2 * saved) == (uniform, ())
 
 
 @pytest.mark.parametrize(
@@ -280,7 +284,7 @@ def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candid
 )
 def test_what_drifts_in_one_sweep_is_no_fact(what, change):
     """Time and frequency vary together there."""
-    selection = select(changing(**{what: change}))
+    selection = select(temporal_change_findings(**{what: change}))
     found = selection.verdict.findings
     assert all(each.interval is None for each in found)
     assert bool(found) == bool(change)
@@ -291,7 +295,7 @@ def test_what_drifts_in_one_sweep_is_no_fact(what, change):
 )
 def test_what_drifts_while_the_motor_sweeps_there_and_back_is_named(what, change):
     """A mode rings for seconds: it does not follow at once what its frequency and decay become."""
-    selection = select(changing(**{what: change}, seconds=40.0, back=True))
+    selection = select(temporal_change_findings(**{what: change}, seconds=40.0, back=True))
     verdict, numbers = selection.verdict, selection.headline.parameters
     found = {finding.kind: finding for finding in verdict.findings}
     assert found.keys() == ({f"drifting {what}"} if change else set())

@@ -8,7 +8,12 @@ import pytest
 from analysis.identify import Plant, ResponseGrid, fit_record
 from analysis.identify.drag_torque import DragLaw, DragResponse
 from analysis.identify.headline import ReportedValue
-from analysis.identify.scales import SCALE_EXPONENTS, density_check, scales_absorbed, with_scales
+from analysis.identify.scales import (
+    SCALE_EXPONENTS,
+    density_check,
+    parameters_compensate_scales,
+    with_scale_uncertainty,
+)
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping
 
@@ -113,7 +118,9 @@ def test_intervals_include_the_scales_in_quadrature():
         "tool_inertia_kg_m2": ReportedValue(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
         "tip_mass_kg": ReportedValue(1e-3, None, None, "the record does not determine it"),
     }
-    found = with_scales(parameters, {"torque_scale": 0.01, "length": 0.002, "density": 0.1})
+    found = with_scale_uncertainty(
+        parameters, {"torque_scale": 0.01, "length": 0.002, "density": 0.1}
+    )
     assert found.keys() == {
         "gamma", "density_over_stiffness", "bending_stiffness_n_m2", "tool_inertia_kg_m2",
     }  # fmt: skip
@@ -131,8 +138,8 @@ def test_intervals_include_the_scales_in_quadrature():
     low, high = found["tool_inertia_kg_m2"].interval_95
     assert low == 0.0
     assert high == pytest.approx(1e-6 + 1.96 * math.hypot(2e-6, 1e-8), rel=1e-4)
-    assert with_scales(parameters, {}) == {}
-    assert with_scales(parameters, {"density": 0.1}) == {}
+    assert with_scale_uncertainty(parameters, {}) == {}
+    assert with_scale_uncertainty(parameters, {"density": 0.1}) == {}
 
 
 @pytest.mark.fit
@@ -150,7 +157,7 @@ def test_intervals_with_scales_hold_the_truth(fits):
         "bending_stiffness_n_m2": LINK.bending_stiffness_n_m2,
         "tool_inertia_kg_m2": 1e-5,
     }
-    found = with_scales(parameters, uncertainty)
+    found = with_scale_uncertainty(parameters, uncertainty)
     assert found.keys() == truth.keys()
     for name, value in truth.items():
         low, high = found[name].interval_95
@@ -166,10 +173,10 @@ def test_what_is_held_fixed_does_not_make_up_for_a_scale(sessions):
     def fixed(*names):
         return fit_record(measurement, [STRUCTURES["III"]], fixed=names).fits[0]
 
-    assert scales_absorbed(fixed())
-    assert scales_absorbed(fixed("delay_s", "tool_inertia_kg_m2"))  # of no inertia
-    assert not scales_absorbed(fixed("bending_stiffness_n_m2"))
-    assert not scales_absorbed(fixed("density_over_stiffness"))
+    assert parameters_compensate_scales(fixed())
+    assert parameters_compensate_scales(fixed("delay_s", "tool_inertia_kg_m2"))  # of no inertia
+    assert not parameters_compensate_scales(fixed("bending_stiffness_n_m2"))
+    assert not parameters_compensate_scales(fixed("density_over_stiffness"))
 
 
 @pytest.mark.fit

@@ -7,7 +7,7 @@ import pytest
 
 from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
-from analysis.identify.verdict import ANOTHER_DAMPING, BIC_TIE
+from analysis.identify.verdict import BIC_TIE, SECOND_DAMPING_REASON
 from analysis.models import STRUCTURES, Structure
 from rigd.beam import Beam, LoadedBeam, clamped_free_eigenvalues
 from rigd.session import Validity
@@ -207,8 +207,8 @@ def test_of_two_modes_one_damping_that_is_enough_tells_no_order(sessions):
     assert verdict.visible_modes == (1, 2)
     assert told.fit.structure.name == "IV"
     for order in (verdict.alpha, verdict.lambda_):
-        assert (order.status, order.reason) == ("not identifiable", ANOTHER_DAMPING)
-    assert told.parameters["zeta"].flag == told.parameters["alpha"].flag == ANOTHER_DAMPING
+        assert (order.status, order.reason) == ("not identifiable", SECOND_DAMPING_REASON)
+    assert told.parameters["zeta"].flag == told.parameters["alpha"].flag == SECOND_DAMPING_REASON
     assert all(each.size.flag for each in told.sizes)
     assert all(mode.damping_ratio.flag is None for mode in told.modes)
     assert any(said.startswith("Internal damping alone would do.") for said in verdict.sentences)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from analysis.identify._data import Decimation, fast_length, fast_length_below, interpolate_gaps
-from analysis.identify.noise import noise_of, smooth_power
+from analysis.identify.noise import estimate_noise, smooth_power
 
 
 def test_gaps_of_a_band_limited_signal_are_closed():
@@ -105,7 +105,7 @@ def white(seed):
 def test_a_hum_is_a_line(hz, amplitude):
     wander = 0.01 * np.sin(2 * np.pi * TIME_S / 40)
     hum = amplitude * np.sin(2 * np.pi * (hz * TIME_S + wander) + 1)
-    noise = noise_of(spectrum(white(6) + hum), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
+    noise = estimate_noise(spectrum(white(6) + hum), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
     (line,) = noise.lines
     assert line.frequency_hz == pytest.approx(hz, abs=0.003)
     assert line.amplitude_nm == pytest.approx(amplitude, rel=0.06)
@@ -119,7 +119,9 @@ def test_a_hum_is_a_line(hz, amplitude):
 def test_what_comes_and_goes_is_no_line():
     decay = np.where(TIME_S > 40, np.exp(-0.5 * np.maximum(TIME_S - 40, 0)), 0)
     passing = decay * np.sin(2 * np.pi * 16 * TIME_S)
-    noise = noise_of(spectrum(white(7) + 0.2 * passing), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
+    noise = estimate_noise(
+        spectrum(white(7) + 0.2 * passing), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE
+    )
     assert noise.lines == ()
     assert noise.counts.all()
     assert np.abs(spectrum(0.2 * passing)).max() ** 2 > 100 * np.median(noise.power)
@@ -127,20 +129,20 @@ def test_what_comes_and_goes_is_no_line():
 
 def test_white_noise_has_no_lines():
     for seed in range(20):
-        noise = noise_of(spectrum(white(seed)), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
+        noise = estimate_noise(spectrum(white(seed)), FREQUENCY_HZ, SAMPLES, near_mode=NOWHERE)
         assert noise.lines == ()
         assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 
 def test_what_is_not_known_is_no_less_noise():
     half = np.where(np.arange(SAMPLES) % 2 == 0, white(3), 0)
-    noise = noise_of(spectrum(half), FREQUENCY_HZ, SAMPLES, known_fraction=0.5)
+    noise = estimate_noise(spectrum(half), FREQUENCY_HZ, SAMPLES, known_fraction=0.5)
     assert np.mean(noise.power) == pytest.approx(SAMPLES * 4e-3**2, rel=0.06)
 
 
 def test_a_resonance_is_never_left_out():
     hum = spectrum(white(6) + 0.02 * np.sin(2 * np.pi * 16.7 * TIME_S))
     for near_mode in (None, np.abs(FREQUENCY_HZ - 16.6) < 0.2):
-        noise = noise_of(hum, FREQUENCY_HZ, SAMPLES, near_mode=near_mode)
+        noise = estimate_noise(hum, FREQUENCY_HZ, SAMPLES, near_mode=near_mode)
         assert noise.lines == ()
         assert noise.counts.all()

@@ -7,7 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._step_in_time import step_score
+from analysis.identify._step_in_time import best_stiffness_step
 from rigd.beam import clamped_free_eigenvalues
 
 pytestmark = pytest.mark.fit
@@ -52,7 +52,7 @@ def _score(field):
     starts = [(m.number, m.frequency_hz, m.damping_ratio) for m in field.likeliest.modes]
     fit = fit_modes(field.comparison, field.noise, starts, field.columns)
     assert fit.visible == (1, 2, 3)
-    return step_score(field.comparison, fit)
+    return best_stiffness_step(field.comparison, fit)
 
 
 def test_step_of_the_stiffness_is_found(score_of, sessions, plants, link):

@@ -5,7 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.paper import band_limited, loudest_moment_s, modelled_torque
+from analysis.paper import band_limited, largest_oscillation_time_s, modelled_torque
 from rigd.beam import Beam, Damping, transfer
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -77,5 +77,5 @@ def test_the_loudest_moment_is_where_the_burst_is(centre_s):
     t = np.arange(10_000) / 1000
     burst = np.exp(-(((t - centre_s) / 0.5) ** 2)) * np.sin(2 * np.pi * 16 * t)
     louder_elsewhere = 5 * np.exp(-(((t - 5.0) / 0.5) ** 2)) * np.sin(2 * np.pi * 60 * t)
-    found_s = loudest_moment_s(burst + louder_elsewhere, 1000.0, 16.0)
+    found_s = largest_oscillation_time_s(burst + louder_elsewhere, 1000.0, 16.0)
     assert found_s == pytest.approx(centre_s, abs=0.1)

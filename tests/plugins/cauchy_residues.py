@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import CONSTANTS, Plant, ResponseGrid
+from analysis.identify import MODE_CONSTANT_NAMES, Plant, ResponseGrid
 from analysis.identify.free_decay import mode_poles
 
 _CIRCLE = np.exp(2j * np.pi * np.arange(8) / 8)
@@ -14,7 +14,7 @@ _RADIUS = 0.2
 
 
 def modal_constants(plant: Plant, modes: Sequence[int]) -> NDArray[np.float64]:
-    """`CONSTANTS` of some modes of a plant in turn, shape (4 n,); NaN where a mode has no pole.
+    """Constants of some modes of a plant in turn, shape (4 n,); NaN where a mode has no pole.
 
     A residue is the mean over a circle round its pole (Cauchy's integral): exact for any ends and
     instruments that the response knows.
@@ -26,7 +26,7 @@ def modal_constants(plant: Plant, modes: Sequence[int]) -> NDArray[np.float64]:
     """
     found = {pole.mode: pole.at_rad_s for pole in mode_poles(plant, max(modes), ())}
     if not all(mode in found and found[mode].imag > 0 for mode in modes):
-        return np.full(len(CONSTANTS) * len(modes), np.nan)
+        return np.full(len(MODE_CONSTANT_NAMES) * len(modes), np.nan)
     poles = np.array([found[mode] for mode in modes])
     turns = (_RADIUS * np.abs(poles.real) + 1e-9 * np.abs(poles))[:, None] * _CIRCLE
     response = ResponseGrid((poles[:, None] + turns).ravel()).evaluate(plant)[0]

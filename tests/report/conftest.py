@@ -6,7 +6,7 @@ import pytest
 from rich.console import Console
 
 from analysis.identify import Candidate, Measurement, Selection, fit_record
-from analysis.identify.headline import of_fit
+from analysis.identify.headline import headline_of_fit
 from analysis.identify.verdict import OrderVerdict, Verdict
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper import analyse
@@ -53,7 +53,7 @@ def record_result(make_signals, write_session, tmp_path_factory):
             "Both orders are fractional.", "Less than noise <b> remains.",
             experiments=("Sweep round mode 1 & 2.",),
         ),
-        of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
+        headline_of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
         tuple(sorted(candidates, key=lambda each: each.bic)),
         analysis,
     )  # fmt: skip

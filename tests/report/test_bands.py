@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import LOGARITHMIC
+from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.report.bands import loss_factors, response_band
 from rigd.beam import Beam, Damping, transfer
 
@@ -22,12 +22,12 @@ def fit(record_result):
 def drawn(fit, draws):
     """Parameters as the covariance says, by name, shape (draws,) each."""
     mean = [
-        np.log(fit.parameters[name]) if name in LOGARITHMIC else fit.parameters[name]
+        np.log(fit.parameters[name]) if name in LOGARITHMIC_PARAMETERS else fit.parameters[name]
         for name in fit.determined
     ]
     found = np.random.default_rng(1).multivariate_normal(mean, fit.covariance, draws).T
     return {name: np.full(draws, value) for name, value in fit.parameters.items()} | {
-        name: np.exp(values) if name in LOGARITHMIC else values
+        name: np.exp(values) if name in LOGARITHMIC_PARAMETERS else values
         for name, values in zip(fit.determined, found, strict=True)
     }
 

@@ -45,7 +45,7 @@ def count(image, colour):
     ],
 )
 def test_a_figure_shows_its_lines(paper_analysis, tmp_path, draw, colours):
-    with style.styled():
+    with style.figure_style():
         image = pixels(draw(paper_analysis), tmp_path / "a.png")
     height, width, _ = image.shape
     assert 1000 <= width <= 3000
@@ -68,7 +68,7 @@ def test_colours_tell_what_they_show(paper_analysis, tmp_path):
         models=fits,
         settings=replace(paper_analysis.settings, weightings=("const",)),
     )
-    with style.styled():
+    with style.figure_style():
         image = pixels(frf_figure(alone), tmp_path / "a.png")
     assert count(image, style.BLUE) > 1500
     assert count(image, style.VERMILION) == 0
@@ -76,7 +76,7 @@ def test_colours_tell_what_they_show(paper_analysis, tmp_path):
 
 @pytest.mark.fit
 def test_one_panel_a_type(paper_analysis):
-    with style.styled():
+    with style.figure_style():
         figure = frf_figure(paper_analysis)
     titles = [axes.get_title(loc="left") for axes in figure.axes]
     panels = [t.split()[:3] for t in titles if "Type" in t]
@@ -103,7 +103,7 @@ def test_any_choice_of_types_and_weightings_can_be_drawn(
     paper_file, tmp_path, types, weightings, estimator
 ):
     settings = WelchSettings(estimator=estimator, types=types, weightings=weightings)
-    with style.styled():
+    with style.figure_style():
         figure = frf_figure(analyse(load_record(paper_file), settings))
     assert pixels(figure, tmp_path / "a.png").std() > 10
     assert len(figure.legends[0].get_texts()) == len(weightings) + (1 if estimator == "fft" else 2)
@@ -112,7 +112,7 @@ def test_any_choice_of_types_and_weightings_can_be_drawn(
 @pytest.mark.fit
 def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
     assert best_model(paper_analysis).fit.structure.name == "VI"
-    with style.styled():
+    with style.figure_style():
         figure = torque_figure(paper_analysis)
     measured, modelled = (line.get_ydata() for line in figure.axes[0].get_lines()[:2])
     assert np.abs(measured).max() == pytest.approx(np.abs(modelled).max(), rel=0.1)
@@ -123,7 +123,7 @@ def test_the_torque_of_the_true_structure_is_followed(paper_analysis):
 @pytest.mark.fit
 @pytest.mark.parametrize("draw", [paper_signals_figure, frf_figure, torque_figure])
 def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
-    with style.styled():
+    with style.figure_style():
         figure = draw(paper_analysis)
     words = [text.get_text() for text in figure.findobj(Text)]
     assert not [each for each in words if paper_analysis.record.path.stem in each]
@@ -135,7 +135,7 @@ def test_no_figure_has_the_name_of_a_file(paper_analysis, draw):
 )
 def test_a_figure_is_the_same_each_time_in_every_format(tmp_path, kind, start):
     def drawn(name):
-        with style.styled():
+        with style.figure_style():
             figure = style.new_figure(4.0, 3.0, "Title µ ζ", "and more")
             figure.add_subplot().plot([1.0, 2.0])
             return style.save(figure, tmp_path / f"{name}.{kind}")
@@ -150,7 +150,7 @@ def test_a_figure_is_the_same_each_time_in_every_format(tmp_path, kind, start):
 
 
 def test_a_picture_is_written_in_the_formats_asked_for(tmp_path):
-    with style.styled():
+    with style.figure_style():
         picture = style.save_picture(
             style.new_figure(4.0, 3.0), tmp_path / "v1.0", "A figure.", ("pdf",)
         )
@@ -166,13 +166,13 @@ def test_a_figure_stands_in_the_page_as_svg_unless_that_is_far_larger():
 
 
 def test_a_title_that_is_no_text_is_no_obstacle(tmp_path):
-    with style.styled():
+    with style.figure_style():
         style.save(style.new_figure(6.0, 4.0, "caf\udce9.mcap", "—"), tmp_path / "a.png")
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_long_name_and_many_words_fit(tmp_path):
-    with style.styled():
+    with style.figure_style():
         image = pixels(style.new_figure(10, 3, "name" * 60, "many words " * 30), tmp_path / "a.png")
     assert image[:, :20].min() == image[:, -20:].min() == 255
     assert (image[:100, 20:-20].min(axis=(0, 2)) < 200).mean() > 0.6
@@ -198,7 +198,7 @@ def test_an_envelope_keeps_extremes_and_bounds_the_points():
 def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
     target = tmp_path / "a.png"
     target.write_bytes(b"mine")
-    with style.styled(), pytest.raises(OutputExistsError):
+    with style.figure_style(), pytest.raises(OutputExistsError):
         style.save(style.new_figure(4, 3, "a", "b"), target)
     assert target.read_bytes() == b"mine"
 
@@ -207,7 +207,7 @@ def test_a_picture_is_never_overwritten(paper_analysis, tmp_path):
 @pytest.mark.parametrize("height_in", [0.5, 3.0])
 def test_labels_of_a_logarithmic_axis_stand_apart(span, height_in):
     """The width of a band is drawn in half an inch, where 1, 2 and 5 of two decades overlap."""
-    with style.styled():
+    with style.figure_style():
         figure = style.new_figure(8.0, 4.0)
         axes = figure.add_axes((0.1, 0.1, 0.8, height_in / 4.0))
         plain_logarithmic(axes, 0.3, 0.3 * span)
@@ -252,7 +252,7 @@ def test_each_mode_has_a_stretch_round_the_moment_the_chirp_passes_it(paper_anal
 @pytest.mark.fit
 @pytest.mark.parametrize("draw", [paper_signals_figure, torque_figure])
 def test_marks_have_the_numbers_and_the_extent_of_the_enlargements(paper_analysis, draw):
-    with style.styled():
+    with style.figure_style():
         figure = draw(paper_analysis)
     whole = figure.axes[0]
     assert [text.get_text() for text in whole.texts] == ["1", "2", "3"]

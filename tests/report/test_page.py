@@ -15,7 +15,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.headline import ConditionalEstimate, of_fit
+from analysis.identify.headline import ConditionalEstimate, headline_of_fit
 from analysis.report import FIGURES, document, illustrations
 from analysis.report.folder import OutputExistsError
 from analysis.report.record_report import record_page, report_tables, write_report
@@ -258,7 +258,7 @@ def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold)
     reason = "the record does not determine the order"
     careful = retold(
         record_result,
-        headline=of_fit("VI", record_result.whole.fit, (1, 2, 3), {"alpha": reason}),
+        headline=headline_of_fit("VI", record_result.whole.fit, (1, 2, 3), {"alpha": reason}),
         verdict=replace(record_result.whole.verdict, sentences=("Nothing is sure.",)),
     )
     modes, tables, _ = report_tables(careful)
@@ -274,16 +274,20 @@ def test_orders_that_the_data_do_not_support_are_not_told(record_result, retold)
 
 def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result, page_of):
     fit = record_result.whole.fits["VII"]
-    flagged = of_fit("VII", fit, (1, 2, 3), {"alpha": "the record does not determine the order"})
+    flagged = headline_of_fit(
+        "VII", fit, (1, 2, 3), {"alpha": "the record does not determine the order"}
+    )
     told = page_of(flagged)
     assert "internal damping" not in told
     assert "The external damping has a loss factor of" in told
-    known = page_of(of_fit("VII", fit, (1, 2, 3)))
+    known = page_of(headline_of_fit("VII", fit, (1, 2, 3)))
     assert "of the fixed order α\u00a0=\u00a01." in known
 
 
 def test_what_is_unexplained_makes_every_number_a_condition(record_result, retold, page_of):
-    spoilt = of_fit("VI", record_result.whole.fit, (1, 2, 3), unexplained="part is unexplained")
+    spoilt = headline_of_fit(
+        "VI", record_result.whole.fit, (1, 2, 3), unexplained="part is unexplained"
+    )
     told = page_of(spoilt).partition("the antenna's damping ratio would be ")[2]
     assert told
     assert "(" not in told[:60]  # no interval
@@ -295,7 +299,7 @@ def test_what_is_unexplained_makes_every_number_a_condition(record_result, retol
 
 
 def test_a_simpler_structure_stands_beside_the_freest(record_result, retold):
-    taken = of_fit("VII", record_result.whole.fits["VII"], (1, 2, 3)).parameters
+    taken = headline_of_fit("VII", record_result.whole.fits["VII"], (1, 2, 3)).parameters
     simpler = ConditionalEstimate("VII", {"alpha": 1.0}, taken)
     told = replace(record_result.whole.headline, simpler=simpler)
     _modes, tables, _ = report_tables(retold(record_result, headline=told))

@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify.headline import MISREAD, of_fit
+from analysis.identify.headline import CONTRADICTED_FILE_REASON, headline_of_fit
 from analysis.models import STRUCTURES
 from analysis.report import document, illustrations, result_text
 from analysis.report.bands import excited_band_hz, supported_band_hz
@@ -30,7 +30,9 @@ REASON = "order 1 on another beam explains as much"
 def careful(record_result, retold):
     """Type VI whose alpha the data do not support, on a record that shows two modes."""
     order = SimpleNamespace(order="alpha", status="open", value=1.05, interval=(0.9, 1.2))
-    told = of_fit("VI", record_result.whole.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)})
+    told = headline_of_fit(
+        "VI", record_result.whole.fit, (1, 2), {"alpha": REASON}, {"alpha": (0.9, 1.2)}
+    )
     verdict = replace(record_result.whole.verdict, alpha=order)
     return retold(record_result, headline=told, verdict=verdict)
 
@@ -151,10 +153,10 @@ def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
     told = verdict(careful)
     assert "at 2.57 Hz and" in told
     assert "44.8" not in told
-    none = of_fit("VI", careful.whole.fit, ())
+    none = headline_of_fit("VI", careful.whole.fit, ())
     assert "damping ratio is" in told
     assert "damping ratio" not in verdict(retold(careful, headline=none))
-    misread = careful.whole.headline.doubted(MISREAD)
+    misread = careful.whole.headline.doubted(CONTRADICTED_FILE_REASON)
     assert "damping ratio" not in verdict(retold(careful, headline=misread))
 
 
@@ -179,7 +181,9 @@ def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_resu
 
 
 def test_one_mode_has_a_point_and_no_curve(careful, retold):
-    one = retold(careful, headline=of_fit("VI", careful.whole.fit, (1,), {"alpha": REASON}))
+    one = retold(
+        careful, headline=headline_of_fit("VI", careful.whole.fit, (1,), {"alpha": REASON})
+    )
     assert supported_band_hz(one.whole) is None
     axes, _ = loss_axes(one)
     (point,) = {float(x) for line in axes.get_lines() for x in line.get_xdata()}

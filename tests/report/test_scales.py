@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify.scales import with_scales
+from analysis.identify.scales import with_scale_uncertainty
 from analysis.report import document
 from analysis.report.record_report import report_tables
 from analysis.results import RecordResult
@@ -55,7 +55,7 @@ def test_stated_uncertainties_stand_beside_the_statistical_intervals(stated):
     whole = stated(**ALL)
     table = parameters_table(whole)
     rows = {row["parameter"].text: row for row in table.rows}
-    combined = with_scales(whole.headline.parameters, ALL)
+    combined = with_scale_uncertainty(whole.headline.parameters, ALL)
     stiffness = combined["bending_stiffness_n_m2"]
     ends = rows["EI"]["combined_low_95"].value, rows["EI"]["combined_high_95"].value
     assert ends == stiffness.interval_95

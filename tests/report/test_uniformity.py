@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from analysis.identify import CONSTANTS, Measurement, ModalModel, select
+from analysis.identify import MODE_CONSTANT_NAMES, Measurement, ModalModel, select
 from analysis.report import FIGURES, ShownModel, document, illustrations, result_text
 from analysis.report.bands import loss_estimate, modal_response_band
 from analysis.report.record_report import record_page, report_tables, uniformity_tables
@@ -50,7 +50,7 @@ def drawn(result):
 def model_of(constants, background):
     """Modal model of its real constants."""
     poles, residues = [], []
-    for ln_hz, ln_ratio, ln_residue, phase in constants.reshape(-1, len(CONSTANTS)):
+    for ln_hz, ln_ratio, ln_residue, phase in constants.reshape(-1, len(MODE_CONSTANT_NAMES)):
         omega, ratio = 2 * np.pi * np.exp(ln_hz), np.exp(ln_ratio)
         poles.append(omega * (1j - ratio / np.sqrt(1 - ratio**2)))
         residues.append(1j * np.exp(ln_residue + 1j * phase))
@@ -122,8 +122,8 @@ def test_constants_are_compared_with_those_of_a_uniform_beam(modal_result):
     assert np.abs(away).max() < 4
     figure = drawn(modal_result)["uniform_beam"]
     axes = figure.figure.axes
-    assert len(axes) == 2 * len(CONSTANTS)
-    for column, name in enumerate(CONSTANTS):
+    assert len(axes) == 2 * len(MODE_CONSTANT_NAMES)
+    for column, name in enumerate(MODE_CONSTANT_NAMES):
         (points,) = [line for line in axes[2 * column].get_lines() if line.get_marker() == "o"]
         of_name = [row for row in constants.rows if row["constant"].value == name]
         np.testing.assert_allclose(
@@ -153,7 +153,7 @@ def test_the_page_has_a_section_on_the_uniformity(modal_result, page):
 
 def test_a_turn_of_a_phase_is_no_deviation(modal_result, retold):
     headline = modal_result.whole.headline
-    at = CONSTANTS.index("residue_phase_rad")
+    at = MODE_CONSTANT_NAMES.index("residue_phase_rad")
     measured = headline.uniform_beam.measured.copy()
     measured[at] += 2 * np.pi
     test = replace(headline.uniform_beam, measured=measured)

@@ -8,7 +8,7 @@ import pytest
 from rigd.beam import modes
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
-from rigd.engine.reference import ReferenceWriter, put_reference
+from rigd.engine.reference import ReferenceWriter, write_reference
 from rigd.engine.shared_state import SharedState, StateField
 from rigd.excitation import ExcitationError, PrecisionForecast, Segment, until
 from rigd.excitation.targets import Precision, parse_target
@@ -88,7 +88,7 @@ class Bench:
             rate_hz=RATE_HZ, targets=targets, at_most_s=at_most_s, rig=RigPreview(profile)
         )
         planned = excitation.search.planned_ticks
-        spec = put_reference(shared_memory_fd(), excitation.reference_rad, planned)
+        spec = write_reference(shared_memory_fd(), excitation.reference_rad, planned)
         self.shared_state = SharedState.create(shared_memory_fd())
         self.writer = ReferenceWriter(spec, self.shared_state)
         self.search = ExcitationPlanner(excitation.search, profile, self.writer)

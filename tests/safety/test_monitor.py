@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from rigd.engine.cycle import make_watch
+from rigd.engine.cycle import make_limit_monitor
 from rigd.excitation import hold
 from rigd.profile import load_profile
 from rigd.runner import Series
@@ -25,7 +25,7 @@ PERIOD_NS = 1_000_000
 
 @pytest.fixture
 def watch():
-    return make_watch(PROFILE)
+    return make_limit_monitor(PROFILE)
 
 
 def follow(watch, angles_rad):
@@ -64,7 +64,7 @@ def test_a_slip_in_motion_is_found_where_no_limit_of_speed_would(watch):
 )
 def test_late_ticks_are_no_jumps(speed_rad_s, frequency_hz, lateness, phase):
     """A shaft at up to the chirp's speed, latched late by up to 0.8 of a period."""
-    watch = make_watch(replace(PROFILE, limits=replace(LIMITS, velocity_rad_s=100.0)))
+    watch = make_limit_monitor(replace(PROFILE, limits=replace(LIMITS, velocity_rad_s=100.0)))
     omega = min(2 * math.pi * frequency_hz, 900.0 / max(speed_rad_s, 1e-3))
     late_s = np.array(lateness) * 1e-3
     t_s = np.arange(50) * 1e-3 + late_s
@@ -223,7 +223,7 @@ def test_a_session_that_would_fill_the_disk_is_refused(tmp_path, monkeypatch):
         Series(PROFILE, excitation, tmp_path / "sessions")
 
 
-OVERLOADED = "The computer is overloaded: close other programs."
+OVERLOADED_ADVICE = "The computer is overloaded: close other programs."
 
 
 def left_behind(watch):
@@ -236,7 +236,7 @@ def test_what_a_limit_finds_right_after_a_standstill_is_the_computers_doing(watc
     watch.reset(0.0)
     assert watch.check_missed(20, 20, 1000) is None
     said = left_behind(watch)
-    assert said.endswith(f"It came after 20 missed ticks. {OVERLOADED}")
+    assert said.endswith(f"It came after 20 missed ticks. {OVERLOADED_ADVICE}")
     assert "amplitude" not in said
 
 
@@ -244,7 +244,7 @@ def test_missed_ticks_of_several_gaps_are_told_together(watch):
     watch.skip(4)
     assert watch.after_missed == "It came after 4 missed ticks."
     watch.skip(5)
-    assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED}"
+    assert watch.after_missed == f"It came after 9 missed ticks. {OVERLOADED_ADVICE}"
 
 
 def test_a_tick_or_two_do_not_acquit_the_beam(watch):
@@ -252,7 +252,7 @@ def test_a_tick_or_two_do_not_acquit_the_beam(watch):
     said = left_behind(watch)
     assert "It came after 1 missed tick." in said
     assert "lower the amplitude" in said
-    assert OVERLOADED not in said
+    assert OVERLOADED_ADVICE not in said
 
 
 def test_missed_ticks_are_forgotten_after_two_looks(watch):

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.view import Gauge, Health, Note, Scene, sweep_of
+from rigd.view import Gauge, Health, Note, Scene, sweep_ticks
 from rigd.view.banner import (
     GAUGES_ENTITY,
     RUNNING,
@@ -87,7 +87,7 @@ def test_a_sweep_there_and_back_has_a_frequency_on_both_ways(sweep):
     said = banner(both, RUNNING, 181_000_000_000, Health())
     assert "0 → 50 → 0 Hz, now **25 Hz**" in said
     segments = {"sweep": (1000, 241_000), "there": (1000, 121_000), "back": (121_000, 241_000)}
-    assert sweep_of(segments) == (1000, 121_000)
+    assert sweep_ticks(segments) == (1000, 121_000)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_plots_show_a_window_up_to_the_cursor(time_series):
 
 
 def test_plots_of_which_nothing_comes_are_left_out(subject, layout_of):
-    absent = plots.OF_A_BUS | plots.OF_REAL_TIME
+    absent = plots.BUS_PLOT_COMPONENTS | plots.REAL_TIME_PLOT_COMPONENTS
     health = {
         view.name
         for tab in layout_of(replace(subject, absent=absent)).contents

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view.chart import Thinning
+from rigd.view.chart import CurveDecimation
 
 GRID = np.arange(9601) / 160.0
 
@@ -19,7 +19,7 @@ def test_no_extreme_is_lost_and_none_is_made_up(seed, groups, unknown):
     rng = np.random.default_rng(seed)
     values = rng.normal(size=GRID.size)
     values[rng.random(GRID.size) < unknown] = np.nan
-    thinning = Thinning.logarithmic(GRID, 0.5, 60.0, groups)
+    thinning = CurveDecimation.logarithmic(GRID, 0.5, 60.0, groups)
     strips = thinning.strips(values)
     points = np.concatenate(strips) if strips else np.empty((0, 2))
     assert len(points) <= 2 * groups
@@ -37,7 +37,7 @@ def test_no_extreme_is_lost_and_none_is_made_up(seed, groups, unknown):
 def test_every_local_peak_wider_than_a_group_survives():
     peaks_hz = np.geomspace(0.6, 55.0, 12)
     values = sum(np.exp(-(((GRID - peak) / (0.02 * peak)) ** 2)) for peak in peaks_hz)
-    points = np.concatenate(Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(values))
+    points = np.concatenate(CurveDecimation.logarithmic(GRID, 0.5, 60.0, 200).strips(values))
     for peak_hz in peaks_hz:
         near = abs(points[:, 0] - peak_hz) < 0.02 * peak_hz
         near_all = abs(GRID - peak_hz) < 0.02 * peak_hz
@@ -47,10 +47,10 @@ def test_every_local_peak_wider_than_a_group_survives():
 def test_a_curve_is_broken_where_it_is_not_known():
     values = np.zeros(GRID.size)
     values[(GRID > 5.0) & (GRID < 10.0)] = np.nan
-    below, above = Thinning.logarithmic(GRID, 0.5, 60.0, 200).strips(values)
+    below, above = CurveDecimation.logarithmic(GRID, 0.5, 60.0, 200).strips(values)
     assert below[-1, 0] <= 5.0
     assert above[0, 0] >= 10.0
-    thinning = Thinning.logarithmic(GRID, 0.5, 60.0, 200)
+    thinning = CurveDecimation.logarithmic(GRID, 0.5, 60.0, 200)
     assert thinning.strips(np.full(GRID.size, np.nan)) == []
     first, last = GRID[thinning.gaps(values)]
     assert np.isnan(values[thinning.gaps(values)]).all()
@@ -64,6 +64,6 @@ def test_a_curve_is_broken_where_it_is_not_known():
 @pytest.mark.parametrize("grid", [[], [0.1, 0.2]])
 def test_of_a_curve_outside_the_band_nothing_is_left(grid):
     grid = np.array(grid)
-    thinning = Thinning.logarithmic(grid, 0.5, 60.0, 200)
+    thinning = CurveDecimation.logarithmic(grid, 0.5, 60.0, 200)
     assert thinning.extremes(np.ones(grid.size)).size == 0
     assert thinning.strips(np.ones(grid.size)) == []

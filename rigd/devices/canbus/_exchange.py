@@ -28,7 +28,7 @@ from rigd.devices.canbus.port import (
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.running_simulator import SimulatorAddress
-from rigd.runtime import HeldError, HeldFile
+from rigd.runtime import LockFile, LockHeldError
 
 # Pairing of replies
 
@@ -367,7 +367,7 @@ class BusLock:
 
     def __init__(self, bus: str, *, simulated: bool) -> None:
         self._bus = bus
-        self._file = HeldFile(f"bus-{bus}", everybody=not simulated)
+        self._file = LockFile(f"bus-{bus}", for_all_users=not simulated)
 
     def acquire(self) -> None:
         """Lock the bus, or raise if another program has locked it.
@@ -379,7 +379,7 @@ class BusLock:
         """
         try:
             self._file.acquire("rigd")
-        except HeldError as holder:
+        except LockHeldError as holder:
             raise DeviceError(
                 f"CAN bus {self._bus}: another rigd is using it ({holder}); wait for it, or stop "
                 "it."
