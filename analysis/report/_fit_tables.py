@@ -344,7 +344,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in mode_pairs):
         notes.append(
             f"{_FAR_MODE_MARK} more than {100 * LARGEST_FREQUENCY_SHIFT:g} % off the undamped "
-            "beam's: the fit does not follow this resonance. The number only describes the fitted curve."
+            "beam's: the fit does not follow this resonance. The number only describes the fitted "
+            "curve."
         )
     if not all(is_underdamped) or not all(model.modes for model in models):
         notes.append(f"{ABSENT_TEXT} overdamped in this fit.")

@@ -3,8 +3,8 @@ r"""Signals that request the end of a program or of its session, and how the pro
 Ctrl-C, Ctrl-\, Ctrl-Z and the closing of a terminal send a signal to all processes of the terminal,
 and a service manager sends SIGTERM to all processes. A command ends by an exception
 (`raise_on_signals`). The supervisor and the control process stop their session safely at each of
-these signals (`StopRequest`), because a suspended control process would leave its last torque on. The recorder
-and the live publisher ignore the signals (`ignore`), and are ended by the supervisor.
+these signals (`StopRequest`), because a suspended control process would leave its last torque on.
+The recorder and the live publisher ignore the signals (`ignore`), and are ended by the supervisor.
 """
 
 import contextlib
