@@ -1,7 +1,8 @@
 """The oddities of the paper's results, reproduced: its route on beams whose parameters are known.
 
-Prints the tables of ``docs/paper_method.md``, part by part (``--part``); with ``--figures DIR`` it
-also draws the page's figures there. 20 sessions of each of two beams take some five minutes.
+Prints the tables of ``docs/validation/paper_method.md``, part by part (``--part``); with
+``--figures DIR`` it also draws the page's figures there. 20 sessions of each of two beams take some
+five minutes.
 
 The beams are the paper's link with internal damping of order 1; on the second one the modes'
 stiffness is off by +0.6, +0.5 and -1.3 %, as a link's may be that is not quite uniform. The
