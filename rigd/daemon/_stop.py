@@ -325,7 +325,7 @@ class _DaemonStop:
         if self.doubt:
             who = f"process {self.pid}" if self.pid else "the process"
             report.doubts.append(
-                f"The reply of {who} that listens on {self._path} is not believed. {self.doubt}"
+                f"The reply of {who} that listens on {self._path} is not trusted. {self.doubt}"
             )
             return
         rig_text = f"the rig {rig} (rigd serve, process {self.pid})"

@@ -485,9 +485,8 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     complete_groups = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
     if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
-            f"Of {window_count} passes {len(windows)} can be used, and that is too few: it takes "
-            f"at least {LEAST_REPEATS} of the same kind in both directions, without gaps and "
-            "without a standstill."
+            f"Too few passes: {len(windows)} of {window_count} have neither gaps nor a standstill, "
+            f"but an estimate takes at least {LEAST_REPEATS} of the same kind in each direction."
         )
     sessions = {
         number: index

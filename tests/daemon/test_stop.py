@@ -106,7 +106,7 @@ def test_an_impostor_on_the_socket_is_not_believed(
     assert code == 1
     assert f"Stopped: rigd serve on the rig sim (process {daemon.pid})." in out
     assert "torque is off" not in out
-    assert f"The reply of process {os.getpid()} that listens on {path} is not believed." in err
+    assert f"The reply of process {os.getpid()} that listens on {path} is not trusted." in err
     assert control_of(daemon.pid) == IDLE_NAME
     assert daemon.poll() is None
 
