@@ -242,7 +242,7 @@ def stated_specimens(
     ----------
     stated : iterable of (str, Experiment or None)
         Name and experiment of each file; None for a file that could not be read.
-    of_campaign : Experiment
+    campaign_experiment : Experiment
         Experiment of the sessions that are pooled.
     """
     files_by_specimen: list[tuple[Experiment, list[str]]] = [(campaign_experiment, [])]

@@ -69,8 +69,8 @@ def symbol_with_unit(parameter: str) -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns.sentences import with_unit
-    >>> with_unit("zeta"), with_unit("frequency_hz_2")
+    >>> from analysis.campaigns.sentences import symbol_with_unit
+    >>> symbol_with_unit("zeta"), symbol_with_unit("frequency_hz_2")
     ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
     """
     symbol, _, unit = label(parameter)

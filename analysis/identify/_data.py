@@ -190,7 +190,7 @@ class Measurement:
     axis_tilt_deg : float or None
         Inclination of the plane of motion along the beam at rest as the file states it, positive
         where the tip is lower than the motor's axis; None if it was not measured.
-    one_sweep : bool
+    is_single_sweep : bool
         Whether the motor passed each frequency once, in rising or falling order. An effect of time
         then cannot be distinguished from an effect of frequency.
     """

@@ -394,7 +394,7 @@ def finding(
     ----------
     test : UniformBeamTest
         Test that refused the plain uniform beam.
-    found : sequence of CauseFit
+    causes : sequence of CauseFit
         Causes from `explanations`.
     step : Step, optional
         Step of the stiffness during the record, from `best_stiffness_step`.

@@ -183,7 +183,7 @@ class _Blocks:
         ----------
         residual, predicted, free_decay : ndarray, shape (samples,)
             Torque in N·m: residual, prediction, and estimated free decay.
-        near_hz : tuple of float
+        range_hz : tuple of float
             Lowest and highest frequency of the search.
         variance : float
             Variance of one sample of noise that is as strong as the noise near these frequencies,

@@ -546,10 +546,10 @@ class TolerantEstimate:
         Covariance of `PARAMETERS`, with those in `LOGARITHMIC_PARAMETERS` as logarithms.
     first_rad_s : float
         Frequency of the first visible mode, in rad/s.
-    deviance_of_one : mapping of str to float
+    deviance_of_order_one : mapping of str to float
         Increase of chi-square if "alpha" or "lambda" is fixed at 1, with damping ratios and residue
         phases alone. 0 if the interval contains 1.
-    deviance_without : mapping of str to float
+    deviance_without_damping : mapping of str to float
         Increase of chi-square if the damping with coefficient "zeta" or "gamma" is left out.
     """
 

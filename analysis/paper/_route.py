@@ -274,10 +274,10 @@ def largest_oscillation_time_s(
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.paper import loudest_moment_s
+    >>> from analysis.paper import largest_oscillation_time_s
     >>> t = np.arange(10_000) / 1000
     >>> values = np.exp(-((t - 4) ** 2)) * np.sin(2 * np.pi * 5 * t)
-    >>> print(f"{loudest_moment_s(values, 1000, 5.0):.2f} s")
+    >>> print(f"{largest_oscillation_time_s(values, 1000, 5.0):.2f} s")
     4.00 s
     """
     padded = 1 << (len(values) - 1).bit_length()

@@ -29,7 +29,7 @@ class LockFile:
     ----------
     name
         Name of the locked resource. All characters except letters and digits are equivalent.
-    everybody
+    for_all_users
         Whether the resource is common to all users of this computer, as hardware is. The file is
         then in ``/run/lock`` if that folder is writable. Otherwise it is in the user's runtime
         folder.

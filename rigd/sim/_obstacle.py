@@ -300,7 +300,7 @@ class AttachedObstacles:
 
         Parameters
         ----------
-        march
+        substep_matrices
             Matrices for the substeps, of the free or the locked motor.
         free_m
             Displacement in m at the end of each substep without any force, shape (substeps,

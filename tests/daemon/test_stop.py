@@ -167,11 +167,23 @@ OTHER = os.getuid() + 1
     ("command", "changes", "expected"),
     [
         (RUN, {}, STOP_SIGNAL),
-        (RUN, {"caught": 0}, signal.SIGTERM),  # it has not begun, and its SIGINT is ignored
-        (RUN, {"caught": 1 << signal.SIGINT - 1}, signal.SIGINT),
-        (RUN, {"ignored": 1 << STOP_SIGNAL - 1, "caught": 0}, None),  # a quick look is left
+        (
+            RUN,
+            {"handled_signals": 0},
+            signal.SIGTERM,
+        ),  # it has not begun, and its SIGINT is ignored
+        (RUN, {"handled_signals": 1 << signal.SIGINT - 1}, signal.SIGINT),
+        (
+            RUN,
+            {"ignored_signals": 1 << STOP_SIGNAL - 1, "handled_signals": 0},
+            None,
+        ),  # a quick look is left
         (("python3", "-m", "rigd", "identify", "motor"), {}, STOP_SIGNAL),
-        (("python3", "rigd", "identify", "motor", "--from", "a.mcap"), {"caught": 0}, None),
+        (
+            ("python3", "rigd", "identify", "motor", "--from", "a.mcap"),
+            {"handled_signals": 0},
+            None,
+        ),
         (("sudo", "rigd", "run", "hold"), {}, None),
         (("python3", "rigd", "check"), {}, None),
         (RUN, {"uid": -1}, None),

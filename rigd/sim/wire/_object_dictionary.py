@@ -146,7 +146,7 @@ class Entry:
 
         Parameters
         ----------
-        described
+        description
             Description in the file, of an integer as this entry.
         default
             New value at power-on; None leaves it unchanged.
