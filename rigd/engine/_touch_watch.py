@@ -61,7 +61,7 @@ class TouchWatch:
         self._arming_tick = self._pass.begins
         self._excessive_force_ticks = 0
 
-    def step(self, tick: int, missed: int) -> DetectedContact | None:
+    def step(self, tick: int, missed_ticks: int) -> DetectedContact | None:
         """Check the tick that was just run for a touch; return the contact, or None without one.
 
         Parameters
@@ -72,7 +72,7 @@ class TouchWatch:
             Number of ticks that were missed directly before this tick.
         """
         cycle, detector = self._cycle, self._detector
-        flags = cycle.flags
+        status_flags = cycle.flags
         shear_n = 0.0
         if self._projection is not None:
             px, py, pz, qx, qy, qz = self._projection
@@ -84,16 +84,16 @@ class TouchWatch:
         if self._arming_tick <= tick:
             self._arming_tick = len(self._reference_rad)
             detector.arm()
-        touched = detector.step(
+        is_touched = detector.step(
             cycle.angle_rad,
             cycle.coupling_torque_nm,
             shear_n,
-            missed=missed,
-            angle_stale=bool(flags & _ANGLE_STALE),
-            wrench_stale=bool(flags & _WRENCH_STALE),
+            missed=missed_ticks,
+            angle_stale=bool(status_flags & _ANGLE_STALE),
+            wrench_stale=bool(status_flags & _WRENCH_STALE),
         )
         forceful_contact = self._check_force_limit(shear_n)
-        if forceful_contact is not None or not touched:
+        if forceful_contact is not None or not is_touched:
             return forceful_contact
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:

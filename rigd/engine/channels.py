@@ -147,17 +147,19 @@ def create_channels(
     buffered_s
         Time in s whose records the rings hold.
     """
-    *for_rings, for_shared_state, for_reference = fds
+    *ring_fds, shared_state_fd, reference_fd = fds
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
-        for topic, fd in zip(TOPICS, for_rings, strict=True)
+        for topic, fd in zip(TOPICS, ring_fds, strict=True)
     ]
-    return _make_channels(rings, SharedState.create(for_shared_state), for_reference)
+    return _make_channels(rings, SharedState.create(shared_state_fd), reference_fd)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
     """Attach a child process to the channels that the supervisor created, and return them."""
-    return _make_channels([Ring(spec) for spec in specs.rings], SharedState(specs.shared_state_fd))
+    return _make_channels(
+        [Ring(ring_spec) for ring_spec in specs.rings], SharedState(specs.shared_state_fd)
+    )
 
 
 def _make_channels(

@@ -63,23 +63,25 @@ _STANDSTILL_TICKS = 2
 
 def main() -> None:
     """Run the control process, started as ``python -m rigd.engine.control_process``."""
-    stop = StopRequest()
-    stop.catch()
+    stop_request = StopRequest()
+    stop_request.catch()
     parent = Parent()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
-    realtime = job.profile.realtime
+    realtime_settings = job.profile.realtime
     if job.fast:
-        granted = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+        realtime_results = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
     else:
-        granted = {"clock": "real"} | apply_realtime(priority=realtime.priority, cpu=realtime.cpu)
+        realtime_results = {"clock": "real"} | apply_realtime(
+            priority=realtime_settings.priority, cpu=realtime_settings.cpu
+        )
     try:
         devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
         parent.send(Ended(str(error)))
         return
-    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    run_control(job.profile, devices, clock, channels, parent, stop, granted)
+    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
+    run_control(job.profile, devices, clock, channels, parent, stop_request, realtime_results)
 
 
 def run_control(
@@ -89,7 +91,7 @@ def run_control(
     channels: Channels,
     parent: Parent,
     stop: StopRequest,
-    granted: dict[str, str],
+    realtime_results: dict[str, str],
 ) -> None:
     """Connect the devices, execute the supervisor's orders, and close the devices in any case.
 
@@ -104,14 +106,14 @@ def run_control(
     granted
         Real-time settings that were granted, for the file.
     """
-    failure = ""
+    failure_text = ""
     name_this_process(CONNECTING_NAME)
     try:
         # The drive last: an operational drive expects a SYNC every period.
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        server = _ControlServer(profile, devices, clock, channels, parent, stop, granted)
+        server = _ControlServer(profile, devices, clock, channels, parent, stop, realtime_results)
         channels.shared_state[StateField.PHASE] = Phase.OFF
         server.observe_standstill()
         name_this_process(IDLE_NAME)
@@ -119,19 +121,19 @@ def run_control(
             Connected(
                 calibration=devices.sensor.calibration(),
                 drive=drive.statement() if isinstance(drive, StatedDrive) else {},
-                realtime=granted,
+                realtime=realtime_results,
                 simulated=devices.simulated,
             )
         )
         server.serve()
     except (DeviceError, OSError) as error:
-        failure = str(error)
+        failure_text = str(error)
     finally:
         devices.drive.disable()
         channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(Ended(f"{failure} {devices.drive.off_doubt}".strip()))
+    parent.send(Ended(f"{failure_text} {devices.drive.off_doubt}".strip()))
 
 
 class _ControlServer:
@@ -197,11 +199,11 @@ class _ControlServer:
         DeviceError, OSError
             If a device failed.
         """
-        while (order := self._await_order()) is not None:
-            match order:
+        while (supervisor_order := self._await_order()) is not None:
+            match supervisor_order:
                 case SessionJob():
                     try:
-                        self._run_session(order)
+                        self._run_session(supervisor_order)
                     finally:
                         self.store_heat()
                     self.observe_standstill()
@@ -211,7 +213,7 @@ class _ControlServer:
                 case Zero():
                     self._send_measurement(self._set_zero)
                 case Probe():
-                    self._run_probe(order.profile)
+                    self._run_probe(supervisor_order.profile)
                     self.observe_standstill()
 
     def _await_order(self) -> object | None:
@@ -224,11 +226,13 @@ class _ControlServer:
         while not self._stop.requested:
             self._publish_readings()
             try:
-                message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
+                supervisor_message = self._parent.poll(
+                    _STANDSTILL_POLL_S if self._clock.virtual else 0.0
+                )
             except EOFError:
                 return None
-            if message is not None:
-                return message
+            if supervisor_message is not None:
+                return supervisor_message
             if not self._clock.virtual:
                 self._read_idle_devices()
             elif self._on_lines and time.monotonic() - last_tick_s > SIGN_OF_LIFE_S:
@@ -264,7 +268,7 @@ class _ControlServer:
             If a device failed. `Finished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
-        for field in (
+        for state_field in (
             StateField.START_UTC_NS,
             StateField.SCHEDULED,
             StateField.MISSED,
@@ -277,22 +281,22 @@ class _ControlServer:
             StateField.HELD_BEFORE,
             StateField.BEGUN,
         ):
-            shared_state[field] = 0
+            shared_state[state_field] = 0
         self._warn_of_refusals(job)
         self._log_accepted(job)
         cycle = self._cycle = self._make_cycle(job.profile)
-        reference = map_reference(job.reference)
-        touch = None
+        reference_rad = map_reference(job.reference)
+        touch_watch = None
         if job.touch is not None:
             from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
 
-            touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
-        reader = None
+            touch_watch = TouchWatch(job.touch, cycle, reference_rad, job.profile.rig.rate_hz)
+        reference_reader = None
         if job.reference.planned is not None:
-            reader = ReferenceReader(reference, job.reference.planned, shared_state)
-        sequence = SessionSequence(
+            reference_reader = ReferenceReader(reference_rad, job.reference.planned, shared_state)
+        session_sequence = SessionSequence(
             job.profile,
-            reference,
+            reference_rad,
             cycle,
             self._clock,
             self._scheduler,
@@ -302,55 +306,59 @@ class _ControlServer:
             self._parent,
             self._stop,
             job.ending,
-            touch,
-            reader,
+            touch_watch,
+            reference_reader,
         )
-        outcome, reason = "complete", ""
-        recorded = device_failed = False
+        session_outcome, end_reason = "complete", ""
+        was_recorded = device_failed = False
         name_this_process(SESSION_NAME)
         try:
-            seed = self._restart_noise(job)
-            tare = sequence.tare()
-            devices.drive.enable(sequence.stop_requested)
-            sequence.hold()
-            self._parent.send(Ready(tare | seed))
-            sequence.wait_for_go()
-            sequence.record()
-            recorded = True
-            sequence.damp()
-            sequence.return_to_start()
+            seed_metadata = self._restart_noise(job)
+            tare_metadata = session_sequence.tare()
+            devices.drive.enable(session_sequence.stop_requested)
+            session_sequence.hold()
+            self._parent.send(Ready(tare_metadata | seed_metadata))
+            session_sequence.wait_for_go()
+            session_sequence.record()
+            was_recorded = True
+            session_sequence.damp()
+            session_sequence.return_to_start()
             cycle.torque_off()
-            sequence.check_tare()
+            session_sequence.check_tare()
         except SessionEnd as end:
-            outcome, reason, device_failed = end.outcome, end.reason, end.device_failed
+            session_outcome, end_reason, device_failed = end.outcome, end.reason, end.device_failed
         except (DeviceError, OSError) as error:
-            outcome, reason, device_failed = "fault", str(error), True
+            session_outcome, end_reason, device_failed = "fault", str(error), True
         finally:
             devices.drive.disable()
             cycle.torque_off()
             shared_state[StateField.PHASE] = Phase.OFF
             self._publish_readings()
-        doubt = devices.drive.off_doubt
-        if doubt:
-            outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
+        off_doubt = devices.drive.off_doubt
+        if off_doubt:
+            session_outcome, end_reason, device_failed = (
+                "fault",
+                f"{end_reason} {off_doubt}".strip(),
+                True,
+            )
         else:
             name_this_process(IDLE_NAME)
-        failure, fault = reason, outcome == "fault"
-        if recorded and reason:
+        failure_text, is_fault = end_reason, session_outcome == "fault"
+        if was_recorded and end_reason:
             # Events after the last tick do not make the record incomplete.
-            outcome, reason = "complete", f"After the record: {reason}"
+            session_outcome, end_reason = "complete", f"After the record: {end_reason}"
         self._parent.send(
             Finished(
-                outcome=outcome,
-                reason=reason,
-                fault=fault,
-                counts=asdict(sequence.counts),
-                results=sequence.results,
+                outcome=session_outcome,
+                reason=end_reason,
+                fault=is_fault,
+                counts=asdict(session_sequence.counts),
+                results=session_sequence.results,
                 device_failed=device_failed,
             )
         )
         if device_failed:
-            raise DeviceError(failure)
+            raise DeviceError(failure_text)
 
     def _restart_noise(self, job: SessionJob) -> dict[str, str]:
         """Restart the noise of a simulated rig and return its seed as metadata; {} for a real rig.
@@ -360,8 +368,8 @@ class _ControlServer:
         DeviceError
             If the simulated rig does not answer.
         """
-        restart_noise = self._devices.renew_noise
-        return {} if restart_noise is None else {"simulation_seed": str(restart_noise(job.seed))}
+        renew_noise = self._devices.renew_noise
+        return {} if renew_noise is None else {"simulation_seed": str(renew_noise(job.seed))}
 
     def _run_probe(self, profile: Profile) -> None:
         """Run the probing move of a profile, disable the drive, and send the result.
@@ -374,7 +382,7 @@ class _ControlServer:
         from rigd.engine._probe_sequence import ProbeSequence  # late: few connections need it
 
         cycle = self._cycle = self._make_cycle(profile)
-        sequence = ProbeSequence(
+        probe_sequence = ProbeSequence(
             profile,
             cycle,
             self._clock,
@@ -385,26 +393,26 @@ class _ControlServer:
             self._parent,
             self._stop,
         )
-        answer: Measured | Refused
-        failure = ""
+        reply_message: Measured | Refused
+        failure_text = ""
         name_this_process(SESSION_NAME)
         try:
-            sequence.tare()
-            self._devices.drive.enable(sequence.stop_requested)
-            answer = Measured(sequence.move())
+            probe_sequence.tare()
+            self._devices.drive.enable(probe_sequence.stop_requested)
+            reply_message = Measured(probe_sequence.move())
         except SessionEnd as end:
-            answer = Refused(end.reason)
-            failure = end.reason if end.device_failed else ""
+            reply_message = Refused(end.reason)
+            failure_text = end.reason if end.device_failed else ""
         finally:
             self._devices.drive.disable()
             cycle.torque_off()
             self._shared_state[StateField.PHASE] = Phase.OFF
             self._publish_readings()
-        failure = f"{failure} {self._devices.drive.off_doubt}".strip()
-        if failure:
-            raise DeviceError(failure)
+        failure_text = f"{failure_text} {self._devices.drive.off_doubt}".strip()
+        if failure_text:
+            raise DeviceError(failure_text)
         name_this_process(IDLE_NAME)
-        self._parent.send(answer)
+        self._parent.send(reply_message)
 
     def _send_measurement(self, measure: Callable[[], dict[str, object]]) -> None:
         """Run a measurement at rest and send its result, or the reason why it was refused."""
@@ -419,16 +427,16 @@ class _ControlServer:
         The values are for display, because each session measures the zero itself.
         """
         self._cycle.sensor_watch.learn()
-        rest = self._read_rest(self._profile.session.tare_s)
-        failed = self._cycle.sensor_watch.finish_learning()
-        if failed is not None:
-            raise SessionEnd("fault", str(failed))
-        self._cycle.tare = rest.mean
-        self._watch.tared_nm = float(rest.torques_nm.mean())
+        rest_readings = self._read_rest(self._profile.session.tare_s)
+        sensor_violation = self._cycle.sensor_watch.finish_learning()
+        if sensor_violation is not None:
+            raise SessionEnd("fault", str(sensor_violation))
+        self._cycle.tare = rest_readings.mean
+        self._watch.tared_nm = float(rest_readings.torques_nm.mean())
         return {
-            "mean": dict(zip(WRENCH_FIELDS, rest.mean, strict=True)),
-            "std": dict(zip(WRENCH_FIELDS, rest.spread, strict=True)),
-            "torque_std_nm": rest.torque_spread_nm,
+            "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean, strict=True)),
+            "std": dict(zip(WRENCH_FIELDS, rest_readings.spread, strict=True)),
+            "torque_std_nm": rest_readings.torque_spread_nm,
         }
 
     def _set_zero(self) -> dict[str, object]:
@@ -441,12 +449,12 @@ class _ControlServer:
         SessionEnd
             If the motor moves.
         """
-        rest = self._read_rest(_ZERO_READING_S)
+        rest_readings = self._read_rest(_ZERO_READING_S)
         limit_rad_s = self._profile.session.rest_velocity_rad_s
-        if rest.speed_rad_s > limit_rad_s:
+        if rest_readings.speed_rad_s > limit_rad_s:
             raise SessionEnd(
                 "fault",
-                f"The motor moves by {rest.speed_rad_s:.2g} rad/s, more than "
+                f"The motor moves by {rest_readings.speed_rad_s:.2g} rad/s, more than "
                 f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it is at rest.",
             )
         moved_rad = self._cycle.angle_rad
@@ -479,9 +487,9 @@ class _ControlServer:
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
-        failed = self._cycle.check_stale() or self._cycle.check_sensor()
-        if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
+        reading_violation = self._cycle.check_stale() or self._cycle.check_sensor()
+        if reading_violation is not None:
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(reading_violation)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         """Return a new cycle with the controller and monitors of a profile."""
@@ -499,22 +507,27 @@ class _ControlServer:
     def _warn_of_refusals(self, job: SessionJob) -> None:
         """Log the real-time settings that the system did not grant, as warnings."""
         own_refusals = {
-            name: text for name, text in self._granted.items() if text.startswith(REFUSED)
+            setting_name: refusal_text
+            for setting_name, refusal_text in self._granted.items()
+            if refusal_text.startswith(REFUSED)
         }
-        for refused, consequence in (
+        for refused_settings, consequence_text in (
             (own_refusals, "more ticks will be late"),
             (job.refused, "a computer that is busy with other programs may end the session"),
         ):
-            if refused:
-                names = ", ".join(f"{name} ({text})" for name, text in refused.items())
-                message = f"The system did not grant {names}: {consequence}."
-                write_event(self._channels.events, LogEvent(0, "warning", message))
+            if refused_settings:
+                setting_names = ", ".join(
+                    f"{setting_name} ({refusal_text})"
+                    for setting_name, refusal_text in refused_settings.items()
+                )
+                warning_message = f"The system did not grant {setting_names}: {consequence_text}."
+                write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
     def _log_accepted(self, job: SessionJob) -> None:
         """Log the failed rows of ``rigd check`` that the operator accepted, as warnings."""
-        for text in job.accepted:
-            message = f"Accepted by the operator, though rigd check fails: {text}"
-            write_event(self._channels.events, LogEvent(0, "warning", message))
+        for check_row in job.accepted:
+            warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
+            write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
 
 def _make_controller(profile: Profile) -> PidController:

@@ -380,8 +380,8 @@ class SearchEnded:
 
 def encode(message: object) -> bytes:
     """Return a message as bytes for a pipe: its length and the pickled object."""
-    data = pickle.dumps(message)
-    return _LENGTH_HEADER.pack(len(data)) + data
+    pickled_message = pickle.dumps(message)
+    return _LENGTH_HEADER.pack(len(pickled_message)) + pickled_message
 
 
 class MessageReader:
@@ -415,20 +415,20 @@ class MessageReader:
         while (message := self._take_complete_message()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):
                 return None
-            data = os.read(self._fd, 65_536)
-            if not data:
+            received_bytes = os.read(self._fd, 65_536)
+            if not received_bytes:
                 raise EOFError
-            self._pending += data
+            self._pending += received_bytes
         return message
 
     def _take_complete_message(self) -> object | None:
         """Remove and return the first complete message of the data read so far, or None."""
         if len(self._pending) < _LENGTH_HEADER.size:
             return None
-        (length,) = _LENGTH_HEADER.unpack_from(self._pending)
-        if length > _MAX_MESSAGE_BYTES:
+        (message_bytes,) = _LENGTH_HEADER.unpack_from(self._pending)
+        if message_bytes > _MAX_MESSAGE_BYTES:
             raise ValueError(f"no message, but {bytes(self._pending[:80])!r}")
-        end = _LENGTH_HEADER.size + length
+        end = _LENGTH_HEADER.size + message_bytes
         if len(self._pending) < end:
             return None
         message: object = pickle.loads(self._pending[_LENGTH_HEADER.size : end])

@@ -66,7 +66,7 @@ def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[s
         One entry per setting: the granted value, or "refused: " and the reason.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    settings: dict[str, Callable[[], str]] = {
+    setting_functions: dict[str, Callable[[], str]] = {
         "memory": lambda: lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
@@ -74,8 +74,11 @@ def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[s
         "idle_states": lambda: _limit_idle_states(root),
     }
     if priority > 0:
-        settings["scheduling"] = lambda: _set_fifo_priority(priority)
-    return {name: _try_setting(setting) for name, setting in settings.items()}
+        setting_functions["scheduling"] = lambda: _set_fifo_priority(priority)
+    return {
+        setting_name: _try_setting(apply_setting)
+        for setting_name, apply_setting in setting_functions.items()
+    }
 
 
 def pin_off_loop_core(loop_cpu: int) -> None:
@@ -135,16 +138,16 @@ class Precedence:
         """
         if self._priority == 0:
             return {}
-        granted = _try_setting(self._raise_to_realtime)
-        if not granted.startswith(REFUSED):
+        scheduling_result = _try_setting(self._raise_to_realtime)
+        if not scheduling_result.startswith(REFUSED):
             return {
-                "scheduling": granted,
+                "scheduling": scheduling_result,
                 "cores": _format_cores(self._other_cores or self.cores_before),
             }
-        granted_niceness = _try_setting(self._raise_by_niceness)
-        if not granted_niceness.startswith(REFUSED):
-            return {"scheduling": f"{granted_niceness} (SCHED_RR {granted})"}
-        return {"scheduling": granted}
+        niceness_result = _try_setting(self._raise_by_niceness)
+        if not niceness_result.startswith(REFUSED):
+            return {"scheduling": f"{niceness_result} (SCHED_RR {scheduling_result})"}
+        return {"scheduling": scheduling_result}
 
     def cover(self) -> None:
         """Extend the raised priority to new threads, which hold the same interpreter lock."""
@@ -224,11 +227,11 @@ def parse_core_list(text: str) -> frozenset[int]:
     ValueError
         If the text is no such list.
     """
-    cores: set[int] = set()
+    core_numbers: set[int] = set()
     for core_range in filter(None, text.strip().split(",")):
-        first, _, last = core_range.partition("-")
-        cores.update(range(int(first), int(last or first) + 1))
-    return frozenset(cores)
+        first_core, _, last_core = core_range.partition("-")
+        core_numbers.update(range(int(first_core), int(last_core or first_core) + 1))
+    return frozenset(core_numbers)
 
 
 def page_faults() -> int:
@@ -250,13 +253,13 @@ def lock_memory(libc: ctypes.CDLL) -> str:
 
     `libc` is the C library, whose ``mlockall`` is called.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit_bytes == resource.RLIM_INFINITY or os.geteuid() == 0:
         _check_return_code(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
         return MEMORY_LOCKED
     # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
     _check_return_code(libc.mlockall(_MCL_CURRENT))
-    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
+    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit_bytes / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -269,14 +272,14 @@ def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
     """Return the core on which the control process runs, and whether the kernel isolates it."""
     if cpu >= 0:  # chosen whether it may be used or not
         return cpu, False
-    isolated = isolated_cores(root)
-    if isolated:
+    isolated_numbers = isolated_cores(root)
+    if isolated_numbers:
         # Isolated cores are not in a process's affinity until it requests one: try it.
-        before = os.sched_getaffinity(0)
+        allowed_cores = os.sched_getaffinity(0)
         with contextlib.suppress(OSError):
-            os.sched_setaffinity(0, {max(isolated)})
-            os.sched_setaffinity(0, before)
-            return max(isolated), True
+            os.sched_setaffinity(0, {max(isolated_numbers)})
+            os.sched_setaffinity(0, allowed_cores)
+            return max(isolated_numbers), True
     return max(os.sched_getaffinity(0)), False
 
 
@@ -294,8 +297,8 @@ def _pin_to_loop_core(cpu: int, root: Path) -> str:
 
 def _limit_idle_states(root: Path) -> str:
     """Disable idle states that a core leaves slowly, until this process ends; return a text."""
-    states = (root / _IDLE_STATES_FOLDER).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
-    if all(int(state.read_text()) <= MAX_WAKE_UP_US for state in states):
+    latency_files = (root / _IDLE_STATES_FOLDER).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
+    if all(int(latency_file.read_text()) <= MAX_WAKE_UP_US for latency_file in latency_files):
         return f"none slower than {MAX_WAKE_UP_US} µs"
     fd = os.open(root / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     # The bound holds while the descriptor is open, until this process ends.
@@ -309,8 +312,8 @@ def _set_fifo_priority(priority: int) -> str:
     return f"SCHED_FIFO {priority}"
 
 
-def _check_return_code(result: int) -> None:
-    """Raise the C library's last error if `result`, the return value of a call, is not 0."""
-    if result != 0:
+def _check_return_code(return_code: int) -> None:
+    """Raise the C library's last error if `return_code`, the return value of a call, is not 0."""
+    if return_code != 0:
         error_number = ctypes.get_errno()
         raise OSError(error_number, os.strerror(error_number))

@@ -196,7 +196,7 @@ class SharedState:
 
     def known(self, field: StateField) -> int | None:
         """Return the value of a field, or None if the value is `UNKNOWN`."""
-        return None if (value := self._fields[field]) == UNKNOWN else value
+        return None if (field_value := self._fields[field]) == UNKNOWN else field_value
 
     def view(self, field: StateField) -> "memoryview[int]":
         """Return a memory view of one field, whose value ``view[0]`` reads and writes quickly."""
@@ -252,24 +252,26 @@ def write_event(ring: Ring, event: LogEvent) -> None:
     event
         Event; its text is cut to the size of a record.
     """
-    offset = ring.next_slot()
-    if offset < 0:
+    slot_offset = ring.next_slot()
+    if slot_offset < 0:
         return
-    text = event.message.encode()[:_TEXT_SIZE]
-    _HEADER.pack_into(ring.buffer, offset, event.t_ns, LEVELS.index(event.level), len(text))
-    start = offset + _HEADER.size
-    ring.buffer[start : start + len(text)] = text
+    message_bytes = event.message.encode()[:_TEXT_SIZE]
+    _HEADER.pack_into(
+        ring.buffer, slot_offset, event.t_ns, LEVELS.index(event.level), len(message_bytes)
+    )
+    text_offset = slot_offset + _HEADER.size
+    ring.buffer[text_offset : text_offset + len(message_bytes)] = message_bytes
     ring.publish()
 
 
-def read_events(block: bytes) -> list[LogEvent]:
+def read_events(event_bytes: bytes) -> list[LogEvent]:
     """Decode the log events in a block of bytes that :meth:`Ring.take` returned."""
     events = []
-    for offset in range(0, len(block), EVENT_SIZE):
-        t_ns, level, size = _HEADER.unpack_from(block, offset)
-        start = offset + _HEADER.size
-        text = block[start : start + size].decode(errors="replace")
-        events.append(LogEvent(t_ns, LEVELS[level], text))
+    for event_offset in range(0, len(event_bytes), EVENT_SIZE):
+        t_ns, level, text_bytes = _HEADER.unpack_from(event_bytes, event_offset)
+        text_offset = event_offset + _HEADER.size
+        message_text = event_bytes[text_offset : text_offset + text_bytes].decode(errors="replace")
+        events.append(LogEvent(t_ns, LEVELS[level], message_text))
     return events
 
 

@@ -47,19 +47,19 @@ def main() -> None:
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
     channels = attach_channels(job.channels)
-    reader = Observer(channels.samples, job.first)
+    sample_reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
-    touches = TouchFollower(estimator, job)
+    touch_follower = TouchFollower(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
-        block = reader.take(_MAX_BLOCK_SAMPLES)
-        if block:
-            touches.take(decode_samples(block))
+        sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
+        if sample_bytes:
+            touch_follower.take(decode_samples(sample_bytes))
         else:
-            time.sleep(_IDLE_PAUSE_S if touches.idle else _PENDING_PAUSE_S)
-        for report in touches.reports():
-            parent.send(report)
+            time.sleep(_IDLE_PAUSE_S if touch_follower.idle else _PENDING_PAUSE_S)
+        for touch_report in touch_follower.reports():
+            parent.send(touch_report)
         try:
             if parent.poll(0.0) is not None:
                 return
@@ -106,8 +106,8 @@ class TouchFollower:
             self._final_ticks,
             self._contact_ticks,
         ) = (
-            round(seconds * job.rate_hz)
-            for seconds in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
+            round(duration_s * job.rate_hz)
+            for duration_s in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
         )
         self._samples: NDArray[np.void] | None = None
         self._pending_touches: deque[_PendingTouch] = deque()
@@ -144,21 +144,21 @@ class TouchFollower:
         """
         if self._samples is None or not self._pending_touches:
             return []
-        touch = self._pending_touches[0]
-        available_ticks = int(self._samples["tick"][-1]) - touch.tick + 1
+        pending_touch = self._pending_touches[0]
+        available_ticks = int(self._samples["tick"][-1]) - pending_touch.tick + 1
         is_final = self._record_ended or available_ticks >= self._final_ticks
         # In real time the operator waits for the first estimate, even if the record is complete.
         is_first = self._job.realtime is not None or not is_final
-        if available_ticks >= self._first_ticks and is_first and not touch.reported:
-            touch.reported = True
-            return [self._estimate(touch, self._first_ticks, is_final=False)]
+        if available_ticks >= self._first_ticks and is_first and not pending_touch.reported:
+            pending_touch.reported = True
+            return [self._estimate(pending_touch, self._first_ticks, is_final=False)]
         if is_final:
             self._pending_touches.popleft()
-            return [self._estimate(touch, self._final_ticks, is_final=True)]
-        if available_ticks >= self._preview_ticks and not touch.previewed:
-            touch.previewed = True
-            record, _ = self._record(touch, self._preview_ticks)
-            touch.estimate.preview(record)
+            return [self._estimate(pending_touch, self._final_ticks, is_final=True)]
+        if available_ticks >= self._preview_ticks and not pending_touch.previewed:
+            pending_touch.previewed = True
+            record, _ = self._record(pending_touch, self._preview_ticks)
+            pending_touch.estimate.preview(record)
         return []
 
     def _estimate(self, touch: _PendingTouch, after_ticks: int, *, is_final: bool) -> TouchReport:
