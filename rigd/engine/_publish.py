@@ -187,9 +187,9 @@ class SampleLog:
             Number of the tick in the record.
         reference_rad
             Reference angle.
-        missed
+        missed_ticks
             Number of ticks that were missed directly before this tick.
-        wait
+        wait_for_slot
             Whether to wait for free space in a full ring, because nothing moves or time is
             virtual. Otherwise the sample is lost.
         """

@@ -255,7 +255,8 @@ class SessionSequence:
                 raise SessionEnd(
                     "fault",
                     f"{motion_text} It did not come to rest within session.rest_timeout_s = "
-                    f"{session_settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
+                    f"{session_settings.rest_timeout_s:g} s; wait until it is at rest and "
+                    "start again.",
                 )
             if self._shared_state[StateField.PHASE] != Phase.WAITING:
                 self._shared_state[StateField.PHASE] = Phase.WAITING
@@ -266,8 +267,8 @@ class SessionSequence:
         session_settings = self._profile.session
         if rest_readings.speed_rad_s > session_settings.rest_velocity_rad_s:
             return (
-                f"The motor is not at rest: it moves by {rest_readings.speed_rad_s:.2g} rad/s, more than "
-                f"session.rest_velocity_rad_s = {session_settings.rest_velocity_rad_s:g} rad/s."
+                f"The motor is not at rest: it moves by {rest_readings.speed_rad_s:.2g} rad/s, more "
+                f"than session.rest_velocity_rad_s = {session_settings.rest_velocity_rad_s:g} rad/s."
             )
         if rest_readings.torque_spread_nm > session_settings.rest_torque_nm:
             return (

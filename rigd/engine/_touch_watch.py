@@ -68,7 +68,7 @@ class TouchWatch:
         ----------
         tick
             Number of the tick in the record.
-        missed
+        missed_ticks
             Number of ticks that were missed directly before this tick.
         """
         cycle, detector = self._cycle, self._detector

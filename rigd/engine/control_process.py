@@ -103,7 +103,7 @@ def run_control(
         Devices, not yet connected.
     clock, channels, parent, stop
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
-    granted
+    realtime_results
         Real-time settings that were granted, for the file.
     """
     failure_text = ""

@@ -365,7 +365,7 @@ class Heartbeat:
 
         Parameters
         ----------
-        beat
+        beat_count
             Present count, which the process increments while it runs.
         now_s
             Time of a monotonic clock.

@@ -81,9 +81,9 @@ def is_whole(shared_state: SharedState, scheduled_ticks: int, reference_ticks: i
     ----------
     shared_state
         State of the session.
-    scheduled
+    scheduled_ticks
         Number of ticks of the record.
-    ticks
+    reference_ticks
         Number of ticks of the reference; for a growing reference, its capacity.
     """
     if scheduled_ticks == reference_ticks:

@@ -117,16 +117,22 @@ def next_segment(
     ExcitationError
         If there is no target, or no segment fits into the time or drives a mode.
     """
-    driven = [mode.number for mode in estimate.modes() if mode.number in through]
+    driven_modes = [
+        beam_mode.number for beam_mode in estimate.modes() if beam_mode.number in through
+    ]
     quantities = Quantities.linearised(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
-    plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.from_angle(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
-    search = SegmentSearch(
-        estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
+    move_plant = rig.plant_with(estimate.loaded_beam)
+    record_so_far = RecordSoFar.from_angle(
+        angle_rad_so_far, estimate, move_plant.rate_hz, HORIZON_S
     )
-    return search.segment(search.best_candidate(time_left_s, driven), time_left_s)
+    segment_search = SegmentSearch(
+        estimate, quantities, move_plant, rig.start_rad, record_so_far, tip_slope_rad, time_left_s
+    )
+    return segment_search.segment(
+        segment_search.best_candidate(time_left_s, driven_modes), time_left_s
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,32 +189,34 @@ def geometry_floors(
     ExcitationError
         If no mode can be driven.
     """
-    targets = [target for target in targets if target.quantity not in MODE_QUANTITIES]
+    targets = [
+        single_target for single_target in targets if single_target.quantity not in MODE_QUANTITIES
+    ]
     if not targets or not uniformity:
         return ()
-    plant = rig.plant_with(estimate.loaded_beam)
-    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    move_plant = rig.plant_with(estimate.loaded_beam)
+    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_S)
     quantities = Quantities.linearised(targets, estimate)
-    search = SegmentSearch(
-        estimate, quantities, plant, rig.start_rad, resting_record, tip_slope_rad
+    segment_search = SegmentSearch(
+        estimate, quantities, move_plant, rig.start_rad, resting_record, tip_slope_rad
     )
     tolerant_estimate = estimate.with_tolerance(uniformity)
     floors = [
         least_deviations(
-            np.zeros((len(each.names), len(each.names))),
-            each,
-            Quantities.linearised(targets, each),
-            *search.steady_sines(),
+            np.zeros((len(beam_estimate.names), len(beam_estimate.names))),
+            beam_estimate,
+            Quantities.linearised(targets, beam_estimate),
+            *segment_search.steady_sines(),
             duration_s,
         )
-        for each in (tolerant_estimate, estimate)
+        for beam_estimate in (tolerant_estimate, estimate)
     ]
     return tuple(
-        GeometryFloor(item.target, item.value, std, exact_std)
-        for item, std, exact_std in zip(
+        GeometryFloor(quantity_precision.target, quantity_precision.value, std, exact_std)
+        for quantity_precision, std, exact_std in zip(
             quantities.items, floors[0].tolist(), floors[1].tolist(), strict=True
         )
-        if not item.impossible
+        if not quantity_precision.impossible
     )
 
 
@@ -285,28 +293,29 @@ def design_excitation(
     >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
     (True, True)
     """
-    plant = rig.plant_with(estimate.loaded_beam)
+    move_plant = rig.plant_with(estimate.loaded_beam)
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
-    left_s = duration_s
-    segments: list[Segment] = []
-    while not segments or (
-        left_s >= SHORTEST_S and not all(each.reached for each in segments[-1].expected)
+    remaining_s = duration_s
+    planned_segments: list[Segment] = []
+    while not planned_segments or (
+        remaining_s >= SHORTEST_S
+        and not all(planned_segment.reached for planned_segment in planned_segments[-1].expected)
     ):
-        so_far_rad = np.concatenate([before_rad, angle_rad])
-        segment = next_segment(
-            estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
+        whole_angle_rad = np.concatenate([before_rad, angle_rad])
+        new_segment = next_segment(
+            estimate, whole_angle_rad, targets, rig, remaining_s, tip_slope_rad=tip_slope_rad
         )
-        segments.append(segment)
-        reference_rad = np.concatenate([reference_rad, segment.reference_rad])
+        planned_segments.append(new_segment)
+        reference_rad = np.concatenate([reference_rad, new_segment.reference_rad])
         # The loop's state after one segment is the initial state of the next.
-        angle_rad = plant.respond(reference_rad).angle_rad
-        left_s -= segment.reference_rad.size / plant.rate_hz
+        angle_rad = move_plant.respond(reference_rad).angle_rad
+        remaining_s -= new_segment.reference_rad.size / move_plant.rate_hz
     return Design(
-        segments=tuple(segments),
+        segments=tuple(planned_segments),
         reference_rad=reference_rad,
         angle_rad=angle_rad,
         names=estimate.names,
-        covariance=segments[-1].covariance,
-        expected=segments[-1].expected,
+        covariance=planned_segments[-1].covariance,
+        expected=planned_segments[-1].expected,
     )

@@ -96,46 +96,46 @@ def parse_target(quantity: str, text: str) -> Target:
             f"The precision of {quantity!r} cannot be requested; choose from "
             f"{', '.join(QUANTITIES)}."
         )
-    option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
-    example = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
+    option_text, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
+    example_text = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
-    mode_text, colon, std_text = text.strip().rpartition(":")
-    mode = None
-    if colon:
+    mode_text, colon_text, std_text = text.strip().rpartition(":")
+    mode_number = None
+    if colon_text:
         if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
-                f"{option}: {quantity} is no quantity of a mode; give for example {example}."
+                f"{option_text}: {quantity} is no quantity of a mode; give for example {example_text}."
             )
         if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
-                f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
-                f"give for example {example}."
+                f"{option_text}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
+                f"give for example {example_text}."
             )
-        mode = int(mode_text)
+        mode_number = int(mode_text)
     std_text = std_text.strip()
-    relative = std_text.endswith("%")
-    number = std_text.removesuffix("%") if relative else std_text.removesuffix(unit)
+    is_relative = std_text.endswith("%")
+    number_text = std_text.removesuffix("%") if is_relative else std_text.removesuffix(unit)
     try:
-        std = float(number)
+        std = float(number_text)
     except ValueError:
         raise ExcitationError(
-            f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
-            f"number{f' in {unit}' if unit else ''}, for example {example}."
+            f"{option_text}: {std_text!r} is no standard deviation; give a percentage of the value or a "
+            f"number{f' in {unit}' if unit else ''}, for example {example_text}."
         ) from None
-    std = std / 100 if relative else std
+    std = std / 100 if is_relative else std
     if not (isfinite(std) and std > 0.0):
         raise ExcitationError(
-            f"{option}: the standard deviation must be finite and more than 0; give for example "
-            f"{example}."
+            f"{option_text}: the standard deviation must be finite and more than 0; give for example "
+            f"{example_text}."
         )
     useless_std = _USELESS_STD.get(quantity, inf)
-    if not relative and std >= useless_std:
+    if not is_relative and std >= useless_std:
         raise ExcitationError(
-            f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
+            f"{option_text}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
             f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
-    return Target(quantity, std, relative, mode)
+    return Target(quantity, std, is_relative, mode_number)
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,16 +210,21 @@ class Quantities:
         covariance
             Covariance of the free parameters, shape (k, k).
         """
-        variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
-        target_std = np.array([inf if each.impossible else each.target_std for each in self.items])
-        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / target_std
+        variances = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
+        target_std = np.array(
+            [inf if precision.impossible else precision.target_std for precision in self.items]
+        )
+        ratios: Real = np.sqrt(np.maximum(variances, 0.0)) / target_std
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
         """Return the precision of every target for a covariance of the parameters, shape (k, k)."""
         return tuple(
-            replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
-            for each, slope in zip(self.items, self.gradients, strict=True)
+            replace(
+                precision,
+                std=sqrt(max(float(quantity_gradient @ covariance @ quantity_gradient), 0.0)),
+            )
+            for precision, quantity_gradient in zip(self.items, self.gradients, strict=True)
         )
 
 
@@ -227,7 +232,7 @@ def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[
     """Return a target for each mode, if the given target applies to every mode in the band."""
     if target.quantity not in MODE_QUANTITIES or target.mode is not None:
         return [target]
-    return [replace(target, mode=mode.number) for mode in modes]
+    return [replace(target, mode=estimated_mode.number) for estimated_mode in modes]
 
 
 def _linearise(
@@ -237,24 +242,39 @@ def _linearise(
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """
-    gradient = np.zeros(len(estimate.names))
-    name = target.quantity
-    if name in MODE_QUANTITIES:
-        mode = next((each for each in modes if each.number == target.mode), None)
-        if mode is None:
-            mode_numbers = ", ".join(str(each.number) for each in modes) or "none"
+    quantity_gradient = np.zeros(len(estimate.names))
+    quantity_name = target.quantity
+    if quantity_name in MODE_QUANTITIES:
+        target_mode = next(
+            (estimated_mode for estimated_mode in modes if estimated_mode.number == target.mode),
+            None,
+        )
+        if target_mode is None:
+            mode_numbers = (
+                ", ".join(str(estimated_mode.number) for estimated_mode in modes) or "none"
+            )
             return (
                 0.0,
-                gradient,
+                quantity_gradient,
                 f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
             )
-        if name == "damping":
-            return mode.damping_ratio, mode.damping_gradient, ""
-        return mode.frequency_hz, mode.frequency_gradient_hz, ""
-    value = estimate.values[name]
-    coefficient = _COEFFICIENT_OF_ORDER.get(name, name)
-    if estimate.values[coefficient] == 0.0 or name not in estimate.names:
-        reason = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_DAMPING_KIND[name]} damping {reason} in the estimate so far"
-    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC_PARAMETERS else 1.0
-    return value, gradient, ""
+        if quantity_name == "damping":
+            return target_mode.damping_ratio, target_mode.damping_gradient, ""
+        return target_mode.frequency_hz, target_mode.frequency_gradient_hz, ""
+    quantity_value = estimate.values[quantity_name]
+    coefficient_name = _COEFFICIENT_OF_ORDER.get(quantity_name, quantity_name)
+    if estimate.values[coefficient_name] == 0.0 or quantity_name not in estimate.names:
+        impossible_reason = (
+            "is absent"
+            if estimate.values[coefficient_name] == 0.0
+            else f"has {quantity_name} fixed"
+        )
+        return (
+            quantity_value,
+            quantity_gradient,
+            f"{_DAMPING_KIND[quantity_name]} damping {impossible_reason} in the estimate so far",
+        )
+    quantity_gradient[estimate.names.index(quantity_name)] = (
+        quantity_value if quantity_name in LOGARITHMIC_PARAMETERS else 1.0
+    )
+    return quantity_value, quantity_gradient, ""
