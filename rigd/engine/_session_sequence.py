@@ -264,17 +264,17 @@ class SessionSequence:
 
     def _describe_motion(self, rest_readings: RestReadings) -> str:
         """Return a sentence that says how motor or beam moves, or an empty text if both rest."""
-        session_settings = self._profile.session
-        if rest_readings.speed_rad_s > session_settings.rest_velocity_rad_s:
+        settings = self._profile.session
+        if rest_readings.speed_rad_s > settings.rest_velocity_rad_s:
             return (
-                f"The motor is not at rest: it moves by {rest_readings.speed_rad_s:.2g} rad/s, more "
-                f"than session.rest_velocity_rad_s = {session_settings.rest_velocity_rad_s:g} rad/s."
+                f"The motor is not at rest: it moves by {rest_readings.speed_rad_s:.2g} rad/s, "
+                f"more than session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s."
             )
-        if rest_readings.torque_spread_nm > session_settings.rest_torque_nm:
+        if rest_readings.torque_spread_nm > settings.rest_torque_nm:
             return (
                 f"The beam is not at rest: the coupling torque varies by "
                 f"{rest_readings.torque_spread_nm:.2g} N·m, more than session.rest_torque_nm = "
-                f"{session_settings.rest_torque_nm:g} N·m."
+                f"{settings.rest_torque_nm:g} N·m."
             )
         return ""
 

@@ -258,31 +258,46 @@ class _MoveSearch:
         longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, sufficient, fraction_short, fraction_sufficient = 8, longest_ticks + 1, inf, 0.0
-        best: Real | None = None
+        too_short_ticks, sufficient_ticks, fraction_short, fraction_sufficient = (
+            8,
+            longest_ticks + 1,
+            inf,
+            0.0,
+        )
+        best_accelerations: Real | None = None
         for _ in range(_MAX_ROUNDS):
-            fraction, acceleration = self._least_limit_fraction(n)
-            if fraction <= 1.0:
-                sufficient, fraction_sufficient, best = n, fraction, acceleration
+            used_fraction, accelerations = self._least_limit_fraction(n)
+            if used_fraction <= 1.0:
+                sufficient_ticks, fraction_sufficient, best_accelerations = (
+                    n,
+                    used_fraction,
+                    accelerations,
+                )
             else:
-                too_short, fraction_short = n, fraction
-            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient <= max(
-                _CONVERGED_DURATION_RATIO * too_short, too_short + 1
+                too_short_ticks, fraction_short = n, used_fraction
+            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient_ticks <= max(
+                _CONVERGED_DURATION_RATIO * too_short_ticks, too_short_ticks + 1
             ):
                 break
-            if too_short >= longest_ticks:
+            if too_short_ticks >= longest_ticks:
                 break
             n = _next_duration_ticks(
-                too_short, sufficient, fraction_short, fraction_sufficient, n, fraction, self._order
+                too_short_ticks,
+                sufficient_ticks,
+                fraction_short,
+                fraction_sufficient,
+                n,
+                used_fraction,
+                self._order,
             )
             n = min(n, longest_ticks)
-        if best is None:
+        if best_accelerations is None:
             raise ExcitationError(
                 f"No move of at most {LONGEST_MOVE_S:g} s by {self._distance_rad:g} rad stays "
                 "within the limits of the profile; choose a smaller angle, or check "
                 "limits.velocity_rad_s."
             )
-        return best
+        return best_accelerations
 
     def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
         """Solve the linear programme for a move of n ticks.
@@ -623,21 +638,21 @@ def move(
         raise ExcitationError("A move is planned for a rig; run it with its profile.")
     if (angle_rad is None) == (by_rad is None):
         raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
-    for option, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
+    for option_name, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
         if value_rad is not None:
-            require_finite(option, value_rad, "rad")
+            require_finite(option_name, value_rad, "rad")
     if robust not in (0, 1):
         raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
-    plant = rig.move_plant(path, MOVE)
-    farthest_rad = _MAX_END_ANGLE_FRACTION * plant.angle_rad
+    rig_plant = rig.move_plant(path, MOVE)
+    farthest_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
     if not abs(target_rad) <= farthest_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either side; "
-            "choose at most "
+            f"{rig_plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either "
+            "side; choose at most "
             f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
@@ -646,9 +661,9 @@ def move(
             f"The motor stands at {start_rad:.4g} rad already, and a move is of "
             f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
         )
-    planned_move = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
-    segments = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
-    end = predict_move_end(plant, planned_move.reference_rad, ring_down_s)
+    planned_move = shortest_move(rig_plant, distance_rad, start_rad=start_rad, robust=bool(robust))
+    segment_ticks = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
+    end = predict_move_end(rig_plant, planned_move.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
@@ -666,9 +681,9 @@ def move(
     if end.arrival_s is not None:
         parameters["arrival_s"] = end.arrival_s
     excitation = assemble_excitation(
-        "move", parameters, rate_hz, segments, planned_move.reference_rad
+        "move", parameters, rate_hz, segment_ticks, planned_move.reference_rad
     )
-    return replace(excitation, stays=True, model=plant.model)
+    return replace(excitation, stays=True, model=rig_plant.model)
 
 
 def _allowed_range(farthest_rad: float, start_rad: float) -> str:

@@ -96,7 +96,7 @@ def parse_target(quantity: str, text: str) -> Target:
             f"The precision of {quantity!r} cannot be requested; choose from "
             f"{', '.join(QUANTITIES)}."
         )
-    option_text, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
+    option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
     example_text = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
@@ -105,11 +105,11 @@ def parse_target(quantity: str, text: str) -> Target:
     if colon_text:
         if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
-                f"{option_text}: {quantity} is no quantity of a mode; give for example {example_text}."
+                f"{option}: {quantity} is no quantity of a mode; give for example {example_text}."
             )
         if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
-                f"{option_text}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
+                f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
                 f"give for example {example_text}."
             )
         mode_number = int(mode_text)
@@ -120,19 +120,19 @@ def parse_target(quantity: str, text: str) -> Target:
         std = float(number_text)
     except ValueError:
         raise ExcitationError(
-            f"{option_text}: {std_text!r} is no standard deviation; give a percentage of the value or a "
+            f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
             f"number{f' in {unit}' if unit else ''}, for example {example_text}."
         ) from None
     std = std / 100 if is_relative else std
     if not (isfinite(std) and std > 0.0):
         raise ExcitationError(
-            f"{option_text}: the standard deviation must be finite and more than 0; give for example "
+            f"{option}: the standard deviation must be finite and more than 0; give for example "
             f"{example_text}."
         )
     useless_std = _USELESS_STD.get(quantity, inf)
     if not is_relative and std >= useless_std:
         raise ExcitationError(
-            f"{option_text}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
+            f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
             f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
     return Target(quantity, std, is_relative, mode_number)
@@ -186,19 +186,30 @@ class Quantities:
         estimate
             Estimate at which the quantities are linearised.
         """
-        modes = estimate.modes()
-        items, gradients = [], []
-        for target in targets:
-            for single_target in _targets_of_modes(target, modes):
-                value, gradient, impossible = _linearise(single_target, estimate, modes)
-                target_std = (
-                    single_target.std * abs(value) if single_target.relative else single_target.std
+        estimated_modes = estimate.modes()
+        quantity_items, gradients = [], []
+        for joint_target in targets:
+            for single_target in _targets_of_modes(joint_target, estimated_modes):
+                quantity_value, quantity_gradient, impossible_reason = _linearise(
+                    single_target, estimate, estimated_modes
                 )
-                if target_std == 0.0 and not impossible:
-                    impossible = f"{single_target.name} is 0: no percentage of it is a precision"
-                items.append(Precision(single_target, value, inf, target_std, impossible))
-                gradients.append(gradient)
-        return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
+                target_std = (
+                    single_target.std * abs(quantity_value)
+                    if single_target.relative
+                    else single_target.std
+                )
+                if target_std == 0.0 and not impossible_reason:
+                    impossible_reason = (
+                        f"{single_target.name} is 0: no percentage of it is a precision"
+                    )
+                quantity_items.append(
+                    Precision(single_target, quantity_value, inf, target_std, impossible_reason)
+                )
+                gradients.append(quantity_gradient)
+        return cls(
+            tuple(quantity_items),
+            np.array(gradients).reshape(len(quantity_items), len(estimate.names)),
+        )
 
     def ratios(self, covariance: Real) -> Real:
         """Return the ratio of each quantity's standard deviation to its target, shape (q,).

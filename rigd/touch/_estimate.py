@@ -119,7 +119,7 @@ class GrowingEstimate:
             Whether this is the first estimate. It then tries one and two obstacles at rest only,
             because other kinds take a second, and reports any other touch as of unknown kind.
         """
-        result = None
+        latest_result = None
         searched_from = record.angle_rad.size
         # The start that explained the beginning comes first.
         for detection_delay_s in sorted(
@@ -127,22 +127,24 @@ class GrowingEstimate:
         ):
             if not self._has_enough_samples(record, detection_delay_s):
                 continue
-            search = self._search(record, detection_delay_s)
+            explanation_search = self._search(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # After an unexplained one, only if the touch may have begun before.
-                search.likely_first_sample >= searched_from
+                explanation_search.likely_first_sample >= searched_from
                 or self._began_earlier(record, detection_delay_s)
             ):
                 continue
-            estimate = estimate_from_explanations(search, search.explain(first=first), scan=scan)
-            if result is None or estimate.explained:
-                result = estimate
-            if estimate.explained:
+            touch_estimate = estimate_from_explanations(
+                explanation_search, explanation_search.explain(first=first), scan=scan
+            )
+            if latest_result is None or touch_estimate.explained:
+                latest_result = touch_estimate
+            if touch_estimate.explained:
                 self._explaining_delay_s = detection_delay_s
-            if estimate.explained or first:
+            if touch_estimate.explained or first:
                 break
-            searched_from = search.first
-        return result or self._empty_estimate(record)
+            searched_from = explanation_search.first
+        return latest_result or self._empty_estimate(record)
 
     def _has_enough_samples(self, record: TouchRecord, detection_delay_s: float) -> bool:
         """Return whether enough samples precede a touch `detection_delay_s` before detection."""
@@ -166,22 +168,24 @@ class GrowingEstimate:
         """Return whether the touch seems to begin before the samples that may contain it."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
-        search = self._search(record, detection_delay_s)
-        if search.begins_before_window:
+        explanation_search = self._search(record, detection_delay_s)
+        if explanation_search.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
-        if search.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
+        if explanation_search.misfit < _POOR_MISFIT or not self._has_enough_samples(
+            record, longer_delay_s
+        ):
             return False
         longer_search = self._search(record, longer_delay_s)
         return (
-            longer_search.likely_first_sample < search.first
-            and longer_search.misfit < 0.5 * search.misfit
+            longer_search.likely_first_sample < explanation_search.first
+            and longer_search.misfit < 0.5 * explanation_search.misfit
         )
 
     def _empty_estimate(self, record: TouchRecord) -> TouchEstimate:
         """Return the estimate without any result, for a record with too few samples."""
-        empty = np.zeros(0)
-        channels = 1 if record.shear_n is None else 2
+        empty_array = np.zeros(0)
+        channel_count = 1 if record.shear_n is None else 2
         return TouchEstimate(
             x_m=None,
             time_s=None,
@@ -189,13 +193,13 @@ class GrowingEstimate:
             stiffness_n_per_m=None,
             kind="unknown",
             model=self._tables.model.source,
-            channels=channels,
+            channels=channel_count,
             samples=record.angle_rad.size - record.detected,
             chi2_per_degree=np.nan,
-            positions_m=empty,
-            log_likelihood=empty,
-            innovations=np.zeros((channels, 0)),
-            innovation_times_s=empty,
-            force_history_n=empty,
-            force_times_s=empty,
+            positions_m=empty_array,
+            log_likelihood=empty_array,
+            innovations=np.zeros((channel_count, 0)),
+            innovation_times_s=empty_array,
+            force_history_n=empty_array,
+            force_times_s=empty_array,
         )

@@ -51,10 +51,10 @@ class LaplaceLine:
 
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
-        shift = WRAP_AROUND_EXPONENT / (n * step_s)
-        used_frequencies = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(used_frequencies) / (n * step_s)
-        self._growth = np.exp(shift * step_s * np.arange(n))
+        real_part_per_s = WRAP_AROUND_EXPONENT / (n * step_s)
+        frequency_count = round(band * (n // 2)) + 1
+        self.s = real_part_per_s + 2j * np.pi * np.arange(frequency_count) / (n * step_s)
+        self._growth = np.exp(real_part_per_s * step_s * np.arange(n))
 
     def to_laplace(self, samples: Real) -> Complex:
         """Return the Laplace transform of a function of time, along the last axis.
@@ -67,8 +67,8 @@ class LaplaceLine:
         """
         from scipy.fft import rfft
 
-        damped = samples / self._growth[: samples.shape[-1]]
-        spectrum: Complex = rfft(damped, self.n, axis=-1)[..., : self.s.size]
+        damped_samples = samples / self._growth[: samples.shape[-1]]
+        spectrum: Complex = rfft(damped_samples, self.n, axis=-1)[..., : self.s.size]
         return spectrum
 
     def to_time(self, transform: Complex, steps: int) -> Real:
@@ -110,9 +110,9 @@ class ForcePulse:
         fine_step_s = step_s / _OVERSAMPLING
         self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLING * steps, real=True), fine_step_s)
         s = self.line.s
-        pulse = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
+        pulse_transform = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
-        self._delayed_pulse = pulse * np.exp(-s * step_s)
+        self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
     def kernels(self, response: Complex) -> Real:
         """Return the kernels of responses: their values over time for one hat, shape (k, steps).
@@ -122,10 +122,10 @@ class ForcePulse:
         response
             Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
         """
-        values = self.line.to_time(
+        fine_values = self.line.to_time(
             self._delayed_pulse * response, _OVERSAMPLING * (self._steps + 1)
         )
-        return values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
+        return fine_values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,10 +159,14 @@ class ContactKernels:
         steps
             Number of time steps of the result.
         """
-        first, weights = cubic_weights(x_m, self.x_m)
-        tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
+        first_rows, weights = cubic_weights(x_m, self.x_m)
+        kernel_tables = (
+            self.displacement[:, :steps],
+            self.torque[:, :steps],
+            self.shear[:, :steps],
+        )
         return ContactKernels(
-            x_m, self.step_s, *(interpolate_rows(t, first, weights) for t in tables)
+            x_m, self.step_s, *(interpolate_rows(t, first_rows, weights) for t in kernel_tables)
         )
 
     def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
@@ -175,18 +179,20 @@ class ContactKernels:
         steps
             Number of time steps of the result.
         """
-        pulse = 1 - np.abs(np.arange(1 - factor, factor)) / factor
-        tables = []
-        for table in (self.displacement, self.torque, self.shear):
-            padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
+        pulse_weights = 1 - np.abs(np.arange(1 - factor, factor)) / factor
+        wide_tables = []
+        for kernel_table in (self.displacement, self.torque, self.shear):
+            padded_table = np.pad(kernel_table, ((0, 0), (factor - 1, factor - 1)))
             # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
             wide_response = sum(
-                weight
-                * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
-                for i, weight in zip(range(1 - factor, factor), pulse, strict=True)
+                pulse_weight
+                * padded_table[
+                    :, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor
+                ]
+                for i, pulse_weight in zip(range(1 - factor, factor), pulse_weights, strict=True)
             )
-            tables.append(np.ascontiguousarray(wide_response))
-        return ContactKernels(self.x_m, factor * self.step_s, *tables)
+            wide_tables.append(np.ascontiguousarray(wide_response))
+        return ContactKernels(self.x_m, factor * self.step_s, *wide_tables)
 
 
 def contact_kernels(
@@ -212,22 +218,22 @@ def contact_kernels(
     sensor_filter
         Filters of torque and shear.
     """
-    pulse = ForcePulse(step_s, steps)
-    s = pulse.line.s
-    grid = PointForceGrid(s, beam, damping)
+    force_pulse = ForcePulse(step_s, steps)
+    s = force_pulse.line.s
+    force_grid = PointForceGrid(s, beam, damping)
     filter_response = sensor_filter.response(s)
-    stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
-    tables = np.empty((3, x_m.size, steps))
+    complex_stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
+    kernel_tables = np.empty((3, x_m.size, steps))
     for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
         x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
-            grid.per_force(x, x).T,
-            -filter_response * grid.per_angle(x).T,
-            filter_response * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+            force_grid.per_force(x, x).T,
+            -filter_response * force_grid.per_angle(x).T,
+            filter_response * complex_stiffness * force_grid.per_force(np.zeros_like(x), x, 3).T,
         )
-        for table, response in zip(tables, responses, strict=True):
-            table[i : i + _POSITIONS_AT_ONCE] = pulse.kernels(response)
-    return ContactKernels(x_m, step_s, *tables)
+        for kernel_table, laplace_response in zip(kernel_tables, responses, strict=True):
+            kernel_table[i : i + _POSITIONS_AT_ONCE] = force_pulse.kernels(laplace_response)
+    return ContactKernels(x_m, step_s, *kernel_tables)
 
 
 @dataclass(frozen=True, slots=True)
@@ -269,17 +275,19 @@ def cross_kernels(
 
     The arguments are those of `contact_kernels`.
     """
-    pulse = ForcePulse(step_s, steps)
-    s = pulse.line.s
-    inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
-    internal = 1 + damping.zeta * s**damping.alpha
-    wave = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
-    stiffness = beam.bending_stiffness_n_m2 * beam.length_m
-    per_force = 1 / (stiffness * (inertial + internal * wave[:, None] ** 4))
-    shapes = np.stack(
+    force_pulse = ForcePulse(step_s, steps)
+    s = force_pulse.line.s
+    inertial_factor = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
+    stiffness_factor = 1 + damping.zeta * s**damping.alpha
+    wave_numbers = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
+    stiffness_scale = beam.bending_stiffness_n_m2 * beam.length_m
+    per_force = 1 / (
+        stiffness_scale * (inertial_factor + stiffness_factor * wave_numbers[:, None] ** 4)
+    )
+    mode_shapes = np.stack(
         [mode_shape(i + 1, x_m / beam.length_m) for i in range(_CROSS_MODE_COUNT)], axis=1
     )
-    return CrossKernels(x_m, shapes, pulse.kernels(per_force))
+    return CrossKernels(x_m, mode_shapes, force_pulse.kernels(per_force))
 
 
 _POSITIONS_AT_ONCE = 8
@@ -319,19 +327,21 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     """
     from numpy.polynomial import chebyshev
 
-    nodes = chebyshev.chebpts1(count)
-    scaled = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
-    at_nodes, at_positions = (chebyshev.chebvander(each, count - 1) for each in (nodes, scaled))
-    between: Real = at_positions @ np.linalg.inv(at_nodes)
-    return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
+    unit_nodes = chebyshev.chebpts1(count)
+    unit_positions = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
+    at_nodes, at_positions = (
+        chebyshev.chebvander(unit_points, count - 1) for unit_points in (unit_nodes, unit_positions)
+    )
+    interpolation_matrix: Real = at_positions @ np.linalg.inv(at_nodes)
+    return x_m[0] + (x_m[-1] - x_m[0]) * (unit_nodes + 1) / 2, interpolation_matrix
 
 
-def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(positions_at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
-    at
+    positions_at
         Points to which is interpolated, shape (k,).
     grid
         At least four equally spaced, increasing points.
@@ -343,9 +353,9 @@ def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     weights : ndarray, shape (k, 4)
         Weights of these four grid points.
     """
-    position = (np.asarray(at) - grid[0]) / (grid[1] - grid[0])
-    first = np.clip(np.floor(position).astype(np.intp) - 1, 0, grid.size - 4)
-    u = position - first
+    grid_positions = (np.asarray(positions_at) - grid[0]) / (grid[1] - grid[0])
+    first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid.size - 4)
+    u = grid_positions - first_indices
     weights = np.stack(
         [
             -(u - 1) * (u - 2) * (u - 3) / 6,
@@ -355,12 +365,12 @@ def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
         ],
         axis=-1,
     )
-    return first, weights
+    return first_indices, weights
 
 
-def interpolate_rows(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
+def interpolate_rows(table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
     """Interpolate between the rows of a table (m, n) with the result of `cubic_weights`: (k, n)."""
-    total = weights[:, 0, None] * table[first]
+    weighted_sum = weights[:, 0, None] * table[first_rows]
     for i in range(1, 4):
-        total += weights[:, i, None] * table[first + i]
-    return total
+        weighted_sum += weights[:, i, None] * table[first_rows + i]
+    return weighted_sum

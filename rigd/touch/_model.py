@@ -72,21 +72,21 @@ class TouchModel:
         beam, damping = self.beam, self.damping
         match name:
             case "bending_stiffness_n_m2":
-                factor = 1 + by / beam.bending_stiffness_n_m2
+                coefficient = 1 + by / beam.bending_stiffness_n_m2
                 beam = replace(
                     beam,
-                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * factor,
-                    density_kg_per_m=beam.density_kg_per_m * factor,
+                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * coefficient,
+                    density_kg_per_m=beam.density_kg_per_m * coefficient,
                 )
             case "density_over_stiffness":
-                factor = 1 + by / beam.density_over_stiffness
-                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * factor)
+                coefficient = 1 + by / beam.density_over_stiffness
+                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * coefficient)
             case "zeta" | "gamma":
                 damping = replace(damping, **{name: max(getattr(damping, name) + by, 0.0)})
             case "alpha" | "lambda":
                 key = "lambda_" if name == "lambda" else name
-                order = min(max(getattr(damping, key) + by, 0.0), 1.99)
-                damping = replace(damping, **{key: order})
+                exponent = min(max(getattr(damping, key) + by, 0.0), 1.99)
+                damping = replace(damping, **{key: exponent})
             case "tool_inertia_kg_m2":
                 return replace(self, tool_inertia_kg_m2=self.tool_inertia_kg_m2 + by)
             case "delay_s":
@@ -121,7 +121,7 @@ class TouchModel:
         sensor_filter
             Filters of torque and shear.
         """
-        values = {
+        parameter_values = {
             "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
             "density_over_stiffness": beam.density_over_stiffness,
             "zeta": damping.zeta,
@@ -134,7 +134,10 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: factor * values[name] for name, factor in _ASSUMED_RELATIVE_STD.items()},
+            std={
+                parameter_name: relative_std * parameter_values[parameter_name]
+                for parameter_name, relative_std in _ASSUMED_RELATIVE_STD.items()
+            },
         )
 
     @classmethod

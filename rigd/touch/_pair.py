@@ -70,27 +70,38 @@ class TwoObstacleContact:
         force : ndarray, shape (k, n)
             Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
-        contact, instant = self._contact, parameters[:, 1]
-        steps = contact.step_count(instant, window)
-        positions = parameters[:, 0], parameters[:, 3]
-        kernels = [self._kernels.at_positions(x, steps) for x in positions]
-        (beyond, side), (beyond_other, side_other) = (
-            contact.motion_beyond_obstacle(x, instant, steps) for x in positions
+        obstacle_contact, instants_s = self._contact, parameters[:, 1]
+        step_count = obstacle_contact.step_count(instants_s, window)
+        positions_m = parameters[:, 0], parameters[:, 3]
+        local_kernels = [self._kernels.at_positions(x, step_count) for x in positions_m]
+        (beyond_first_m, first_side), (beyond_second_m, second_side) = (
+            obstacle_contact.motion_beyond_obstacle(x, instants_s, step_count) for x in positions_m
         )
-        cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
-        pressing = integrate_two_contacts(
-            (kernels[0].displacement, kernels[1].displacement),
-            cross,
-            (beyond, beyond_other - parameters[:, 4:5]),
+        local_cross_kernels = (
+            self._crossing.between_positions(*positions_m, step_count)
+            * (first_side * second_side)[:, None]
+        )
+        pressing_forces_n = integrate_two_contacts(
+            (local_kernels[0].displacement, local_kernels[1].displacement),
+            local_cross_kernels,
+            (beyond_first_m, beyond_second_m - parameters[:, 4:5]),
             (np.exp(parameters[:, 2]), np.exp(parameters[:, 5])),
         )
-        forces = -side[:, None] * pressing[0], -side_other[:, None] * pressing[1]
-        channels = window.motion.noise.size
-        first, second = (
-            contact.effects((local.torque, local.shear)[:channels], force, instant, window)
-            for local, force in zip(kernels, forces, strict=True)
+        forces_n = (
+            -first_side[:, None] * pressing_forces_n[0],
+            -second_side[:, None] * pressing_forces_n[1],
         )
-        return first + second, forces[0]
+        channel_count = window.motion.noise.size
+        first_effect, second_effect = (
+            obstacle_contact.effects(
+                (position_kernels.torque, position_kernels.shear)[:channel_count],
+                force_n,
+                instants_s,
+                window,
+            )
+            for position_kernels, force_n in zip(local_kernels, forces_n, strict=True)
+        )
+        return first_effect + second_effect, forces_n[0]
 
     def predict_channels(self, parameters: Real, window: WhitenedWindow) -> Real:
         """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
@@ -137,36 +148,43 @@ class TwoObstacleContact:
         Their likelihood is computed from the first-order effect of the second obstacle.
         """
         x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
-        instants = np.full(_POSITION_COUNT, single_obstacle[1])
-        steps = self._contact.step_count(instants, window)
+        instants_s = np.full(_POSITION_COUNT, single_obstacle[1])
+        step_count = self._contact.step_count(instants_s, window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
-        beyond, _ = self._contact.motion_beyond_obstacle(x_m, instants, steps)
-        distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
-        pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
-        with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))
+        beyond_m, _ = self._contact.motion_beyond_obstacle(x_m, instants_s, step_count)
+        distances_m = np.maximum(beyond_m[:, np.minimum(delay_steps, step_count - 1)], 0.0)
+        trial_pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
+        with_second = np.tile(trial_pair, (_POSITION_COUNT * delay_steps.size, 1))
         with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
         without_second = np.concatenate(
             [single_obstacle, [x_m[-1], space.high[4], MIN_LN_STIFFNESS]]
         )
         changed_first = without_second + np.diag(space.difference)[:3]
-        rows = np.vstack([without_second, changed_first, with_second])
-        residual = window.residuals(self.predict_channels(rows, window))
-        residual_without_second, effect = residual[0], residual[4:] - residual[0]
+        candidate_rows = np.vstack([without_second, changed_first, with_second])
+        residuals = window.residuals(self.predict_channels(candidate_rows, window))
+        residual_without_second, second_effects = residuals[0], residuals[4:] - residuals[0]
         # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(
-            ((residual[1:4] - residual_without_second) / space.difference[:3, None]).T
+            ((residuals[1:4] - residual_without_second) / space.difference[:3, None]).T
         )
-        projected_effect = effect - (effect @ q) @ q.T
-        power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
-        factor = np.maximum(-(projected_effect @ residual_without_second) / power, 0.0)
-        gain = (factor**2 * power).reshape(_POSITION_COUNT, -1)
-        likeliest = np.argsort(-gain.max(axis=1))[:count]
-        chosen = likeliest * delay_steps.size + gain[likeliest].argmax(axis=1)
-        starts: Real = with_second[chosen]
-        starts[:, 5] += np.log(np.clip(factor[chosen], 0.1, 100.0))
-        follows = (residual_without_second + factor[chosen, None] * effect[chosen]) @ q
-        moves = -np.linalg.solve(triangle, follows.T).T
-        starts[:, :3] += np.clip(moves, -4 * space.scale[:3], 4 * space.scale[:3])
+        projected_effect = second_effects - (second_effects @ q) @ q.T
+        effect_power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
+        effect_factors = np.maximum(
+            -(projected_effect @ residual_without_second) / effect_power, 0.0
+        )
+        chi2_gain = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
+        likeliest_positions = np.argsort(-chi2_gain.max(axis=1))[:count]
+        chosen_rows = likeliest_positions * delay_steps.size + chi2_gain[
+            likeliest_positions
+        ].argmax(axis=1)
+        starts: Real = with_second[chosen_rows]
+        starts[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
+        first_obstacle_residuals = (
+            residual_without_second
+            + effect_factors[chosen_rows, None] * second_effects[chosen_rows]
+        ) @ q
+        first_obstacle_changes = -np.linalg.solve(triangle, first_obstacle_residuals.T).T
+        starts[:, :3] += np.clip(first_obstacle_changes, -4 * space.scale[:3], 4 * space.scale[:3])
         return starts
 
     @staticmethod

@@ -86,12 +86,14 @@ class WhitenedWindow:
         """
         if deviations is None:
             deviations = motion.design[:, first:end] @ motion.spread
-        noise = motion.noise[:, None, None]
-        columns = (deviations[:, : end - first] / noise).reshape(-1, deviations.shape[2])
-        covariance = np.eye(columns.shape[0]) + columns @ columns.T
+        noise_stds = motion.noise[:, None, None]
+        scaled_deviations = (deviations[:, : end - first] / noise_stds).reshape(
+            -1, deviations.shape[2]
+        )
+        covariance = np.eye(scaled_deviations.shape[0]) + scaled_deviations @ scaled_deviations.T
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        raw = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
-        return cls(motion, first, end, whitening, whitening @ raw)
+        scaled_innovations = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
+        return cls(motion, first, end, whitening, whitening @ scaled_innovations)
 
     def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Return the whitened innovations minus predicted effects of touches, shape (k, n).
@@ -103,12 +105,12 @@ class WhitenedWindow:
         predicted
             Effect of each touch on torque and base shear, shape (k, c, samples).
         """
-        noise, whitening, data = (
-            each.astype(predicted.dtype, copy=False)
-            for each in (self.motion.noise, self.whitening, self.data)
+        noise_stds, whitening, whitened_data = (
+            float_array.astype(predicted.dtype, copy=False)
+            for float_array in (self.motion.noise, self.whitening, self.data)
         )
-        scaled = (predicted / noise[:, None]).reshape(predicted.shape[0], -1)
-        return data - scaled @ whitening.T
+        scaled_predictions = (predicted / noise_stds[:, None]).reshape(predicted.shape[0], -1)
+        return whitened_data - scaled_predictions @ whitening.T
 
 
 class ObstacleContact:
@@ -157,24 +159,26 @@ class ObstacleContact:
         force : ndarray, shape (k, n)
             Force on the beam in N, at the steps from the touch on.
         """
-        motion = self._motion
-        x, instant = parameters[:, 0], parameters[:, 1]
+        free_motion = self._motion
+        x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at_positions(x, steps) if kernels is None else kernels
-        approach, sides = self.motion_beyond_obstacle(x, instant, steps, side)
+        time_steps = self.step_count(instants_s, window)
+        local_kernels = self._kernels.at_positions(x, time_steps) if kernels is None else kernels
+        approaches_m, pressing_sides = self.motion_beyond_obstacle(x, instants_s, time_steps, side)
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
-            np.broadcast_to(local_kernels.displacement[:, :steps], approach.shape),
-            approach,
+            np.broadcast_to(local_kernels.displacement[:, :time_steps], approaches_m.shape),
+            approaches_m,
             np.exp(parameters[:, 2]),
             step_s,
-            *(sides * motion_parameters[0],) if len(motion_parameters) else (),
+            *(pressing_sides * motion_parameters[0],) if len(motion_parameters) else (),
             *motion_parameters[1:2],
         )
-        force = -sides[:, None] * pressing_force_n
-        tables = (local_kernels.torque, local_kernels.shear)[: motion.innovations.shape[0]]
-        return self.effects(tables, force, instant, window), force
+        forces_n = -pressing_sides[:, None] * pressing_force_n
+        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+            : free_motion.innovations.shape[0]
+        ]
+        return self.effects(kernel_tables, forces_n, instants_s, window), forces_n
 
     def effect_of_changed_motion(
         self, parameters: Real, window: WhitenedWindow, displacement_changes_m: Real
@@ -194,22 +198,32 @@ class ObstacleContact:
             Changes of the displacement at the obstacle's position, on the free motion's steps from
             its first step on, shape (r, columns).
         """
-        x, instant = parameters[:1], parameters[1:2]
-        steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at_positions(x, steps)
-        approach, side = self.motion_beyond_obstacle(x, instant, steps)
-        instants = np.repeat(instant, len(displacement_changes_m))
-        added_approach_m = side * self._on_kernel_steps(displacement_changes_m, instants, steps)
-        all_approaches = np.vstack(
-            [approach, approach + added_approach_m - added_approach_m[:, :1]]
+        x, instant_s = parameters[:1], parameters[1:2]
+        time_steps = self.step_count(instant_s, window)
+        local_kernels = self._kernels.at_positions(x, time_steps)
+        approach_m, pressing_side = self.motion_beyond_obstacle(x, instant_s, time_steps)
+        repeated_instants_s = np.repeat(instant_s, len(displacement_changes_m))
+        added_approach_m = pressing_side * self._on_kernel_steps(
+            displacement_changes_m, repeated_instants_s, time_steps
         )
-        stiffness = np.full((1, len(all_approaches)), np.exp(parameters[2]))
+        all_approaches = np.vstack(
+            [approach_m, approach_m + added_approach_m - added_approach_m[:, :1]]
+        )
+        stiffnesses_n_per_m = np.full((1, len(all_approaches)), np.exp(parameters[2]))
         pressing_force_n = integrate_contact(
-            local_kernels.displacement, all_approaches[None], stiffness, self._kernels.step_s
+            local_kernels.displacement,
+            all_approaches[None],
+            stiffnesses_n_per_m,
+            self._kernels.step_s,
         )[0]
-        tables = (local_kernels.torque, local_kernels.shear)[: self._motion.innovations.shape[0]]
+        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+            : self._motion.innovations.shape[0]
+        ]
         return self.effects(
-            tables, -side * (pressing_force_n[1:] - pressing_force_n[0]), instants, window
+            kernel_tables,
+            -pressing_side * (pressing_force_n[1:] - pressing_force_n[0]),
+            repeated_instants_s,
+            window,
         )
 
     def step_count(self, instant: Real, window: WhitenedWindow) -> int:
@@ -223,8 +237,8 @@ class ObstacleContact:
             Samples at whose end the integration ends.
         """
         step_s = self._kernels.step_s
-        steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
-        return min(max(steps, 4), self._kernels.steps)
+        needed_steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
+        return min(max(needed_steps, 4), self._kernels.steps)
 
     def pressing_direction(self, parameters: Real) -> float:
         """Return the direction of the beam's motion at a touch, 1 or -1.
@@ -252,14 +266,14 @@ class ObstacleContact:
         window
             Samples for which the effect is predicted.
         """
-        motion = self._motion
+        free_motion = self._motion
         step_s = self._kernels.step_s
-        stride = round((motion.t[1] - motion.t[0]) / step_s)
-        samples = window.end - window.first
-        begin = (motion.t[window.first] - instant) / step_s
+        steps_per_sample = round((free_motion.t[1] - free_motion.t[0]) / step_s)
+        sample_count = window.end - window.first
+        begin_steps = (free_motion.t[window.first] - instant) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
-        aligned = shift_rows(force, begin, (samples - 1) * stride + 1)
-        return contact_responses(tables, aligned, stride, samples)
+        aligned_forces = shift_rows(force, begin_steps, (sample_count - 1) * steps_per_sample + 1)
+        return contact_responses(tables, aligned_forces, steps_per_sample, sample_count)
 
     def motion_beyond_obstacle(
         self, x: Real, instant: Real, steps: int, given_direction: float | None = None
@@ -283,27 +297,29 @@ class ObstacleContact:
         side : ndarray, shape (k,)
             Direction of the motion, 1 or -1.
         """
-        motion = self._motion
-        first, weights = cubic_weights(x, self._x_m)
-        displacement_m = interpolate_rows(motion.displacement_m, first, weights)
-        free = self._on_kernel_steps(displacement_m, instant, steps)
+        free_motion = self._motion
+        first_rows, weights = cubic_weights(x, self._x_m)
+        displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
+        free_motion_m = self._on_kernel_steps(displacement_m, instant, steps)
         if given_direction is None:
-            before = shift_rows(displacement_m, (instant - motion.first_s) / motion.step_s - 1.0, 1)
-            side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
+            position_before_m = shift_rows(
+                displacement_m, (instant - free_motion.first_s) / free_motion.step_s - 1.0, 1
+            )
+            pressing_sides = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
-            side = np.full(x.size, given_direction)
-        return side[:, None] * (free - free[:, :1]), side
+            pressing_sides = np.full(x.size, given_direction)
+        return pressing_sides[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_sides
 
     def _on_kernel_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
         """Interpolate displacements to the kernels' time steps, each row from its instant on."""
-        motion = self._motion
-        begin = (instant - motion.first_s) / motion.step_s
-        substeps = max(1, round(motion.step_s / self._kernels.step_s))
-        interpolated = np.empty((begin.size, substeps * -(-steps // substeps)))
+        free_motion = self._motion
+        begin_steps = (instant - free_motion.first_s) / free_motion.step_s
+        substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
+        interpolated_m = np.empty((begin_steps.size, substeps * -(-steps // substeps)))
         for i in range(substeps):
-            part = interpolated[:, i::substeps]
-            part[:] = shift_rows(displacement_m, begin + i / substeps, part.shape[1])
-        return interpolated[:, :steps]
+            substep = interpolated_m[:, i::substeps]
+            substep[:] = shift_rows(displacement_m, begin_steps + i / substeps, substep.shape[1])
+        return interpolated_m[:, :steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -348,53 +364,81 @@ def find_minima(
     free
         Whether each parameter of each start is free, shape (k, p); None: all are free.
     """
-    current = np.clip(starts, space.low, space.high)
-    damping = np.full(len(current), 1e-2)
-    residual, jacobian = _linearise(predict, window, current, space)
-    chi2 = np.einsum("kn,kn->k", residual, residual)
-    active = np.ones(len(current), dtype=bool)
+    best_parameters = np.clip(starts, space.low, space.high)
+    damping_factors = np.full(len(best_parameters), 1e-2)
+    current_residuals, jacobians = _linearise(predict, window, best_parameters, space)
+    chi2 = np.einsum("kn,kn->k", current_residuals, current_residuals)
+    is_active = np.ones(len(best_parameters), dtype=bool)
     regularisation = 1e-6 / space.scale**2
     for _ in range(rounds):
-        rows = np.flatnonzero(active)
-        j, r = jacobian[rows], residual[rows]
+        active_rows = np.flatnonzero(is_active)
+        j, r = jacobians[active_rows], current_residuals[active_rows]
         if free is not None:
-            j = j * free[rows, None]
-        normal = np.einsum("knp,knq->kpq", j, j)
-        gradient = np.einsum("knp,kn->kp", j, r)
-        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + regularisation
-        normal += diagonal[:, :, None] * np.eye(current.shape[1])
-        step = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-        step = np.clip(step, -8 * space.scale, 8 * space.scale)
-        trial = np.clip(current[rows] + step, space.low, space.high)
-        predicted_residual = r + np.einsum("knp,kp->kn", j, trial - current[rows])
-        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", predicted_residual, predicted_residual)
-        new_residual, new_jacobian = _linearise(predict, window, trial, space)
-        new_chi2 = np.einsum("kn,kn->k", new_residual, new_residual)
-        gain = chi2[rows] - new_chi2
-        is_improved = gain > 0
-        accepted_rows = rows[is_improved]
-        current[accepted_rows], chi2[accepted_rows] = trial[is_improved], new_chi2[is_improved]
-        residual[accepted_rows], jacobian[accepted_rows] = (
-            new_residual[is_improved],
+            j = j * free[active_rows, None]
+        normal_matrices = np.einsum("knp,knq->kpq", j, j)
+        gradients = np.einsum("knp,kn->kp", j, r)
+        normal_diagonals = (
+            np.einsum("kpp->kp", normal_matrices) * damping_factors[active_rows, None]
+            + regularisation
+        )
+        normal_matrices += normal_diagonals[:, :, None] * np.eye(best_parameters.shape[1])
+        parameter_steps = -np.linalg.solve(normal_matrices, gradients[:, :, None])[:, :, 0]
+        parameter_steps = np.clip(parameter_steps, -8 * space.scale, 8 * space.scale)
+        trial_parameters = np.clip(
+            best_parameters[active_rows] + parameter_steps, space.low, space.high
+        )
+        predicted_residual = r + np.einsum(
+            "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
+        )
+        predicted_gain = chi2[active_rows] - np.einsum(
+            "kn,kn->k", predicted_residual, predicted_residual
+        )
+        new_residuals, new_jacobian = _linearise(predict, window, trial_parameters, space)
+        new_chi2 = np.einsum("kn,kn->k", new_residuals, new_residuals)
+        chi2_gain = chi2[active_rows] - new_chi2
+        is_improved = chi2_gain > 0
+        accepted_rows = active_rows[is_improved]
+        best_parameters[accepted_rows], chi2[accepted_rows] = (
+            trial_parameters[is_improved],
+            new_chi2[is_improved],
+        )
+        current_residuals[accepted_rows], jacobians[accepted_rows] = (
+            new_residuals[is_improved],
             new_jacobian[is_improved],
         )
-        damping[rows] = np.where(is_improved, damping[rows] / 6, damping[rows] * 8)
+        damping_factors[active_rows] = np.where(
+            is_improved, damping_factors[active_rows] / 6, damping_factors[active_rows] * 8
+        )
         # Residuals have kinks where contacts begin and end: short steps may fail to reduce them.
-        active[rows[np.where(is_improved, gain, predicted_gain) < _MIN_CHI2_REDUCTION]] = False
-        if not active.any():
+        is_active[
+            active_rows[np.where(is_improved, chi2_gain, predicted_gain) < _MIN_CHI2_REDUCTION]
+        ] = False
+        if not is_active.any():
             break
-    return Minima(current, chi2, jacobian)
+    return Minima(best_parameters, chi2, jacobians)
 
 
 def _linearise(
     predict: Prediction, window: WhitenedWindow, current: Real, space: ParameterRanges
 ) -> tuple[Real, Real]:
     """Return the residuals of candidates, (k, n), and derivatives by the parameters, (k, n, p)."""
-    width = current.shape[1]
-    shifts = np.where(current + space.difference > space.high, -space.difference, space.difference)
-    rows = np.concatenate([current, *(current + np.eye(width)[i] * shifts for i in range(width))])
-    residuals = window.residuals(predict(rows, window)).reshape(width + 1, len(current), -1)
-    derivatives = (residuals[1:] - residuals[0]) / shifts.T[:, :, None]
+    parameter_count = current.shape[1]
+    parameter_shifts = np.where(
+        current + space.difference > space.high, -space.difference, space.difference
+    )
+    shifted_candidates = np.concatenate(
+        [
+            current,
+            *(
+                current + np.eye(parameter_count)[i] * parameter_shifts
+                for i in range(parameter_count)
+            ),
+        ]
+    )
+    residuals = window.residuals(predict(shifted_candidates, window)).reshape(
+        parameter_count + 1, len(current), -1
+    )
+    derivatives = (residuals[1:] - residuals[0]) / parameter_shifts.T[:, :, None]
     return residuals[0], np.moveaxis(derivatives, 0, -1)
 
 
@@ -420,16 +464,16 @@ class CandidateGrid:
     def __init__(self, kernels: ContactKernels, stride: int, rate_hz: float, samples: int) -> None:
         self._ratio = round(1 / (rate_hz * kernels.step_s))
         self._samples, self._stride, self._step_s = samples, stride, kernels.step_s
-        steps = self._ratio * samples
+        time_steps = self._ratio * samples
         self._x_m = kernels.x_m[::stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._kernel = kernels.displacement[::stride, :steps].astype(np.float32)
-        lag = self._ratio * np.arange(samples)[:, None] - np.arange(steps)
+        self._kernel = kernels.displacement[::stride, :time_steps].astype(np.float32)
+        lag_steps = self._ratio * np.arange(samples)[:, None] - np.arange(time_steps)
         self._channels = [
-            np.where(lag >= 0, table[::stride][:, np.maximum(lag, 0)], 0.0)
+            np.where(lag_steps >= 0, kernel_table[::stride][:, np.maximum(lag_steps, 0)], 0.0)
             .transpose(0, 2, 1)
             .astype(np.float32)
-            for table in (kernels.torque, kernels.shear)
+            for kernel_table in (kernels.torque, kernels.shear)
         ]  # (positions, steps, samples)
 
     def integrate(
@@ -447,13 +491,15 @@ class CandidateGrid:
             Index of the last sample at which the touch may begin. The earliest is the first sample
             of the window.
         """
-        samples = np.arange(window.first + 1, latest + 1)
-        batches = np.array_split(samples, -(-samples.size // _INSTANTS_AT_ONCE))
-        chi2 = [self._sums_of_squares(motion, window, batch) for batch in batches]
-        starts = np.meshgrid(
-            self._x_m, motion.t[samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
+        touch_samples = np.arange(window.first + 1, latest + 1)
+        sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
+        chi2 = [
+            self._sums_of_squares(motion, window, sample_batch) for sample_batch in sample_batches
+        ]
+        grid_axes = np.meshgrid(
+            self._x_m, motion.t[touch_samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
         )
-        return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
+        return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _sums_of_squares(
         self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]
@@ -462,30 +508,32 @@ class CandidateGrid:
 
         The shape is (positions, instants, stiffnesses).
         """
-        positions, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
-        length = window.end - int(samples[0])
-        steps = self._ratio * length
-        begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
-        columns = begins[:, None] + np.arange(-1, steps)
-        last = motion.displacement_m.shape[1] - 1
-        displacement_m = motion.displacement_m[:: self._stride][:, np.minimum(columns, last)]
+        position_count, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
+        sample_count = window.end - int(samples[0])
+        time_steps = self._ratio * sample_count
+        begin_steps = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
+        step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
+        last_column = motion.displacement_m.shape[1] - 1
+        displacement_m = motion.displacement_m[:: self._stride][
+            :, np.minimum(step_columns, last_column)
+        ]
         # Axes: position, instant, step.
-        side = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
+        pressing_sides = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
             :, :, None
         ].astype(np.float32)
-        approach = (side * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])).astype(
-            np.float32
-        )
+        approaches_m = (
+            pressing_sides * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])
+        ).astype(np.float32)
         pressing_force_n = integrate_contact(
-            self._kernel[:, :steps],
-            np.repeat(approach, stiffness_count, axis=1),
-            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (positions, samples.size)),
+            self._kernel[:, :time_steps],
+            np.repeat(approaches_m, stiffness_count, axis=1),
+            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (position_count, samples.size)),
             self._step_s,
         )
-        force = -np.repeat(side, stiffness_count, axis=1) * pressing_force_n
-        predicted = np.zeros(
+        forces_n = -np.repeat(pressing_sides, stiffness_count, axis=1) * pressing_force_n
+        predicted_effects = np.zeros(
             (
-                positions,
+                position_count,
                 samples.size,
                 stiffness_count,
                 motion.noise.size,
@@ -493,15 +541,21 @@ class CandidateGrid:
             ),
             dtype=np.float32,
         )
-        for channel in range(motion.noise.size):
-            effect = force @ self._channels[channel][:, :steps, :length]
-            effect = effect.reshape(positions, samples.size, stiffness_count, length)
-            for i, sample in enumerate(samples):
-                count = window.end - sample
-                predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
-        residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
-        chi2: Real = np.einsum("kn,kn->k", residual, residual)
-        return chi2.reshape(positions, samples.size, stiffness_count)
+        for channel_index in range(motion.noise.size):
+            channel_effect = forces_n @ self._channels[channel_index][:, :time_steps, :sample_count]
+            channel_effect = channel_effect.reshape(
+                position_count, samples.size, stiffness_count, sample_count
+            )
+            for i, touch_sample in enumerate(samples):
+                later_samples = window.end - touch_sample
+                predicted_effects[:, i, :, channel_index, -later_samples:] = channel_effect[
+                    :, i, :, :later_samples
+                ]
+        sample_residuals = window.residuals(
+            predicted_effects.reshape(-1, *predicted_effects.shape[3:])
+        )
+        chi2: Real = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
+        return chi2.reshape(position_count, samples.size, stiffness_count)
 
 
 _INSTANTS_AT_ONCE = 16
@@ -522,6 +576,6 @@ def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Re
     candidates
         Parameters of the candidates, shape (k, p).
     """
-    residual = window.residuals(predict(candidates, window))
-    chi2: Real = np.einsum("kn,kn->k", residual, residual)
+    candidate_residuals = window.residuals(predict(candidates, window))
+    chi2: Real = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
     return chi2

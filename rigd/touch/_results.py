@@ -77,19 +77,24 @@ class TouchEstimate:
         start_s
             Time of the record's first sample, which is added to the instant of touch.
         """
-        time = self.time_s
-        if time is not None:
-            low, high = time.interval_95
-            time = replace(
-                time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
+        touch_time = self.time_s
+        if touch_time is not None:
+            low_s, high_s = touch_time.interval_95
+            touch_time = replace(
+                touch_time,
+                value=touch_time.value + start_s,
+                interval_95=(low_s + start_s, high_s + start_s),
             )
         quantities = {
             "x_m": self.x_m,
-            "time_s": time,
+            "time_s": touch_time,
             "force_n": self.force_n,
             "stiffness_n_per_m": self.stiffness_n_per_m,
         }
-        return {name: each and each.as_dict() for name, each in quantities.items()} | {
+        return {
+            quantity_name: estimated and estimated.as_dict()
+            for quantity_name, estimated in quantities.items()
+        } | {
             "kind": self.kind,
             "model": self.model,
         }

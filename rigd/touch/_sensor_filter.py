@@ -51,10 +51,10 @@ class SensorFilter:
         spacing_s
             Time between two records.
         """
-        weights = np.full(records, 1 / records)
+        record_weights = np.full(records, 1 / records)
         if kind == "triangle":
-            weights = np.convolve(weights, weights)
-        return cls(corner_hz, order, tuple(weights.tolist()), spacing_s)
+            record_weights = np.convolve(record_weights, record_weights)
+        return cls(corner_hz, order, tuple(record_weights.tolist()), spacing_s)
 
     @property
     def weights_delay_s(self) -> float:
@@ -69,13 +69,15 @@ class SensorFilter:
         s
             Laplace variable in rad/s, of any shape.
         """
-        points = np.asarray(s, dtype=np.complex128)
-        ages = self.spacing_s * np.arange(len(self.weights))[::-1]
-        values: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
+        laplace_points = np.asarray(s, dtype=np.complex128)
+        record_ages_s = self.spacing_s * np.arange(len(self.weights))[::-1]
+        filter_response: Complex = np.exp(
+            np.multiply.outer(laplace_points, -record_ages_s)
+        ) @ np.array(self.weights)
         if self.corner_hz > 0:
-            u = points / (2 * pi * self.corner_hz)
-            values /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
-        return values
+            u = laplace_points / (2 * pi * self.corner_hz)
+            filter_response /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
+        return filter_response
 
 
 NO_FILTER: Final = SensorFilter()

@@ -27,21 +27,21 @@ class TouchTables:
         self.model, self.rate_hz = model, rate_hz
         self.x_m = positions(model.beam.length_m, _SPACING_M)
         steps_per_sample = 4 * max(1, round(4000 / rate_hz))
-        steps = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
+        step_count = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
         self.finest = contact_kernels(
             model.beam,
             model.damping,
             self.x_m,
             1 / (steps_per_sample * rate_hz),
-            steps,
+            step_count,
             model.sensor_filter,
         )
-        self.middle = self.finest.with_wider_pulses(2, steps // 2)
+        self.middle = self.finest.with_wider_pulses(2, step_count // 2)
         self.coarse = self.finest.with_wider_pulses(
-            steps_per_sample // 4, steps // (steps_per_sample // 4)
+            steps_per_sample // 4, step_count // (steps_per_sample // 4)
         )
         half_sample_kernels = self.finest.with_wider_pulses(
-            steps_per_sample // 2, steps // (steps_per_sample // 2)
+            steps_per_sample // 2, step_count // (steps_per_sample // 2)
         )
         self.crossing = cross_kernels(
             model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
@@ -56,9 +56,12 @@ class TouchTables:
         no_positions = np.empty(0)
         self.changed = [
             FreeBeam(
-                model.with_changed_parameter(name, std), no_positions, rate_hz, self.max_samples
+                model.with_changed_parameter(parameter_name, std),
+                no_positions,
+                rate_hz,
+                self.max_samples,
             )
-            for name, std in model.std.items()
+            for parameter_name, std in model.std.items()
             if std > 0
         ]
         """Beams in each of which one uncertain parameter is changed by its standard deviation."""
