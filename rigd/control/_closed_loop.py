@@ -62,7 +62,7 @@ _OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, s
 
 @dataclass(frozen=True, slots=True)
 class LoopModel:
-    """Parameters of the closed loop of motor, beam and controller."""
+    """Parameters of motor, beam, delays and controller, from which a closed loop is computed."""
 
     rate_hz: float
     """Ticks a second."""
@@ -422,7 +422,7 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
 
 
 def check_stability(loop: ClosedLoop) -> str | None:
-    """Check the stability of a closed loop before the motor moves.
+    """Return a warning if a closed loop is slightly unstable, or None; raise if it is more so.
 
     Returns
     -------
@@ -450,14 +450,14 @@ def check_stability(loop: ClosedLoop) -> str | None:
         if _damping_ratio(least_damped_pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
-                f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe_pole(least_damped_pole)} grows "
-                f"at {least_damped_pole.real:.2g} /s; {remedy_text}."
+                f"radius {lightly_damped_loop.spectral_radius:.7f}), "
+                f"{_describe_pole(least_damped_pole)} grows at {least_damped_pole.real:.2g} /s; {remedy_text}."
             )
     if growth_rate_per_s <= 0.0:
         return None
     return (
-        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
-        "damping does that, so keep sessions short."
+        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost "
+        "no damping does that, so keep sessions short."
     )
 
 
@@ -491,7 +491,7 @@ def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
 
 @lru_cache(maxsize=4)
 def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Return the closed loop and its warning, cached by model."""
+    """Return the closed loop and the warning of `check_stability`, cached by loop model."""
     closed_loop = close_loop(model)
     return closed_loop, check_stability(closed_loop)
 
@@ -511,7 +511,7 @@ def _stability_remedy(settings: ControlSettings) -> str:
 
 
 def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
-    """Return a loop's model in which the beam has almost no damping.
+    """Return the parameters of a closed loop, with almost no damping of the beam.
 
     Parameters
     ----------
@@ -527,12 +527,12 @@ def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
 
 
 def _damping_ratio(pole_rad_s: complex) -> float:
-    """Return the damping ratio of a pole."""
+    """Return the damping ratio of a pole in rad/s, as a fraction of critical damping."""
     return -pole_rad_s.real / abs(pole_rad_s)
 
 
 def _describe_pole(pole_rad_s: complex) -> str:
-    """Return frequency and damping ratio of a pole as text."""
+    """Return frequency in Hz and damping ratio of a pole, as text for a message."""
     frequency_hz = abs(pole_rad_s.imag) / (2.0 * pi)
     return f"a mode at {frequency_hz:.3g} Hz with damping ratio {_damping_ratio(pole_rad_s):.2g}"
 
@@ -570,27 +570,27 @@ class _DiscretePlant:
         extended_matrix = np.zeros((state_size, state_size + 1))
 
         def state_map_after(duration_s: float) -> tuple[Real, int]:
-            """Return the linear map to the state at a time after a tick, shape (n, size + 1).
+            """Return the linear map to the state at a time after a tick, shape (n, state_size + 1).
 
             The second result is the column of the torque that acts at that time.
             """
-            state, column = np.eye(n, state_size + 1), column_before
-            for interval_s, acting in (
+            state_map, torque_column = np.eye(n, state_size + 1), column_before
+            for interval_s, acting_column in (
                 (min(duration_s, switch_s), column_before),
                 (duration_s - switch_s, column_after),
             ):
                 if interval_s > 0.0:
                     transition, torque_effect = propagator(coupled_plant, interval_s)
-                    state = transition @ state
-                    state[:, acting] += torque_effect
-                    column = acting
-            return state, column
+                    state_map = transition @ state_map
+                    state_map[:, acting_column] += torque_effect
+                    torque_column = acting_column
+            return state_map, torque_column
 
         def reading_row(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
-            """Return the row vector of a sensor's reading at a time after a tick, (size + 1,)."""
-            state, column = state_map_after(since_tick_s)
-            chain_reading: Real = row @ state
-            chain_reading[column] += per_torque
+            """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
+            state_map, torque_column = state_map_after(since_tick_s)
+            chain_reading: Real = row @ state_map
+            chain_reading[torque_column] += per_torque
             return chain_reading
 
         extended_matrix[:n] = state_map_after(period_s)[0]
@@ -638,8 +638,8 @@ def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]
     delay_periods = delay_s / period_s
     if delay_periods > MAX_DELAY_PERIODS:
         raise ControlDesignError(
-            f"{key} = {delay_s:g} s is {delay_periods:.4g} periods; at most {MAX_DELAY_PERIODS} can be "
-            "controlled over."
+            f"{key} = {delay_s:g} s is {delay_periods:.4g} periods; at most {MAX_DELAY_PERIODS} "
+            "can be controlled over."
         )
     whole_periods = floor(delay_periods + 1e-9)
     period_fraction = delay_periods - whole_periods

@@ -29,7 +29,10 @@ class Disturbances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisturbedResponse:
-    """Response of the closed loop with friction and noise, at each tick in several random draws."""
+    """Response of the closed loop with friction and noise: angle and mode torques at each tick.
+
+    There is one response for each of several random draws of the noise.
+    """
 
     angle_rad: Real
     """Angle of the output shaft in rad, shape (n, draws)."""

@@ -148,7 +148,7 @@ def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex
 
 
 def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
-    """Return the stability margins of a loop at one signal."""
+    """Return the stability margins of a closed loop opened at one signal."""
 
     def curve(phase_rad: Real) -> Complex:
         return open_loop_gain(loop, cut, phase_rad)
@@ -203,7 +203,7 @@ Curve = Callable[[Real], Complex]
 
 
 def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
-    """Return the examined angular frequencies times the period, in increasing order.
+    """Return the frequencies at which margins are searched, in rad per tick, increasing.
 
     They are dense around the resonances of the open and the closed loop.
     """

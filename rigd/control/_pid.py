@@ -19,7 +19,7 @@ from rigd.errors import UserError
 
 
 class ControlDesignError(UserError, ValueError):
-    """Error of a controller that cannot be designed, or whose closed loop is unstable."""
+    """Error if the angle controller cannot be designed, or its closed loop is unstable."""
 
 
 @dataclass(frozen=True, slots=True)

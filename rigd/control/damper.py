@@ -33,7 +33,7 @@ _SLOW_CORNER_OVER_MODE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class DamperSettings:
-    """Settings of the active damping for one rig."""
+    """Settings of the active damping of one rig's beam: gain, lead and corners of the filters."""
 
     yield_rad_per_nm_s: float
     """Speed of the reference per torque of the beam."""
@@ -46,7 +46,7 @@ class DamperSettings:
 
 
 class VibrationDamper:
-    """Active damper, which moves the reference angle so that the beam's vibration decays.
+    """Active damper: moves the reference angle of the motor so that the beam's vibration decays.
 
     Parameters
     ----------

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class ProbeSequence(SessionSequence):
-    """Steps of one probing move on connected devices.
+    """Run of one probing move, which measures the motor and the encoder, on connected devices.
 
     The parameters are those of a `SessionSequence`.
     """
@@ -82,7 +82,7 @@ class ProbeSequence(SessionSequence):
         return {"end": probing_move.end.name} | estimate_probe(self._rig, probing_move).as_dict()
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:
-        """Run one tick of the probing move, and report missed ticks to it."""
+        """Run one tick of the probing move, and pass it the number of ticks missed before."""
         if self._move is not None:
             self._move.missed = max(0, self._scheduler.tick - self._last_tick - 1)
             self._last_tick = self._scheduler.tick

@@ -15,7 +15,7 @@ from rigd.session.layout import Status, pack_control_into, pack_sample_into, pac
 
 
 class ReadingPublisher:
-    """Publisher of the control process's readings in the shared state, several times a second.
+    """Writer of the control process's last readings to the shared state, several times a second.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class ReadingPublisher:
         self._last_bits: tuple[int, tuple[int, ...]] | None = None
 
     def publish(self, cycle: Cycle, now_ns: int) -> None:
-        """Publish the control process's heartbeat and last readings in the shared state.
+        """Write the control process's heartbeat and last readings to the shared state.
 
         Parameters
         ----------
@@ -80,7 +80,7 @@ class ReadingPublisher:
         self._publish_load((drive_health, sensor_health), now_ns)
 
     def _publish_load(self, line_healths: tuple[LineHealth, ...], now_ns: int) -> None:
-        """Publish the load of the busiest bus or serial line since the last call."""
+        """Publish the load of the busiest bus or serial line since the last call, in ppm."""
         line_bits = tuple(line_health.bits or 0 for line_health in line_healths)
         if self._last_bits is None:
             self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
@@ -241,7 +241,7 @@ class SampleLog:
             self._write_terms(tick, t_ns)
 
     def _count_stale(self, status_flags: int) -> None:
-        """Count a tick with a stale angle or wrench, and publish the counts."""
+        """Count a tick with a stale angle or wrench, and write the counts to the shared state."""
         counts, shared_state = self.counts, self._shared_state
         if status_flags & _ANGLE_STALE:
             counts.stale_angles += 1
@@ -251,7 +251,7 @@ class SampleLog:
             shared_state[StateField.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
-        """Write the ages of a tick's readings to a ring, or nothing if the ring is full."""
+        """Write the ages of a tick's angle and wrench to a ring, unless the ring is full."""
         slot_offset = ring.next_slot()
         if slot_offset < 0:
             return  # dropped, like the terms
@@ -267,7 +267,7 @@ class SampleLog:
         ring.publish()
 
     def _write_terms(self, tick: int, t_ns: int) -> None:
-        """Write the controller's terms of a tick to their ring, or nothing if it is full."""
+        """Write the torques of a tick's PID terms to their ring, unless the ring is full."""
         terms_ring, controller = self._terms_ring, self._cycle.controller
         slot_offset = terms_ring.next_slot()
         if slot_offset < 0:
@@ -287,7 +287,7 @@ class SampleLog:
         terms_ring.publish()
 
     def _wait_for_free_slot(self) -> int:
-        """Wait for free space in the ring of samples, and return the offset of the next sample.
+        """Wait for free space in the ring of samples, and return the byte offset of the next sample.
 
         Return -1 if the recorder has stopped reading.
         """

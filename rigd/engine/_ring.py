@@ -27,7 +27,7 @@ _WRITTEN_COUNTER, _READ_COUNTER = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class RingSpec:
-    """Descriptor and layout of a ring, with which a child process attaches to it."""
+    """File descriptor and layout of a ring buffer, with which a child process attaches to it."""
 
     fd: int
     """File descriptor of the shared memory, which the child inherits."""
@@ -132,7 +132,7 @@ class Ring:
         return record_bytes
 
     def discard(self) -> None:
-        """Discard all records that are not read yet, for a consumer that starts again."""
+        """Mark all records of the ring as read, for a consumer that begins with new records."""
         self._counters[_READ_COUNTER] = self._counters[_WRITTEN_COUNTER]
 
     def close(self) -> None:
@@ -143,7 +143,7 @@ class Ring:
 
 
 class Observer:
-    """Reader of a ring that never delays the producer, and counts the records that it missed.
+    """Reader of a ring that never delays the producer, and counts records overwritten unread.
 
     Parameters
     ----------

@@ -100,7 +100,7 @@ class SessionEnd(Exception):
 
 
 class SessionSequence:
-    """Steps of one session on connected devices, from the tare to the check of the tare.
+    """Steps of one session on connected devices, from the tare to the final check of the zero.
 
     Parameters
     ----------
@@ -180,7 +180,7 @@ class SessionSequence:
         """Results for the metadata ``outcome`` of the file, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
-        """Measure the sensor's zero at rest before the drive is enabled, and return it as metadata.
+        """Measure the wrench at rest before the drive is enabled, and return it as file metadata.
 
         Returns
         -------
@@ -225,7 +225,7 @@ class SessionSequence:
         return rest_readings.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
     def _compare_with_tare_before(self, zero_nm: float) -> None:
-        """End the session if the torque's zero differs too much from that of the last tare."""
+        """Raise `SessionEnd` if the torque at rest, in N·m, differs too much from the last tare."""
         watch = self._cycle.watch
         if watch.tared_nm is not None:
             violation = watch.check_tare(zero_nm - watch.tared_nm)
@@ -290,7 +290,7 @@ class SessionSequence:
             self._run_tick(self._start_angle_rad, excused=tick_number == 0)
 
     def wait_for_go(self) -> None:
-        """Hold the motor until the supervisor reports that the recorder is ready.
+        """Hold the motor until the supervisor requests the start of the record.
 
         Virtual time does not advance meanwhile.
 
@@ -429,7 +429,7 @@ class SessionSequence:
     def _watch_touch(
         self, touch_watch: "TouchWatch", tick: int, missed_ticks: int
     ) -> SessionEnd | None:
-        """Check the last tick for a touch, to which the touch watch reacts.
+        """Check the last tick for a touch of an obstacle, and let the touch watch react to it.
 
         Return an error that ends the session if the touch requires that, otherwise None.
         """
@@ -484,7 +484,7 @@ class SessionSequence:
             self._run_tick(self._end_angle_rad + distance_rad * path_fraction)
 
     def check_tare(self) -> None:
-        """Average the sensor again with the drive disabled, and check the drift of its zero.
+        """Measure the torque at rest after the record; raise `SessionEnd` if it drifted too much.
 
         Raises
         ------
@@ -576,7 +576,7 @@ class SessionSequence:
         )
 
     def _check_reading(self) -> None:
-        """End the session if a reading at rest shows a failed encoder or sensor, or on a stop."""
+        """Raise `SessionEnd` if encoder or sensor have failed, or a stop is requested."""
         self._switch_off_if_stopped()
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
         reading_violation = self._cycle.check_stale() or self._cycle.check_sensor()
@@ -584,7 +584,7 @@ class SessionSequence:
             raise SessionEnd("fault", str(self._cycle.with_reported_cause(reading_violation)))
 
     def _check_missed_ticks(self, new_missed_ticks: int, tick: int) -> SessionEnd | None:
-        """Return an error that ends the session if too many ticks were missed, else None."""
+        """Return an error that ends the session if more ticks were missed than allowed."""
         if not new_missed_ticks:
             return None
         self._cycle.skip_encoder(new_missed_ticks)
@@ -598,7 +598,7 @@ class SessionSequence:
         return self._stop_reason() is not None
 
     def _check_stale_readings(self, scheduled_ticks: int) -> SessionEnd | None:
-        """Return an error that ends the session if too many readings were stale, else None."""
+        """Return an error that ends the session if more readings were stale than allowed."""
         tick_counts = self.counts
         violation_text = self._cycle.watch.check_stale_fraction(
             tick_counts.stale_angles, tick_counts.stale_wrenches, scheduled_ticks
@@ -624,7 +624,7 @@ class SessionSequence:
         return None
 
     def _poll(self) -> SessionEnd | None:
-        """Publish heartbeat and readings, and check slow limits, supervisor and stop requests.
+        """Publish heartbeat and readings, and check slow limits, suspend, supervisor and stop.
 
         Return an error that ends the session, or None. The supervisor requests a stop when the
         recorder has died (`rigd.runner`).
@@ -674,7 +674,7 @@ class SessionSequence:
     def _record_clock_results(
         self, start_utc_ns: int, start_monotonic_ns: int, executed_ns: int
     ) -> None:
-        """Store the drift of the wall clock against the monotonic clock, and the true tick rate.
+        """Store wall clock drift, page faults and true tick rate of the record in `results`.
 
         The results go into the file's metadata.
         """
@@ -692,7 +692,7 @@ class SessionSequence:
             self.results["true_rate_hz"] = repr(interval_count / (executed_ns * 1e-9))
 
     def _publish_readings(self) -> None:
-        """Publish the readings for the operator, and log each doubt about their age once."""
+        """Publish the readings, and log each doubt about the stated age of readings once."""
         self._display.publish(self._cycle, self._scheduler.due_ns)
         for doubt in self._display.doubts:
             if doubt not in self._doubts_reported:

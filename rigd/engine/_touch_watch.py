@@ -62,7 +62,7 @@ class TouchWatch:
         self._excessive_force_ticks = 0
 
     def step(self, tick: int, missed_ticks: int) -> DetectedContact | None:
-        """Check the tick that was just run for a touch; return the contact, or None without one.
+        """Check the last tick for a touch; return the contact, or None if nothing was touched.
 
         Parameters
         ----------

@@ -26,7 +26,7 @@ _EVENTS = 256
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Kind of record that the control process publishes, and the processes that read it."""
+    """Kind of record that the control process writes to a ring, and the processes that read it."""
 
     name: str
     """Name of the topic's channel in the session file."""

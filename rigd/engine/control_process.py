@@ -176,7 +176,7 @@ class _ControlServer:
             store_motor_heat(self._profile, self._watch.heat_nm2)
 
     def observe_standstill(self) -> None:
-        """Read the devices until the motor's angle and speed at rest are known, and publish them.
+        """Read the devices with the torque off until the motor's angle and speed are known.
 
         Virtual time stops after this.
 
@@ -415,7 +415,7 @@ class _ControlServer:
         self._parent.send(reply_message)
 
     def _send_measurement(self, measure: Callable[[], dict[str, object]]) -> None:
-        """Run a measurement at rest and send its result, or the reason why it was refused."""
+        """Run a measurement at rest; send its result, or `Refused` with the reason of a failure."""
         try:
             self._parent.send(Measured(measure()))
         except SessionEnd as end:
@@ -481,7 +481,7 @@ class _ControlServer:
         )
 
     def _check_reading(self) -> None:
-        """End a measurement if encoder or sensor failed, or the supervisor wants to end."""
+        """Raise an error if encoder or sensor failed, or a stop is requested."""
         if self._scheduler.tick % SLOW_CHECK_TICKS == 0:
             self._publish_readings()
         if self._stop.requested or not self._parent.alive():
@@ -524,14 +524,14 @@ class _ControlServer:
                 write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
     def _log_accepted(self, job: SessionJob) -> None:
-        """Log the failed rows of ``rigd check`` that the operator accepted, as warnings."""
+        """Log the failed checks of ``rigd check`` that the operator accepted, as warnings."""
         for check_row in job.accepted:
             warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
             write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
 
 def _make_controller(profile: Profile) -> PidController:
-    """Return the angle controller with the gains of a profile's pole placement."""
+    """Return the PID controller of the motor's angle, designed for the motor of a profile."""
     motor = profile.control_motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)

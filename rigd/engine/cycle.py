@@ -66,7 +66,7 @@ sign. The range allows for friction and for an inertia that is only assumed."""
 
 
 class StandstillMonitor:
-    """Check that the motor's angle does not jump while the torque is off.
+    """Monitor that checks that the motor's angle does not jump while the torque is off.
 
     Each angle is compared with the angles before it. From one tick to the next the speed may change
     as much as ``limits.acceleration_rad_s2`` allows, as in the loop. Over ticks that were missed
@@ -95,7 +95,7 @@ class StandstillMonitor:
 
     @property
     def has_speed(self) -> bool:
-        """Whether angle and speed are known, with which the next angle can be compared."""
+        """Whether the last angle and speed are known, so that the next angle can be checked."""
         return self._last_movements_rad is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
@@ -307,13 +307,13 @@ class Cycle:
         self._recent_ticks.clear()
 
     def skip(self, missed_ticks: int) -> None:
-        """Pass the number of missed ticks to limit and encoder monitors; the torque was held."""
+        """Report ticks missed while the torque was held to the limit and encoder monitors."""
         if missed_ticks:
             self.watch.skip(missed_ticks)
             self.skip_encoder(missed_ticks)
 
     def skip_encoder(self, missed_ticks: int) -> None:
-        """Pass the number of missed ticks to the encoder monitor only."""
+        """Report missed ticks to the encoder monitor only."""
         if self.encoder_watch is not None:
             self.encoder_watch.skip(missed_ticks, self.angle_rad)
 
@@ -360,12 +360,12 @@ class Cycle:
 
     @property
     def stale(self) -> bool:
-        """Whether a reading of the last tick is stale."""
+        """Whether angle or wrench of the last tick is older than the tick."""
         return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
     def stale_names(self) -> str:
-        """Names of the stale readings of the last tick."""
+        """Names of the last tick's stale readings, as text for a message."""
         flag_names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
         return " and ".join(
             reading_name for stale_flag, reading_name in flag_names if self.flags & stale_flag
@@ -434,7 +434,7 @@ class Cycle:
     def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check motor heat, recorder lag and free disk space, every `SLOW_CHECK_TICKS` ticks.
+        """Check motor heat, recorder lag and free disk space; return the violated limit or None.
 
         Parameters
         ----------
@@ -517,7 +517,7 @@ class RestReadings:
         return fx, fy, fz, tx, ty, tz
 
     def as_metadata(self) -> dict[str, str]:
-        """Return duration, mean and standard deviation as metadata of the session file."""
+        """Return duration in s, and mean and standard deviation of each axis, as file metadata."""
         return {"tare_s": repr(self.duration_s)} | {
             f"tare_{statistic}_{axis}": repr(axis_value)
             for statistic, axis_values in (("mean", self.mean), ("std", self.spread))

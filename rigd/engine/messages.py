@@ -63,7 +63,7 @@ class ControlJob:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Plan of the steps that follow a record while the motor is still held."""
+    """Plan of the steps after a session's record: how to damp the beam and return the motor."""
 
     stays: bool = False
     """Whether the motor stays at the end of the reference instead of returning to the start."""
@@ -75,7 +75,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class TouchOrder:
-    """Order to search for an obstacle in a session."""
+    """Settings of a session that moves the beam until it touches an obstacle."""
 
     beam: "WatchedBeam"
     """Model of the beam for the touch detector."""
@@ -167,7 +167,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Message with the result of a measurement between sessions."""
+    """Message with the result of a tare, a new zero or a probing move between sessions."""
 
     values: dict[str, Any]
     """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
@@ -175,7 +175,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Message that a measurement was not possible."""
+    """Message that a tare, a new zero or a probing move failed, with the reason."""
 
     reason: str
     """Reason, such as a moving motor, as a sentence for the operator."""
@@ -437,7 +437,7 @@ class MessageReader:
 
 
 def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait until a descriptor can be read or written, and return whether it can.
+    """Wait until a descriptor can be read or written; return False after the timeout.
 
     Parameters
     ----------

@@ -264,7 +264,7 @@ class Parent:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """How one of the rig's processes is started, watched and ended."""
+    """Description of one process of a rig: how it is started, watched and ended."""
 
     name: str
     """Name of the process in messages to the operator."""

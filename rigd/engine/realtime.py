@@ -128,7 +128,7 @@ class Precedence:
         self._apply: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
-        """Request the raised priority, and return which scheduling and cores were granted.
+        """Request the raised priority, and return the results by setting: scheduling and cores.
 
         Returns
         -------
@@ -150,7 +150,7 @@ class Precedence:
         return {"scheduling": scheduling_result}
 
     def cover(self) -> None:
-        """Extend the raised priority to new threads, which hold the same interpreter lock."""
+        """Raise the priority of threads started since; they share the interpreter lock."""
         if self._apply is None:
             return
         for thread in Path("/proc/self/task").iterdir():
@@ -193,7 +193,7 @@ class Precedence:
             raise
 
     def _set_nice(self, thread: int) -> None:
-        """Set the niceness of a thread under the ordinary scheduling policy."""
+        """Set the niceness `SUPERVISION_NICENESS` and the ordinary policy of a thread."""
         os.setpriority(os.PRIO_PROCESS, thread, SUPERVISION_NICENESS)
         _set_ordinary(thread)
 

@@ -28,7 +28,7 @@ _MAX_ANGLE_RAD = 6.3
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSpec:
-    """Descriptor and length of a reference in shared memory, for processes that attach to it."""
+    """Descriptor and length of the reference angles in shared memory, to attach to them."""
 
     fd: int
     """File descriptor of the shared memory, which child processes inherit."""
@@ -41,7 +41,7 @@ class ReferenceSpec:
 def write_reference(
     fd: int, reference_rad: "NDArray[np.float64]", planned: int | None = None
 ) -> ReferenceSpec:
-    """Write a reference to shared memory, and return the description with which others attach.
+    """Write reference angles to shared memory; return what other processes need to attach.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
 
 
 def is_whole(shared_state: SharedState, scheduled_ticks: int, reference_ticks: int) -> bool:
-    """Return whether a record extends to the end of its reference.
+    """Return whether the ticks of a record extend to the end of its reference angles.
 
     Parameters
     ----------

@@ -49,7 +49,7 @@ class Phase(IntEnum):
 
     @property
     def words(self) -> str:
-        """Name of the phase for the operator."""
+        """Name of the phase as text for the operator, such as "recording"."""
         return _OPERATOR_NAMES.get(self, self.name.lower())
 
 
@@ -63,7 +63,7 @@ _OPERATOR_NAMES = {
 
 
 class Activity(StrEnum):
-    """Stage of a session for the operator, with the same name in every view."""
+    """Stage of a session for the operator, the same in terminal, page and socket documents."""
 
     PREPARING = "preparing"
     """The record has not begun."""

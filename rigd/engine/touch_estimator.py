@@ -86,7 +86,7 @@ class _PendingTouch:
 
 
 class TouchFollower:
-    """Estimates each detected touch of a record as soon as there are enough samples.
+    """Estimator of all detected touches of a record, each as soon as it has enough samples.
 
     Parameters
     ----------

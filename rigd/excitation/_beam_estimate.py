@@ -70,7 +70,7 @@ _BACKGROUND_TERMS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class BeamEstimate:
-    """Estimated beam and damping, with the noise of the measured torque."""
+    """Estimated parameters of beam and damping, with the noise spectrum of the measured torque."""
 
     beam: Beam
     """Beam with the given length, and the estimated density and stiffness."""
@@ -97,7 +97,7 @@ class BeamEstimate:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Return the estimate of a beam that a JSON document contains.
+        """Return the beam parameters, damping and noise spectrum that a JSON document contains.
 
         Parameters
         ----------
@@ -148,7 +148,7 @@ class BeamEstimate:
     def stated(
         cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
     ) -> "BeamEstimate":
-        """Return the estimate of a beam that is known beforehand, with all its parameters free.
+        """Return an estimate with given beam and damping, whose parameters are all to be fitted.
 
         Parameters
         ----------
@@ -177,7 +177,7 @@ class BeamEstimate:
         )
 
     def check(self) -> None:
-        """Raise `ExcitationError` if the estimate cannot predict a record.
+        """Raise `ExcitationError` if a parameter or the noise spectrum is invalid.
 
         Raises
         ------
@@ -253,7 +253,7 @@ class BeamEstimate:
         return replace(self, names=free_names, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Return the estimate with the free parameters of a modal model.
+        """Return the estimate with the constants of a modal model as its free parameters.
 
         They are the constants of each mode, and those of a background.
         """
@@ -284,7 +284,7 @@ class BeamEstimate:
 
     @property
     def loaded(self) -> LoadedBeam | None:
-        """Beam with tip mass, root compliance and offsets of the modes' stiffness.
+        """Beam model with tip mass, root compliance and offsets of the modes' stiffness.
 
         It is None if all of these are 0 and not free, so that the beam is uniform.
         """
@@ -297,7 +297,7 @@ class BeamEstimate:
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """Beam with tip mass, root compliance and stiffness offsets, which may all be 0."""
+        """Beam model with tip mass, root compliance and stiffness offsets, which may all be 0."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -388,7 +388,7 @@ pole and residue."""
 
 @dataclass(frozen=True, slots=True)
 class EstimatedMode:
-    """Mode of the estimated beam with locked hub."""
+    """Vibration mode of the estimated beam with its hub held still."""
 
     number: int
     """Number of the mode, from 1."""

@@ -86,7 +86,7 @@ class TorqueModel:
 
     @classmethod
     def for_records(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Return the torque model of a beam for records of at least a given number of ticks.
+        """Return the torque model of a beam for records of at least `ticks` ticks.
 
         Parameters
         ----------
@@ -136,7 +136,7 @@ class TorqueModel:
         return spectrum
 
     def whitened_derivatives(self, spectrum: Complex) -> Real:
-        """Return whitened derivatives of the torque by the parameters at each sample.
+        """Return derivatives of the torque by the free parameters over the noise, at each sample.
 
         `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
         """
@@ -154,7 +154,7 @@ class TorqueModel:
     def _inverse_transform(
         self, spectra: Complex, sample_count: int, values_per_sample: int
     ) -> Real:
-        """Return functions of time, with some values per sample, from their Laplace transforms."""
+        """Return functions of time, with some values per sample, from Laplace transforms."""
         time_s = np.arange(sample_count) * (self.factor / values_per_sample / self.rate_hz)
         time_values = np.fft.irfft(spectra, 2 * sample_count)[:, :sample_count]
         time_values *= np.exp(self.sigma_per_s * time_s)
@@ -273,7 +273,7 @@ def ticks_per_sample(rate_hz: float) -> int:
 def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Return the weights at some frequencies that give the noise of a sample variance 1.
+    """Return weights of frequencies with which the torque noise of a sample has variance 1.
 
     They fade to 0 above the end of the band.
     """
@@ -297,7 +297,7 @@ def _fast_transform_length(min_length: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """Fisher information of a record up to now, and the vibration that continues after it."""
+    """Whitened torque derivatives of a record so far, and the vibration that continues after it."""
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
@@ -314,7 +314,7 @@ class RecordSoFar:
     def from_angle(
         cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
     ) -> "RecordSoFar":
-        """Return the information of a record of the motor's angle.
+        """Return derivatives and continuing vibration, predicted from the motor's angle.
 
         Parameters
         ----------
@@ -366,7 +366,7 @@ class RecordSoFar:
         return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
     def information_after(self, more: Real | None, samples: int) -> Real:
-        """Return the information on the parameters after further samples, shape (k, k).
+        """Return the Fisher information on the parameters after further samples, shape (k, k).
 
         Parameters
         ----------
@@ -423,7 +423,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
 
 
 def projected_information(gram: Real, k: int) -> Real:
-    """Return the information on the first k parameters if all others are unknown, shape (k, k).
+    """Return the Fisher information on k parameters if all others are unknown, shape (k, k).
 
     Parameters
     ----------
@@ -467,7 +467,7 @@ def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
 
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
-    """Return the standard deviation of a parameter that is known before any record."""
+    """Return the standard deviation that a parameter is assumed to have before any record."""
     beam = estimate.beam
     constant_kind = name.rpartition("_")[0]
     if constant_kind == "background":
@@ -484,7 +484,7 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
 
 
 def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Return the whitened nuisance terms of a record: free decays, offset and drift of the torque.
+    """Return effects on a record's torque that are not of interest: free decays, offset, drift.
 
     The shape is (m, samples).
     """

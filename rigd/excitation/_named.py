@@ -17,7 +17,7 @@ Value = float | int | str | Path
 
 
 class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
-    """Interface to a rig's limits and predicted behaviour, for which an excitation is planned."""
+    """Interface to a rig for which any kind of excitation is planned: limits and predictions."""
 
 
 KINDS: Mapping[str, Callable[..., Excitation]] = {

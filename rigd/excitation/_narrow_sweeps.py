@@ -60,7 +60,7 @@ _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class _ModeEntry(BaseModel):
-    """Mode of one fit in an analyser's document.
+    """Mode of one fit in the JSON document of an analysis.
 
     A value is None if the fit has none, and the frequency is 0 Hz if the mode does not oscillate.
     """
@@ -88,7 +88,7 @@ class _HeadlineValue(BaseModel):
 
 
 class _HeadlineMode(BaseModel):
-    """Mode in the main results of an analysis: of the modal model, if the record shows it."""
+    """Mode in the main results of an analysis, with frequency in Hz and damping ratio."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -97,7 +97,7 @@ class _HeadlineMode(BaseModel):
 
     @property
     def entry(self) -> _ModeEntry:
-        """The mode in the form of a single fit's mode."""
+        """Frequency, damping ratio and standard deviation of the mode, as for a mode of one fit."""
         return _ModeEntry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,
@@ -106,7 +106,7 @@ class _HeadlineMode(BaseModel):
 
 
 class _Headline(BaseModel):
-    """Main results that an analysis reports of one record or of a campaign."""
+    """Main results of an analysis of one record or of a campaign: its list of modes."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -114,7 +114,7 @@ class _Headline(BaseModel):
 
 
 class _Document(BaseModel):
-    """Analyser's document, reduced to the keys from which modes are read."""
+    """JSON document of an analysis, reduced to the keys from which modes are read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -136,7 +136,7 @@ class FoundMode:
 
 
 def read_modes(document_path: str | Path) -> tuple[FoundMode, ...]:
-    """Read the modes of a beam from an analyser's document, lowest frequency first.
+    """Read the modes of a beam from the JSON document of an analysis, lowest frequency first.
 
     Parameters
     ----------
@@ -295,7 +295,7 @@ class Band:
 
     @classmethod
     def around_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Return the band around a mode.
+        """Return the band of frequencies to be swept around a mode.
 
         On either side it extends by the uncertainty of the frequency and by `widths` half-power
         widths.
@@ -314,7 +314,7 @@ class Band:
 
 
 def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
-    """Return the fractions of the time in each band that determine the damping most precisely.
+    """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
     all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
@@ -404,7 +404,7 @@ def _information_rates(
 
 
 def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
-    """Return the beam with another density, so that its nearest mode has the given frequency.
+    """Return the beam with a density such that its mode nearest to a frequency has this frequency.
 
     The profile's beam is wrong by more than the width of a band.
     """
@@ -573,13 +573,13 @@ def _admissible_amplitudes(
 
 
 def _divide_ticks(fractions: Real, ticks: int) -> list[int]:
-    """Return numbers of ticks in proportion to fractions, whose sum is exactly `ticks`."""
+    """Return numbers of ticks in proportion to `fractions`; their sum is exactly `ticks`."""
     end_ticks = np.round(np.cumsum(fractions) * ticks).astype(int)
     return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 
 
 def _raise_to_least(fractions: Real) -> Real:
-    """Return fractions of the time of which none is less than `LEAST_TIME_FRACTION` allows.
+    """Return the bands' fractions of the time, each raised to the least that is allowed.
 
     The other fractions are reduced in proportion, so that the sum remains 1.
     """

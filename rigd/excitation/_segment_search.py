@@ -70,7 +70,7 @@ _LIMIT_CHECK_TICKS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class PrecisionForecast:
-    """Forecast of the time until all target precisions are reached."""
+    """Forecast of the time in s until all target standard deviations are reached."""
 
     seconds: float
     """Time in s until all targets are reached with the best segments; infinite: never."""
@@ -80,7 +80,7 @@ class PrecisionForecast:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """Planned segment of excitation, with the precision expected from it.
+    """Planned segment of excitation, with the standard deviations expected after it.
 
     It begins and ends with angle, speed and acceleration zero.
     """
@@ -128,7 +128,7 @@ class _SweepBand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _UnitSweep:
-    """Reference and predicted response of a sweep of amplitude 1 rad in one phase."""
+    """Reference angle and predicted response of a sweep of amplitude 1 rad in one phase."""
 
     reference_rad: Real
     """Reference angle at each tick of the segment; shape (n,)."""
@@ -148,7 +148,7 @@ class _UnitSweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SegmentCandidate:
-    """Candidate for the next segment, at the largest amplitude that the limits allow."""
+    """Candidate for the next segment of excitation, as a sum of sweeps within the limits."""
 
     duration_s: float
     """Duration of the segment in s."""
@@ -182,7 +182,7 @@ class _SegmentCandidate:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ContinuedDrive:
-    """Response to driving a mode further after a segment, in two phases of the sine."""
+    """Response to exciting a mode by a sine after a segment, in two phases of the sine."""
 
     weighted: Real
     """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
@@ -193,7 +193,7 @@ class _ContinuedDrive:
 
 
 class SegmentSearch:
-    """Search for the best next segment, with the quantities that all candidates have in common."""
+    """Search for the next segment of excitation that improves the target precisions most."""
 
     def __init__(
         self,
@@ -257,7 +257,7 @@ class SegmentSearch:
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
     def candidate_bands(self) -> list[_SweepBand]:
-        """Return the bands that candidate sweeps cover: through every mode, and on either side."""
+        """Return the frequency bands of candidate sweeps: through every mode, and on either side."""
         sweep_bands = []
         for beam_mode in self.modes:
             hz = beam_mode.frequency_hz
@@ -344,7 +344,7 @@ class SegmentSearch:
     def best_candidate(
         self, time_left_s: float, through: Collection[int] = ()
     ) -> _SegmentCandidate:
-        """Return the most informative candidate that fits into `time_left_s`.
+        """Return the most informative candidate segment that fits into `time_left_s`.
 
         It drives one of the modes in `through`, or any mode if `through` is empty.
         """
@@ -359,7 +359,7 @@ class SegmentSearch:
         )
 
     def best_of_duration(self, duration_s: float, through: Collection[int]) -> _SegmentCandidate:
-        """Return the most informative candidate of a given duration.
+        """Return the most informative candidate segment of a given duration.
 
         The best band comes first; bands of further modes are added if they give more information.
         """
@@ -435,7 +435,7 @@ class SegmentSearch:
         mode_number: int,
         mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
     ) -> _SegmentCandidate:
-        """Return a candidate that also brings all modes but one to rest by the segment's end.
+        """Return a candidate segment that also brings all modes but one to rest by its end.
 
         If the limits do not allow that, the modes' vibration is reduced as far as they allow.
         """
@@ -483,7 +483,7 @@ class SegmentSearch:
         )
 
     def sweep_pair(self, band: _SweepBand, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
-        """Return two unit sweeps through a band, whose phases differ by a quarter of a period."""
+        """Return two sweeps of 1 rad through a band, a quarter of a period apart in phase."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
@@ -539,7 +539,7 @@ class SegmentSearch:
         sweep_pair: tuple[_UnitSweep, _UnitSweep],
         phase_index: int,
     ) -> _SegmentCandidate:
-        """Return a candidate with a further band, at the largest amplitude that limits allow.
+        """Return a candidate segment with a further band, at the largest allowed amplitude.
 
         The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
         sweep is ``phase_index / _PHASE_COUNT`` of a turn.
@@ -624,7 +624,7 @@ class SegmentSearch:
         return np.linalg.pinv(decay_columns.T)
 
     def continued_drive(self, band: _SweepBand) -> _ContinuedDrive:
-        """Return the response to driving the mode of a band by a sine up to the horizon."""
+        """Return the response to exciting a band's mode by a sine up to the planning horizon."""
         if band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
             sine_pair = self.sweep_pair(replace(band, half_width_hz=0.0), duration_s)
@@ -651,7 +651,7 @@ class SegmentSearch:
         return self._continued_drives[band.middle_hz]
 
     def segment(self, chosen: _SegmentCandidate, time_left_s: float) -> Segment:
-        """Return the chosen candidate as a segment, with the precisions expected from it."""
+        """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.model_samples(chosen.duration_s)
         segment_channels = chosen.weighted_sum("channels")
@@ -705,7 +705,7 @@ class SegmentSearch:
         return needed_s
 
     def forecast(self, time_left_s: float) -> PrecisionForecast:
-        """Forecast the time until all targets are reached."""
+        """Return the forecast of the time in s until all target standard deviations are reached."""
         impossible_reasons = [
             precision.impossible for precision in self.quantities.items if precision.impossible
         ]
@@ -726,7 +726,7 @@ class SegmentSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SineMixture:
-    """Mixture of steady sines that reaches all targets in the shortest time, without ring-up."""
+    """Durations of steady sines that reach all target precisions soonest, ring-up neglected."""
 
     times_s: Real
     """Time in s for which each sine lasts; shape (m,)."""
@@ -743,7 +743,7 @@ def best_mixture(
     angle_rad: Real,
     relaxation: float = 1.0,
 ) -> SineMixture:
-    """Return the times of steady sines that together reach all targets soonest.
+    """Return durations of steady sines that together reach all target precisions soonest.
 
     Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
     equivalence theorem all sines of the best mixture give the same information per second on the
@@ -843,7 +843,7 @@ def least_deviations(
 
 
 def largest_factor(existing_motion: Real, added_motion: Real) -> float:
-    """Return the largest factor by which a motion can be added without exceeding the limits.
+    """Return the largest factor with which a motion can be added within the limits.
 
     All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
     existing motion exceeds this range by itself, the sum may be as large, but no larger.

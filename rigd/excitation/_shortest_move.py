@@ -68,7 +68,7 @@ _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
+    """Interface to the response of the closed loop to a reference: arrays (n,), one value a tick."""
 
     @property
     def angle_rad(self) -> Real:
@@ -198,7 +198,7 @@ def shortest_move(
 
 
 def _residual_torque_nm(plant: MovePlant, reference_rad: Real, ringing: Complex | None) -> float:
-    """Return the coupling torque in N·m of the vibration after a move.
+    """Return the largest coupling torque in N·m of the beam's vibration after a move.
 
     It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
     """
@@ -217,7 +217,7 @@ def _residual_torque_nm(plant: MovePlant, reference_rad: Real, ringing: Complex 
 
 
 class _MoveSearch:
-    """Search for the shortest duration of a move, with a linear programme for each duration."""
+    """Search for the shortest move of the motor, with a linear programme for each duration."""
 
     def __init__(
         self,
@@ -365,7 +365,7 @@ class _MoveSearch:
         )
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return the state at the end of the move that the initial vibration decays to.
+        """Return the modes' state to which the initial vibration decays by the end of the move.
 
         Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
         """
@@ -438,7 +438,7 @@ class _MoveSearch:
         )
 
     def limit_fraction(self, reference_rad: Real) -> float:
-        """Return the largest fraction of a limit that the response to a reference reaches."""
+        """Return the largest fraction of a rig's limit that the response to a reference reaches."""
         plant = self._plant
         held_ticks = round(plant.settling_s * plant.rate_hz)
         whole_reference_rad = np.concatenate(
@@ -485,7 +485,7 @@ def _next_duration_ticks(
 
 
 class _UnitResponse:
-    """Responses of the closed loop to a constant acceleration of 1 rad/s², by quantity."""
+    """Responses of torque, speed and angle to a reference acceleration of 1 rad/s²."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
@@ -493,7 +493,7 @@ class _UnitResponse:
         self._ticks = 0
 
     def for_ticks(self, ticks: int) -> dict[str, Real]:
-        """Return the responses by quantity, each for at least the given number of ticks."""
+        """Return the response of each quantity by name, for at least the given number of ticks."""
         if ticks > self._ticks:
             self._ticks = max(2 * ticks, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
@@ -512,7 +512,7 @@ class _UnitResponse:
 def _interval_responses(
     unit_responses: Real, edge_ticks: NDArray[np.intp], ticks: NDArray[np.intp]
 ) -> Real:
-    """Return the response at some ticks to an acceleration of 1 in one interval only.
+    """Return the response at some ticks to an acceleration of 1 rad/s² in one interval only.
 
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
     1, and `edge_ticks` are the ticks at which the intervals begin and end.
@@ -577,7 +577,7 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
 
 
 class MoveRig(Protocol):
-    """Interface to a rig for which a move is planned."""
+    """Interface to a rig for which a move of the motor to another angle is planned."""
 
     @property
     def start_rad(self) -> float:

@@ -186,7 +186,7 @@ def require_frequency(
 def lay_out_segments(
     rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
 ) -> dict[str, tuple[int, int]]:
-    """Return first tick and end of the segments rest, sweep and ring-down, by name.
+    """Return the first tick and the tick after the last of rest, sweep and ring-down, by name.
 
     The times are rounded to ticks, and the rounding changes the length of the ring-down only.
     """
@@ -342,7 +342,7 @@ def chirp(
 def hold(
     *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
 ) -> Excitation:
-    """Return an excitation that holds the start angle, to measure noise and drift.
+    """Return an excitation that holds the start angle, to record noise and drift of the sensor.
 
     Parameters
     ----------

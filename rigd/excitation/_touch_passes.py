@@ -37,7 +37,7 @@ margin."""
 
 @dataclass(frozen=True, slots=True)
 class TouchPass:
-    """Ticks at which the parts of one pass in search of an obstacle begin and end."""
+    """Ticks at which one pass in search of an obstacle begins, turns back and ends."""
 
     begins: int
     """Tick at which the way out begins; the rest before it belongs to the pass."""
@@ -49,7 +49,7 @@ class TouchPass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Passes in search of an obstacle, and the control loop's reaction to a touch."""
+    """Passes of a search for an obstacle, and how the motor brakes and returns after a touch."""
 
     passes: tuple[TouchPass, ...]
     """Passes in the order of time."""

@@ -56,7 +56,7 @@ _EXAMPLE_TARGET: Final = "--damping 1%"
 
 
 class ScanRig(DesignRig, Protocol):
-    """Interface to a rig's predicted behaviour, for which a scan is planned."""
+    """Interface to a rig for which a quick sweep through all modes is planned: predictions."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest fraction of a limit that a reference in rad is predicted to use."""
@@ -79,7 +79,7 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """Target precisions of a session that ends when they are reached, and its planned beginning.
+    """Target standard deviations at which a session ends, and its planned quick sweep.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ def until(
     uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
-    """Return the excitation of a session that continues until target precisions are reached.
+    """Return the excitation of a session until target standard deviations are reached.
 
     It begins with a quick scan of all modes. The segments after it are planned during the session:
     each is the most informative excitation.
@@ -244,7 +244,7 @@ def _require_reachable_targets(
     at_most_s: float,
     tip_slope_rad: float,
 ) -> None:
-    """Raise `ExcitationError` if the tolerance of the geometry makes a target unreachable."""
+    """Raise `ExcitationError` if a beam of limited uniformity cannot reach a target precision."""
     geometry_limits = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
@@ -267,7 +267,7 @@ def _require_reachable_targets(
 
 
 def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
-    """Return the scan of n ticks with a largest amplitude of 1, at rest at both ends; shape (n,).
+    """Return a quick sweep of n ticks with largest amplitude 1, at rest at both ends; shape (n,).
 
     With a beam, the amplitude depends on the frequency relative to the beam's first mode.
     """
@@ -302,7 +302,7 @@ def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Be
 
 
 def _parse_targets(targets: str) -> tuple[Target, ...]:
-    """Parse target precisions, separated by semicolons; raise `ExcitationError` without any."""
+    """Parse targets such as "damping 1%", separated by ";"; raise `ExcitationError` if none."""
     parsed_targets = []
     for target_text in targets.split(";"):
         if target_text.strip():

@@ -90,7 +90,7 @@ def next_segment(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
 ) -> Segment:
-    """Return the next segment, which reduces the targets' standard deviations most per second.
+    """Return the segment of excitation that reduces the targets' standard deviations most.
 
     Parameters
     ----------
@@ -137,7 +137,7 @@ def next_segment(
 
 @dataclass(frozen=True, slots=True)
 class GeometryFloor:
-    """Smallest standard deviation that a quantity can have with a tolerance of the geometry."""
+    """Smallest standard deviation that a parameter of a not quite uniform beam can have."""
 
     target: Target
     """Target of the quantity."""
@@ -150,7 +150,7 @@ class GeometryFloor:
 
     @property
     def makes_unreachable(self) -> bool:
-        """Whether the tolerance of the geometry makes the target unreachable."""
+        """Whether the beam's non-uniformity makes the target standard deviation unreachable."""
         target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
         return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std
 
@@ -163,7 +163,7 @@ def geometry_floors(
     duration_s: float,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> tuple[GeometryFloor, ...]:
-    """Return the smallest standard deviations of the parameters of a nearly uniform beam.
+    """Return the smallest possible standard deviations of a nearly uniform beam's parameters.
 
     Each is computed for the mixture of steady sines that is best for this parameter alone, at the
     largest amplitudes that the rig and the linear model allow. Quantities of modes have no such
@@ -223,7 +223,7 @@ def geometry_floors(
 def expected_precisions(
     angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
 ) -> tuple[Precision, ...]:
-    """Return the precision of each target that is expected from a record of the motor's angle.
+    """Return the standard deviation of each target quantity expected from a motor angle record.
 
     Parameters
     ----------
@@ -249,7 +249,7 @@ def design_excitation(
     angle_rad_so_far: Real | None = None,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> Design:
-    """Design the segments of a session until all targets are reached or the time is over.
+    """Design segments of excitation until all target precisions are reached or time is over.
 
     Parameters
     ----------

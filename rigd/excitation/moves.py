@@ -29,7 +29,7 @@ path shorter than about half a period of a mode would exceed it, and then has fe
 
 
 def quintic(duration_s: float, rate_hz: float) -> Real:
-    """Return the minimum-jerk path from 0 to 1, at rest at both ends.
+    """Return the minimum-jerk path from 0 to 1 at each tick, at rest at both ends, shape (n,).
 
     Parameters
     ----------

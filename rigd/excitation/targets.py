@@ -44,7 +44,7 @@ _DAMPING_KIND: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Target precision of a session: the requested standard deviation of a quantity."""
+    """Requested standard deviation of a quantity, such as the damping ratio of a mode."""
 
     quantity: str
     """Name of the quantity, one of `QUANTITIES`."""
@@ -69,7 +69,7 @@ class Target:
 
 
 def parse_target(quantity: str, text: str) -> Target:
-    """Parse the target precision of a quantity from the text of an option, such as ``2:0.5%``.
+    """Parse the requested precision of a quantity from an option's text, such as ``2:0.5%``.
 
     Parameters
     ----------
@@ -140,7 +140,7 @@ def parse_target(quantity: str, text: str) -> Target:
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """Precision of one quantity in comparison with its target."""
+    """Standard deviation of one quantity, in comparison with the requested one."""
 
     target: Target
     """Target of the quantity, with the number of the mode if the quantity belongs to a mode."""
@@ -155,7 +155,7 @@ class Precision:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the standard deviation to its target, which is reached at 1 and below."""
+        """Ratio of the standard deviation to the requested one; 1 or less: reached."""
         if self.impossible:
             return inf
         return self.std / self.target_std if self.target_std > 0.0 else inf
@@ -168,7 +168,7 @@ class Precision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """Target quantities of a session as linear functions of the parameters near an estimate."""
+    """Quantities with a requested precision, as linear functions of the beam's parameters."""
 
     items: tuple[Precision, ...]
     """Value and target of each quantity; the standard deviations are still unknown."""
@@ -177,7 +177,7 @@ class Quantities:
 
     @classmethod
     def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
-        """Return the target quantities, linearised at an estimate of the beam.
+        """Return the quantities with a requested precision, linearised at an estimate of the beam.
 
         Parameters
         ----------
@@ -229,7 +229,7 @@ class Quantities:
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
-        """Return the precision of every target for a covariance of the parameters, shape (k, k)."""
+        """Return each quantity's standard deviation for a covariance (k, k) of the parameters."""
         return tuple(
             replace(
                 precision,
@@ -249,7 +249,7 @@ def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[
 def _linearise(
     target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
-    """Return the value of a target quantity and its derivatives by the parameters, shape (k,).
+    """Return the value of a quantity and its derivatives by the beam's parameters, shape (k,).
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """
