@@ -451,7 +451,8 @@ def check_stability(loop: ClosedLoop) -> str | None:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
                 f"radius {lightly_damped_loop.spectral_radius:.7f}), "
-                f"{_describe_pole(least_damped_pole)} grows at {least_damped_pole.real:.2g} /s; {remedy_text}."
+                f"{_describe_pole(least_damped_pole)} grows at {least_damped_pole.real:.2g} /s; "
+                f"{remedy_text}."
             )
     if growth_rate_per_s <= 0.0:
         return None

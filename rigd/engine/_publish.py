@@ -287,7 +287,7 @@ class SampleLog:
         terms_ring.publish()
 
     def _wait_for_free_slot(self) -> int:
-        """Wait for free space in the ring of samples, and return the byte offset of the next sample.
+        """Wait for free space in the ring of samples; return the byte offset of the next sample.
 
         Return -1 if the recorder has stopped reading.
         """

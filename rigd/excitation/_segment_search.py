@@ -257,7 +257,7 @@ class SegmentSearch:
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
     def candidate_bands(self) -> list[_SweepBand]:
-        """Return the frequency bands of candidate sweeps: through every mode, and on either side."""
+        """Return the frequency bands of candidate sweeps: at every mode, and on either side."""
         sweep_bands = []
         for beam_mode in self.modes:
             hz = beam_mode.frequency_hz

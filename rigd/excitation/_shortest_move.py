@@ -68,7 +68,7 @@ _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 
 
 class Response(Protocol):
-    """Interface to the response of the closed loop to a reference: arrays (n,), one value a tick."""
+    """Interface to the closed loop's response to a reference: arrays (n,), one value a tick."""
 
     @property
     def angle_rad(self) -> Real:

@@ -41,7 +41,7 @@ _WIDE_LIKELIHOOD_DROP = 8.0
 def estimate_from_explanations(
     search: ExplanationSearch, explained: ExplainedRecord, *, scan: bool
 ) -> TouchEstimate:
-    """Return the estimate of a touch from the likeliest explanations of its record.
+    """Return position, instant, force and stiffness of a touch from its likeliest explanations.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ def _unexplained_position(search: ExplanationSearch) -> Estimated:
 
 
 def _with_wide_interval(search: ExplanationSearch, estimate: Estimated) -> Estimated:
-    """Return the estimate of a position with an interval that contains those for any force."""
+    """Return a touch position in m, with an interval that includes that for any force over time."""
     *_, low_m, high_m = search.any_force.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return Estimated(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
@@ -217,7 +217,7 @@ def _force_estimate(
 
 
 def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explanation) -> bool:
-    """Return whether another explanation is about as likely as the best one.
+    """Return whether another explanation of a touch is about as likely as the best one.
 
     An explanation with more parameters must be clearly better.
     """
@@ -234,7 +234,7 @@ def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explan
 def _common_parameter(
     likely_explanations: list[Explanation], parameter_column: int, value_shift: float = 0.0
 ) -> Estimated:
-    """Return the estimate of a parameter that all likely explanations have in common.
+    """Return the estimate of a parameter that all likely explanations of a touch have.
 
     `parameter_column` is the column of the parameter in the posterior's samples, and `value_shift`
     is added to its value. The interval contains the intervals of all explanations.
@@ -262,7 +262,7 @@ def _common_parameter(
 
 
 def _stiffness_estimate(posterior: Posterior) -> Estimated | None:
-    """Return the estimate of the stiffness in N/m, or None if the data do not bound it.
+    """Return the obstacle's estimated stiffness in N/m, or None if the data do not bound it.
 
     The value is the exponential of the logarithm's median.
     """

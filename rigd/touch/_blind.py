@@ -22,7 +22,7 @@ _FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
 
 @dataclass(frozen=True, slots=True)
 class AnyForceLikelihood:
-    """Likelihood of a touch by any force, at each position along the beam."""
+    """Likelihood of a touch at each position along the beam, whatever its force over time is."""
 
     x_m: Real
     """Positions along the beam, shape (m,)."""
@@ -74,7 +74,7 @@ class AnyForceLikelihood:
 
 
 class AnyForceEstimator:
-    """Computation of the likelihood of a touch by any force, prepared for one length of records.
+    """Estimator of the touch position without an assumption on the force over time.
 
     Parameters
     ----------
@@ -101,7 +101,7 @@ class AnyForceEstimator:
         ]  # (positions, samples, forces)
 
     def scan(self, window: WhitenedWindow) -> AnyForceLikelihood:
-        """Return the likelihood of a touch by any force at each position.
+        """Return the likelihood of a touch at each position along the beam, for any force.
 
         Parameters
         ----------

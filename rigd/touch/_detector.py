@@ -38,7 +38,7 @@ _RECENT_WEIGHT: Final = 1 / 600
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Settings of the touch detector's sensitivity."""
+    """Settings of the touch detector: false alarms an hour and tolerance of model errors."""
 
     false_alarms_per_hour: float = 0.02
     """Expected number of false alarms in an hour of white noise."""
@@ -46,7 +46,7 @@ class DetectorSettings:
     """Assumed error of the model, as a fraction of the predicted torque and shear."""
 
     def threshold(self, rate_hz: float, signatures: int) -> float:
-        """Return the detection threshold in standard deviations, for the stated false alarms.
+        """Return the detection threshold in standard deviations, for the false alarms an hour.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class DetectorSettings:
 
 
 class TouchDetector:
-    """Detector of a touch, which processes the readings of a record tick by tick.
+    """Detector of the beam's touch of an obstacle, from the readings of each tick.
 
     Until the first `arm` it measures the innovations of the beam at rest. Afterwards innovations
     are compared with their standard deviations, not with the noise for which the model was
@@ -147,7 +147,7 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Stop detecting touches, while the model continues to follow the beam's motion."""
+        """Stop detecting touches; the beam model still follows the readings of each tick."""
         self._armed = False
         self.level = 0.0
 
@@ -173,7 +173,7 @@ class TouchDetector:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> bool:
-        """Process the readings of a tick, and return whether they show a touch.
+        """Process the readings of a tick; return True if they show that the beam touches.
 
         Parameters
         ----------

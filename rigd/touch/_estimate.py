@@ -66,12 +66,12 @@ class TouchEstimator:
         return self.follow().update(record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return an empty estimate of one touch, to be updated while its record grows."""
+        """Return the estimator of one touch whose record still grows."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Estimation of one touch while its record grows; each estimate starts from the previous one.
+    """Estimator of one touch from a growing record; each estimate starts from the last one.
 
     All records begin with the same sample.
 
@@ -147,7 +147,7 @@ class GrowingEstimate:
         return latest_result or self._empty_estimate(record)
 
     def _has_enough_samples(self, record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether enough samples precede a touch `detection_delay_s` before detection."""
+        """Return whether at least 100 samples precede a touch this long before its detection."""
         return (
             record.detected - round(detection_delay_s * self._tables.rate_hz) >= _MIN_SAMPLES_BEFORE
         )
@@ -165,7 +165,7 @@ class GrowingEstimate:
         return self._searches[detection_delay_s]
 
     def _began_earlier(self, record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether the touch seems to begin before the samples that may contain it."""
+        """Return whether a touch seems to begin before `detection_delay_s` ahead of detection."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
         explanation_search = self._search(record, detection_delay_s)

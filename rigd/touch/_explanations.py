@@ -94,7 +94,7 @@ _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Best explanation of a touch's record by obstacles of one kind."""
+    """Explanation of a touch's record by one kind of obstacle, with its parameters and misfit."""
 
     kind: str
     """Kind of obstacle: rigid, moving, yielding, two or knock."""
@@ -121,7 +121,7 @@ class ExplainedRecord:
 
 
 class ExplanationSearch:
-    """Search for the obstacles that explain the record of one touch.
+    """Search for the kinds and parameters of obstacles that explain the record of one touch.
 
     Parameters
     ----------
@@ -286,7 +286,7 @@ class ExplanationSearch:
         return *previous_stage, None, False
 
     def _is_sufficient(self, at_rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
-        """Return whether a longer part of the record would not improve the estimate."""
+        """Return whether a longer part of the record would not improve a touch's estimate."""
         x_m = at_rest.posterior.mean(0)
         is_precise = (
             at_rest.posterior.std(0) < _PRECISE_STD_M or x_m > _TIP_FRACTION * self.edges[1]
@@ -308,7 +308,7 @@ class ExplanationSearch:
             )
 
     def _next_candidates(self, at_rest: Explanation) -> Real:
-        """Return candidates for a longer part of the record, from the result for a shorter part."""
+        """Return candidate obstacles for a longer part of the record, from a shorter part."""
         return np.vstack([at_rest.parameters, self._draw_candidates(at_rest.posterior)])
 
     @cached_property
@@ -322,17 +322,17 @@ class ExplanationSearch:
     # Data for the comparison of candidates
 
     def window(self, seconds: float) -> WhitenedWindow:
-        """Return the whitened innovations from before the touch to a time after the detection."""
+        """Return the whitened innovations from before a touch to `seconds` after its detection."""
         return WhitenedWindow.from_motion(
             self.motion, self.quiet, self.end(seconds), self.deviations
         )
 
     def end(self, seconds: float) -> int:
-        """Return the index of the sample at a time after the detection, or the record's end."""
+        """Return the index of the sample `seconds` after the detection, or the record's end."""
         return self.detected + min(self.available, round(seconds * self.rate))
 
     def space(self, width: int) -> ParameterRanges:
-        """Return the ranges of the first `width` parameters of `OBSTACLE_PARAMETERS`."""
+        """Return the allowed ranges of the first `width` of the `OBSTACLE_PARAMETERS`."""
         t = self.motion.t
         return ParameterRanges(
             low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[:width],
@@ -358,7 +358,7 @@ class ExplanationSearch:
     # Springy obstacle at rest
 
     def _best_of_grid(self) -> Real:
-        """Return the four likeliest candidates of the grid for each position."""
+        """Return the grid's four likeliest obstacle parameters (k, 3) for each position."""
         grid_window = self.window(GRID_COMPARISON_S)
         candidate_grid = self.tables.starts(grid_window.end - grid_window.first)
         grid_candidates, chi2 = candidate_grid.integrate(self.motion, grid_window, self.detected)
@@ -371,7 +371,7 @@ class ExplanationSearch:
 
     @cached_property
     def _first_samples(self) -> WhitenedWindow:
-        """Whitened innovations with which the grid's candidates are compared.
+        """Whitened innovations of the first samples, with which the grid's candidates are compared.
 
         The effects of uncertainties through the contact are not included yet.
         """
@@ -390,14 +390,14 @@ class ExplanationSearch:
 
     @cached_property
     def _first_minima(self) -> Minima:
-        """Minima that least squares found from the likeliest candidates, in longer time steps."""
+        """Local minima of the squared residuals near the grid's likeliest obstacles at rest."""
         predict_effect = self.predictor(self.starts, first=True)
         return find_minima(
             predict_effect, self._first_samples, self.starts, self.space(3), rounds=7
         )
 
     def _add_neighbours(self, candidates: Real) -> Real:
-        """Return candidates, with further ones nearby if they are close to the beam's tip.
+        """Return the candidate obstacles, with further ones nearby if they are close to the tip.
 
         Minima are close together there.
         """
@@ -410,7 +410,7 @@ class ExplanationSearch:
         return np.vstack([candidates, nearby_candidates.reshape(-1, candidates.shape[1])])
 
     def _draw_candidates(self, posterior: Posterior) -> Real:
-        """Return random candidates for a longer window, from the posterior of a shorter window."""
+        """Return random obstacle parameters (k, p) from the posterior of a shorter window."""
         rng = np.random.default_rng(1)
         drawn_candidates = posterior.samples[
             rng.choice(posterior.weights.size, _RANDOM_CANDIDATES, p=posterior.weights)
@@ -510,7 +510,7 @@ class ExplanationSearch:
         shorter_explanation: Explanation,
         shorter_window: WhitenedWindow,
     ) -> bool:
-        """Return whether a shorter window is explained, but not the samples of a longer one."""
+        """Return whether a shorter window is explained, but not the samples added to it."""
         added_samples = longer_window.data.size - shorter_window.data.size
         added_chi2 = longer_explanation.chi2 - shorter_explanation.chi2
         return self.fits(shorter_explanation, shorter_window) and added_chi2 > self.max_chi2(
@@ -597,7 +597,7 @@ class ExplanationSearch:
         return explanations
 
     def pairing(self) -> TwoObstacleContact:
-        """Return the integration of the contact with two obstacles for this record."""
+        """Return the model of the contact with two obstacles for this record."""
         tables = self.tables
         obstacle_contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
         return TwoObstacleContact(obstacle_contact, tables.coarse, tables.crossing)
@@ -670,7 +670,7 @@ class ExplanationSearch:
 
 
 def _distinct_minima(minima: Minima) -> Real:
-    """Return the parameters of minima that are not close to a better minimum, the best first."""
+    """Return the parameters of minima that are not close to a better minimum, best first."""
     minimum_order = np.argsort(minima.chi2)
     distinct_minima: list[Real] = []
     for row in minima.parameters[

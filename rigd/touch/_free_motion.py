@@ -72,7 +72,7 @@ class TouchRecord:
 
 
 class FreeBeam:
-    """Responses of the free beam to its angle, prepared for records of one length.
+    """Responses of a beam without contact to the motor's angle, for records of one length.
 
     Parameters
     ----------
@@ -120,7 +120,7 @@ class FreeBeam:
         self._sample = self.line.to_laplace(_interpolate_angle(unit_sample, rate_hz, self.line)[0])
 
     def at_positions(self, x_m: Real) -> "FreeBeam":
-        """Return the free beam with other positions of the displacement.
+        """Return a copy that computes the displacement at other positions along the beam.
 
         Parameters
         ----------
@@ -171,7 +171,7 @@ class FreeBeam:
         first_sample: int,
         angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
-        """Return the innovations of a record, and the motion of the beam without a touch.
+        """Return the motion of a beam without contact, and a record's deviations from it.
 
         Parameters
         ----------
@@ -237,7 +237,7 @@ class FreeBeam:
 
 @dataclass(frozen=True, slots=True)
 class FreeMotion:
-    """Innovations of a record, and the motion of the beam without a touch."""
+    """Motion that a beam without contact would have, and a record's deviations from it."""
 
     t: Real
     """Instants of the samples of torque and shear, corrected for their delays, shape (n,)."""
@@ -265,7 +265,7 @@ class FreeMotion:
 
 
 def _angle_noise(angle: Real) -> float:
-    """Return the standard deviation of the angle's noise in rad, including encoder steps.
+    """Return the standard deviation of an angle's noise in rad, including encoder steps.
 
     Fourth differences of the samples remove the motion.
     """

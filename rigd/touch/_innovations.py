@@ -60,7 +60,7 @@ _ZERO_BANDWIDTH_RAD_S = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedBeam:
-    """Discrete model of the free beam with an observer, for one tick rate and sensor.
+    """Discrete model of the beam without contact, with an observer, for one tick rate and sensor.
 
     Examples
     --------
@@ -157,7 +157,7 @@ def observed_beam(
 
 
 class InnovationFilter:
-    """Filter that computes the innovations of torque and shear tick by tick.
+    """Filter that computes the deviation of torque and shear from the free beam at each tick.
 
     It starts with the beam at rest at the first angle.
 
@@ -213,7 +213,7 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Compute the innovations of a tick from its readings.
+        """Compute the deviations of torque and shear of a tick from the model, from its readings.
 
         Parameters
         ----------
@@ -253,7 +253,7 @@ class InnovationFilter:
     def _step_with_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Compute one tick with the angle relative to rest, torque and shear."""
+        """Process the angle relative to rest, torque and shear of one tick."""
         n = self._states
         input_vector, output_vector = self._vectors
         input_vector[n] = relative_angle_rad
@@ -271,7 +271,7 @@ class InnovationFilter:
     def _step_without_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Compute one tick without a valid wrench, whose effect on the state is undone."""
+        """Process one tick without a valid wrench, whose effect on the filter's state is undone."""
         self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
         self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0

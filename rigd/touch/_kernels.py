@@ -34,7 +34,7 @@ _FIRST_POSITION_M = 0.003
 
 
 class LaplaceLine:
-    """Laplace transform of functions of time on ``n`` steps, along a line parallel to the axis.
+    """Laplace transform of functions on ``n`` time steps, on a line of constant real part.
 
     Parameters
     ----------
@@ -115,7 +115,7 @@ class ForcePulse:
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
     def kernels(self, response: Complex) -> Real:
-        """Return the kernels of responses: their values over time for one hat, shape (k, steps).
+        """Return responses over time to one triangular pulse of force, shape (k, steps).
 
         Parameters
         ----------
@@ -150,7 +150,7 @@ class ContactKernels:
         return int(self.displacement.shape[1])
 
     def at_positions(self, x_m: Real, steps: int) -> "ContactKernels":
-        """Return the kernels at other positions, by cubic interpolation of four positions.
+        """Return the responses at other positions, by cubic interpolation of four positions.
 
         Parameters
         ----------
@@ -170,7 +170,7 @@ class ContactKernels:
         )
 
     def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
-        """Return the kernels of wider triangular pulses, with longer time steps.
+        """Return the responses to wider triangular pulses of force, with longer time steps.
 
         Parameters
         ----------
@@ -252,7 +252,7 @@ class CrossKernels:
     (modes, n)."""
 
     def between_positions(self, x_m: Real, other_m: Real, steps: int) -> Real:
-        """Return the kernels between pairs of positions, by interpolation of the mode shapes.
+        """Return displacement per force pulse between pairs of positions, shape (pairs, steps).
 
         Parameters
         ----------
@@ -271,7 +271,7 @@ class CrossKernels:
 def cross_kernels(
     beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
 ) -> CrossKernels:
-    """Return the kernels from a force at one position to the displacement at another position.
+    """Return the displacements over time at one position per force pulse at another.
 
     The arguments are those of `contact_kernels`.
     """
@@ -369,7 +369,7 @@ def cubic_weights(positions_at: Real, grid: Real) -> tuple[NDArray[np.intp], Rea
 
 
 def interpolate_rows(table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
-    """Interpolate between the rows of a table (m, n) with the result of `cubic_weights`: (k, n)."""
+    """Interpolate between the rows of a table (m, n) by `cubic_weights`; shape (k, n)."""
     weighted_sum = weights[:, 0, None] * table[first_rows]
     for i in range(1, 4):
         weighted_sum += weights[:, i, None] * table[first_rows + i]

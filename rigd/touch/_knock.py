@@ -13,7 +13,7 @@ _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 
 
 class KnockResponse:
-    """Effect of a knock on the record of a touch: a half-sine pulse of force.
+    """Effect of a knock on the beam, a half-sine pulse of force, on torque and base shear.
 
     A candidate has four columns: position, instant, logarithm of the duration, and peak.
 
@@ -104,7 +104,7 @@ class KnockResponse:
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> ParameterRanges:
-        """Return the ranges of a knock's four parameters.
+        """Return the allowed ranges of a knock's four parameters.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ identified."""
 
 @dataclass(frozen=True, slots=True)
 class TouchModel:
-    """Exact model of the beam for the estimation of touches, with its uncertainty."""
+    """Exact beam model for the estimation of touches, with its parameters' uncertainty."""
 
     beam: Beam
     """Length, density and stiffness of the beam."""
@@ -56,7 +56,7 @@ class TouchModel:
 
     @property
     def wrench_delay_s(self) -> float:
-        """Age of torque and shear in s without the delay of the weighted mean of records."""
+        """Age of torque and shear in s, without the delay of averaging the sensor's records."""
         return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
     def with_changed_parameter(self, name: str, by: float) -> "TouchModel":

@@ -30,7 +30,7 @@ _MAX_DISTANCE_M = 0.3
 
 
 class TwoObstacleContact:
-    """Integration in time of the contact with two obstacles, for the record of one touch.
+    """Model of the beam's contact with two obstacles, for the record of one touch.
 
     Candidates have six columns: position, instant and logarithm of the stiffness of the first
     obstacle, then the position of the second obstacle, the free beam's distance from it at that
@@ -143,7 +143,7 @@ class TwoObstacleContact:
     def _with_second_obstacle(
         self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
     ) -> Real:
-        """Return one obstacle with each of the likeliest second obstacles, shape (count, 6).
+        """Return pairs of one obstacle and a likely second obstacle, shape (count, 6).
 
         Their likelihood is computed from the first-order effect of the second obstacle.
         """
@@ -202,7 +202,7 @@ class TwoObstacleContact:
 
     @staticmethod
     def space(single_obstacle: ParameterRanges) -> ParameterRanges:
-        """Return the ranges of the six parameters of two obstacles.
+        """Return the allowed ranges of the six parameters of two obstacles.
 
         Parameters
         ----------

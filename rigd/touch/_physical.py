@@ -36,7 +36,7 @@ window of samples, shape (k, c, samples)."""
 
 @dataclass(frozen=True, slots=True)
 class ParameterRanges:
-    """Ranges and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
+    """Bounds and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
     low: Real
     """Smallest value of each parameter."""
@@ -114,7 +114,7 @@ class WhitenedWindow:
 
 
 class ObstacleContact:
-    """Integration in time of the contact with obstacles, for the record of one touch.
+    """Model of the beam's contact with an obstacle, for the record of one touch.
 
     Parameters
     ----------
@@ -138,7 +138,7 @@ class ObstacleContact:
         side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
-        """Return the effect of obstacles on torque and shear, and the contact forces.
+        """Return the effect of obstacles on torque and shear, and the contact forces in N.
 
         Parameters
         ----------
@@ -311,7 +311,7 @@ class ObstacleContact:
         return pressing_sides[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_sides
 
     def _on_kernel_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
-        """Interpolate displacements to the kernels' time steps, each row from its instant on."""
+        """Interpolate displacements to the time steps of the contact, each row from its instant."""
         free_motion = self._motion
         begin_steps = (instant - free_motion.first_s) / free_motion.step_s
         substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
@@ -421,7 +421,7 @@ def find_minima(
 def _linearise(
     predict: Prediction, window: WhitenedWindow, current: Real, space: ParameterRanges
 ) -> tuple[Real, Real]:
-    """Return the residuals of candidates, (k, n), and derivatives by the parameters, (k, n, p)."""
+    """Return candidates' residuals (k, n), and their derivatives by the parameters (k, n, p)."""
     parameter_count = current.shape[1]
     parameter_shifts = np.where(
         current + space.difference > space.high, -space.difference, space.difference
@@ -443,7 +443,7 @@ def _linearise(
 
 
 class CandidateGrid:
-    """Grid of candidates over position, instant and stiffness, from which the search starts.
+    """Grid of candidate obstacles over position, instant and stiffness, to start a search.
 
     All candidates are integrated together in coarse time steps.
 
@@ -479,7 +479,7 @@ class CandidateGrid:
     def integrate(
         self, motion: FreeMotion, window: WhitenedWindow, latest: int
     ) -> tuple[Real, Real]:
-        """Return all candidates of the grid, and their sums of squared residuals.
+        """Return all candidate obstacles of the grid, and their sums of squared residuals.
 
         Parameters
         ----------
@@ -504,7 +504,7 @@ class CandidateGrid:
     def _sums_of_squares(
         self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]
     ) -> Real:
-        """Return sums of squared residuals for touches at some samples.
+        """Return the grid candidates' sums of squared residuals for touches at some samples.
 
         The shape is (positions, instants, stiffnesses).
         """
@@ -565,7 +565,7 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 
 
 def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
-    """Return the sum of squared residuals of each candidate, shape (k,).
+    """Return the sum of squared residuals of each candidate obstacle, shape (k,).
 
     Parameters
     ----------

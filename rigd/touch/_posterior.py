@@ -42,7 +42,7 @@ class Posterior:
         return float(1 / np.sum(self.weights**2))
 
     def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
-        """Return quantiles of a parameter's posterior distribution.
+        """Return quantiles of the posterior distribution of one obstacle parameter.
 
         Parameters
         ----------
@@ -57,7 +57,7 @@ class Posterior:
         return np.interp(levels, cumulated_weights, parameter_values[value_order])
 
     def mean(self, column: int) -> float:
-        """Return the posterior mean of a parameter.
+        """Return the mean of one obstacle parameter's posterior distribution.
 
         Parameters
         ----------
@@ -67,7 +67,7 @@ class Posterior:
         return float(self.weights @ self.samples[:, column])
 
     def std(self, column: int) -> float:
-        """Return the posterior standard deviation of a parameter.
+        """Return the standard deviation of one obstacle parameter's posterior distribution.
 
         Parameters
         ----------
@@ -90,7 +90,7 @@ def sample_posterior(
     enough_samples: float,
     smallest_std: Real,
 ) -> Posterior:
-    """Draw weighted samples of the posterior, with a uniform prior within the bounds.
+    """Draw weighted samples of obstacle parameters from the posterior, uniform prior in bounds.
 
     Parameters
     ----------

@@ -11,7 +11,7 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """Estimated number with its uncertainty."""
+    """Estimated number, with its standard deviation and its 95 % interval."""
 
     value: float
     """Estimated value."""
@@ -21,7 +21,7 @@ class Estimated:
     """Interval that contains the true value in 95 of 100 records."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return value, standard deviation and interval as a document of JSON types."""
+        """Return value, standard deviation and 95 % interval as a dictionary of JSON types."""
         return {"value": self.value, "std": self.std, "interval_95": list(self.interval_95)}
 
 
@@ -70,7 +70,7 @@ class TouchEstimate:
         return self.time_s is not None
 
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
-        """Return the estimate of the touch as a document of JSON types.
+        """Return the estimate of the touch as a dictionary of JSON types.
 
         Parameters
         ----------

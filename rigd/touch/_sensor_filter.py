@@ -12,7 +12,7 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class SensorFilter:
-    """Filters of torque and shear between the beam and the samples of a session.
+    """Low-pass filter and averaging of torque and shear by the force sensor.
 
     Examples
     --------
@@ -37,7 +37,7 @@ class SensorFilter:
     def of_records(
         cls, corner_hz: float, order: int, kind: str, records: int, spacing_s: float
     ) -> "SensorFilter":
-        """Return the filter of a sensor that makes several records per tick.
+        """Return the filter of a sensor that sends several readings per tick, which are averaged.
 
         Parameters
         ----------
@@ -58,7 +58,7 @@ class SensorFilter:
 
     @property
     def weights_delay_s(self) -> float:
-        """Group delay in s of the weighted mean of records, part of the stated age of a sample."""
+        """Group delay in s of the weighted mean of the sensor's readings of one tick."""
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
     def response(self, s: ArrayLike) -> Complex:

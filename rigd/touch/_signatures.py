@@ -43,7 +43,7 @@ remain."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedBeam:
-    """Model and signatures of a beam for a `TouchDetector`."""
+    """Beam model and effects of touches on it, with which a `TouchDetector` compares readings."""
 
     observed: ObservedBeam
     """Model of the free beam, with the noise of its readings."""

@@ -21,7 +21,7 @@ _SPACING_M = 0.007
 
 
 class TouchTables:
-    """Precomputed quantities for the estimation of touches with one model at one rate."""
+    """Precomputed contact responses for the estimation of touches, for one beam model and rate."""
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
@@ -67,7 +67,7 @@ class TouchTables:
         """Beams in each of which one uncertain parameter is changed by its standard deviation."""
 
     def starts(self, samples: int) -> CandidateGrid:
-        """Return the grid of candidates for a comparison over a number of samples."""
+        """Return the grid of candidate obstacles for a comparison over a number of samples."""
         if samples not in self._grids:
             self._grids[samples] = CandidateGrid(self.coarse, 2, self.rate_hz, samples)
         return self._grids[samples]

@@ -49,7 +49,7 @@ def touch_record(
     rate_hz: float,
     shear_projection: Sequence[float] | None,
 ) -> TouchRecord:
-    """Return the record of a touch for the estimator, with missed ticks interpolated.
+    """Return angle, torque and shear around a touch, with missed ticks interpolated.
 
     Parameters
     ----------
