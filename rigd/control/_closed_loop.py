@@ -421,7 +421,7 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
     return poles
 
 
-def check_stability(loop: ClosedLoop) -> str | None:
+def check_stability(closed_loop: ClosedLoop) -> str | None:
     """Return a warning if a closed loop is slightly unstable, or None; raise if it is more so.
 
     Returns
@@ -435,17 +435,19 @@ def check_stability(loop: ClosedLoop) -> str | None:
         If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
         the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
-    remedy_text = _stability_remedy(loop.model.settings)
-    growth_rate_per_s = loop.growth_per_s
+    remedy_text = _stability_remedy(closed_loop.model.settings)
+    growth_rate_per_s = closed_loop.growth_per_s
     instability_text = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
-        f"{loop.spectral_radius:.7f}): {_describe_pole(loop.poles_rad_s[0])} grows at "
+        f"{closed_loop.spectral_radius:.7f}): {_describe_pole(closed_loop.poles_rad_s[0])} grows at "
         f"{growth_rate_per_s:.2g} /s"
     )
     if growth_rate_per_s > MAX_GROWTH_PER_S:
         raise ControlDesignError(f"{instability_text}; {remedy_text}.")
-    if loop.model.beam is not None:
-        lightly_damped_loop = close_loop(lightly_damped_model(loop.model, loop.model.beam))
+    if closed_loop.model.beam is not None:
+        lightly_damped_loop = close_loop(
+            lightly_damped_model(closed_loop.model, closed_loop.model.beam)
+        )
         least_damped_pole = lightly_damped_loop.least_damped()
         if _damping_ratio(least_damped_pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
@@ -587,10 +589,10 @@ class _DiscretePlant:
                     torque_column = acting_column
             return state_map, torque_column
 
-        def reading_row(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
+        def reading_row(quantity_row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
             """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
             state_map, torque_column = state_map_after(since_tick_s)
-            chain_reading: Real = row @ state_map
+            chain_reading: Real = quantity_row @ state_map
             chain_reading[torque_column] += per_torque
             return chain_reading
 

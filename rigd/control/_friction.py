@@ -42,7 +42,7 @@ class DisturbedResponse:
 
 
 def simulate_disturbed(
-    loop: ClosedLoop,
+    closed_loop: ClosedLoop,
     reference_rad: Real,
     disturbances: Disturbances,
     *,
@@ -54,7 +54,7 @@ def simulate_disturbed(
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop with a beam.
     reference_rad
         Reference angle at each tick relative to the angle at rest, shape (n,).
@@ -67,31 +67,31 @@ def simulate_disturbed(
     seed
         Seed of the random numbers.
     """
-    realisation, settings = loop.realisation, loop.model.settings
+    realisation, settings = closed_loop.realisation, closed_loop.model.settings
     assert realisation is not None
-    command_cut, angle_cut, torque_cut = loop.cuts
+    command_cut, angle_cut, torque_cut = closed_loop.cuts
     n, step_rad = reference_rad.size, disturbances.encoder_step_rad
     random_numbers = np.random.default_rng(seed)
     offset_rad = step_rad * random_numbers.uniform(-0.5, 0.5, draws)
     torque_noise_nm = random_numbers.normal(0.0, disturbances.torque_noise_nm, (n, draws))
     input_columns = np.stack(
-        [loop.b, command_cut.action, torque_cut.action, angle_cut.action], axis=1
+        [closed_loop.b, command_cut.action, torque_cut.action, angle_cut.action], axis=1
     )
-    output_rows = np.stack([loop.c[0], angle_cut.reading, loop.c[3]])
-    velocity_row, shaft_effect = loop.c[1], loop.shaft_torque[:, None]
-    speed_per_torque = float(velocity_row @ loop.shaft_torque)
+    output_rows = np.stack([closed_loop.c[0], angle_cut.reading, closed_loop.c[3]])
+    velocity_row, shaft_effect = closed_loop.c[1], closed_loop.shaft_torque[:, None]
+    speed_per_torque = float(velocity_row @ closed_loop.shaft_torque)
 
     angle_rad, loop_inputs = np.empty((n, draws)), np.zeros((4, draws))
     # The pairs of states of the modes follow angle and velocity.
     mode_pairs = slice(2, 2 + 2 * modes)
     mode_states = np.empty((n, 2 * modes, draws))
-    x = np.zeros((loop.b.size, draws))
+    x = np.zeros((closed_loop.b.size, draws))
     for tick_number, tick_reference_rad in enumerate(reference_rad):
         angle_rad[tick_number], angle_reading_rad, friction_speed_rad_s = output_rows @ x
         mode_states[tick_number] = x[mode_pairs]
         loop_inputs[0] = tick_reference_rad
         friction_speed_rad_s = (
-            friction_speed_rad_s + loop.d[3] * tick_reference_rad
+            friction_speed_rad_s + closed_loop.d[3] * tick_reference_rad
         ) / settings.friction_velocity_rad_s
         loop_inputs[1] = settings.friction_compensation_nm * np.tanh(friction_speed_rad_s)
         loop_inputs[2] = torque_noise_nm[tick_number]
@@ -101,7 +101,7 @@ def simulate_disturbed(
                 - offset_rad
                 - angle_reading_rad
             )
-        x = loop.a @ x + input_columns @ loop_inputs
+        x = closed_loop.a @ x + input_columns @ loop_inputs
         friction_error_nm = (velocity_row @ x) / speed_per_torque
         x -= shaft_effect * friction_error_nm.clip(
             -disturbances.coulomb_nm, disturbances.coulomb_nm

@@ -87,7 +87,7 @@ class Margins:
     """Frequency in Hz of the smallest distance."""
 
 
-def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
+def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
     """Return the stability margins at each signal at which the loop can be opened.
 
     An additional delay counts as a phase shift. That is exact for whole periods, and otherwise to
@@ -95,7 +95,7 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
 
     Parameters
     ----------
-    loop
+    closed_loop
         Stable loop; the margins of an unstable loop are meaningless.
 
     References
@@ -112,17 +112,17 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     angle reading: modulus margin 0.47
     torque reading: modulus margin 0.25
     """
-    return tuple(_margins_at_cut(loop, cut) for cut in loop.cuts)
+    return tuple(_margins_at_cut(closed_loop, cut) for cut in closed_loop.cuts)
 
 
-def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex:
+def open_loop_gain(closed_loop: ClosedLoop, cut_signal: CutSignal, phase_rad: Real) -> Complex:
     """Return the complex gain L of the loop opened at one signal, at some frequencies.
 
     The sensitivity of the closed loop is ``1/(1 + L)``.
 
     Parameters
     ----------
-    loop, cut
+    closed_loop, cut_signal
         Closed loop, and one of its cuts.
     phase_rad
         Angular frequencies times the period, shape (m,); π is half the sampling rate.
@@ -132,29 +132,29 @@ def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex
     ndarray
         Complex gain, shape (m,).
     """
-    n = cut.action.size
-    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
+    n = cut_signal.action.size
+    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
     complex_gain = np.empty(phase_rad.shape, complex)
     for first_index in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
         z = np.exp(1j * phase_rad[first_index : first_index + _FREQUENCIES_AT_ONCE])[
             :, np.newaxis, np.newaxis
         ]
-        action_column = np.broadcast_to(cut.action[:, np.newaxis], (z.size, n, 1))
+        action_column = np.broadcast_to(cut_signal.action[:, np.newaxis], (z.size, n, 1))
         state_responses = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action_column)
         complex_gain[first_index : first_index + _FREQUENCIES_AT_ONCE] = -(
-            state_responses[:, :, 0] @ cut.reading
+            state_responses[:, :, 0] @ cut_signal.reading
         )
     return complex_gain
 
 
-def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
+def _margins_at_cut(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Margins:
     """Return the stability margins of a closed loop opened at one signal."""
 
     def curve(phase_rad: Real) -> Complex:
-        return open_loop_gain(loop, cut, phase_rad)
+        return open_loop_gain(closed_loop, cut_signal, phase_rad)
 
-    rate_hz = loop.model.rate_hz
-    angular_frequencies = _examined_frequencies(loop, cut)
+    rate_hz = closed_loop.model.rate_hz
+    angular_frequencies = _examined_frequencies(closed_loop, cut_signal)
     complex_gain = curve(angular_frequencies)
 
     crossing_phase_rad, real_gain = _negative_real_crossings(
@@ -184,7 +184,7 @@ def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
     )
     phase_rad_to_hz = rate_hz / (2.0 * pi)
     return Margins(
-        cut=cut.name,
+        cut=cut_signal.name,
         gain_up=gain_up,
         gain_up_hz=gain_up_phase_rad * phase_rad_to_hz,
         gain_down=0.0 if gain_down == inf else -gain_down,
@@ -202,14 +202,14 @@ Curve = Callable[[Real], Complex]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
+def _examined_frequencies(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Real:
     """Return the frequencies at which margins are searched, in rad per tick, increasing.
 
     They are dense around the resonances of the open and the closed loop.
     """
-    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
+    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
     resonance_poles = np.concatenate(
-        [np.linalg.eigvals(state_matrix) for state_matrix in (open_loop_matrix, loop.a)]
+        [np.linalg.eigvals(state_matrix) for state_matrix in (open_loop_matrix, closed_loop.a)]
     )
     resonance_poles = np.log(
         resonance_poles[np.abs(resonance_poles) > _MAX_DELAY_EIGENVALUE].astype(complex)
@@ -231,32 +231,40 @@ def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
     )
 
 
-def _negative_real_crossings(curve: Curve, frequencies: Real, gain: Complex) -> tuple[Real, Real]:
+def _negative_real_crossings(
+    gain_curve: Curve, phases_rad: Real, curve_gain: Complex
+) -> tuple[Real, Real]:
     """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
-    crossings = _sign_changes(np.imag, curve, frequencies, gain)
+    crossings = _sign_changes(np.imag, gain_curve, phases_rad, curve_gain)
     # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
     end_indices = [
-        end for end in (0, -1) if abs(gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(gain[end].real)
+        end
+        for end in (0, -1)
+        if abs(curve_gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(curve_gain[end].real)
     ]
-    crossing_frequencies = np.concatenate([crossings, frequencies[end_indices]])
-    real_gains = np.concatenate([curve(crossings).real, gain[end_indices].real])
+    crossing_frequencies = np.concatenate([crossings, phases_rad[end_indices]])
+    real_gains = np.concatenate([gain_curve(crossings).real, curve_gain[end_indices].real])
     return crossing_frequencies[real_gains < 0.0], real_gains[real_gains < 0.0]
 
 
 def _sign_changes(
-    real_function: Callable[[Complex], Real], curve: Curve, frequencies: Real, gain: Complex
+    real_function: Callable[[Complex], Real],
+    gain_curve: Curve,
+    phases_rad: Real,
+    curve_gain: Complex,
 ) -> Real:
     """Return the frequencies at which a real function of the open loop's gain changes its sign."""
-    is_negative = np.signbit(real_function(gain))
+    is_negative = np.signbit(real_function(curve_gain))
     interval_indices = np.flatnonzero(is_negative[:-1] != is_negative[1:])
     lower_frequencies, upper_frequencies = (
-        frequencies[interval_indices],
-        frequencies[interval_indices + 1],
+        phases_rad[interval_indices],
+        phases_rad[interval_indices + 1],
     )
     for _ in range(_BISECTIONS):
         middle_frequencies = 0.5 * (lower_frequencies + upper_frequencies)
         is_before_zero = (
-            np.signbit(real_function(curve(middle_frequencies))) == is_negative[interval_indices]
+            np.signbit(real_function(gain_curve(middle_frequencies)))
+            == is_negative[interval_indices]
         )
         lower_frequencies, upper_frequencies = (
             np.where(is_before_zero, middle_frequencies, lower_frequencies),
@@ -266,27 +274,29 @@ def _sign_changes(
     return zero_frequencies
 
 
-def _smallest_with_frequency(value_frequencies: Real, values: Real) -> tuple[float, float]:
+def _smallest_with_frequency(
+    value_frequencies: Real, candidate_values: Real
+) -> tuple[float, float]:
     """Return the frequency of the smallest value, and the value; NaN and infinity if all are inf.
 
     `value_frequencies` contains the frequency of each value.
     """
-    if values.size == 0 or values.min() == inf:
+    if candidate_values.size == 0 or candidate_values.min() == inf:
         return nan, inf
-    smallest_index = int(values.argmin())
-    return float(value_frequencies[smallest_index]), float(values[smallest_index])
+    smallest_index = int(candidate_values.argmin())
+    return float(value_frequencies[smallest_index]), float(candidate_values[smallest_index])
 
 
 def _distance_to_critical_point(
-    curve: Curve, frequencies: Real, gain: Complex
+    gain_curve: Curve, phases_rad: Real, curve_gain: Complex
 ) -> tuple[float, float]:
     """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
     for _ in range(_REFINEMENTS):
-        nearest_index = int(np.abs(1.0 + gain).argmin())
+        nearest_index = int(np.abs(1.0 + curve_gain).argmin())
         lower_frequency, upper_frequency = (
-            frequencies[max(nearest_index - 1, 0)],
-            frequencies[min(nearest_index + 1, frequencies.size - 1)],
+            phases_rad[max(nearest_index - 1, 0)],
+            phases_rad[min(nearest_index + 1, phases_rad.size - 1)],
         )
-        frequencies = np.linspace(lower_frequency, upper_frequency, 21)
-        gain = curve(frequencies)
-    return _smallest_with_frequency(frequencies, np.abs(1.0 + gain))
+        phases_rad = np.linspace(lower_frequency, upper_frequency, 21)
+        curve_gain = gain_curve(phases_rad)
+    return _smallest_with_frequency(phases_rad, np.abs(1.0 + curve_gain))

@@ -115,12 +115,12 @@ class _DampingLaw:
         ), -leaky_integral - self._lead * filtered_torque
 
 
-def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
+def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     """Return the settings of the active damping for a rig, or None if none is stable.
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop of the rig.
 
     Returns
@@ -138,7 +138,7 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     from rigd.beam import undamped_frequencies_rad_s
     from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
 
-    loop_model = loop.model
+    loop_model = closed_loop.model
     if loop_model.beam is None:
         return None
     first_rad_s = float(undamped_frequencies_rad_s(loop_model.beam, 1)[0])
@@ -165,26 +165,26 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     return None
 
 
-def damped_poles(loop: "ClosedLoop", settings: DamperSettings) -> Complex:
+def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> Complex:
     """Return the poles of a closed loop with active damping, in rad/s.
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop without active damping.
     settings
         Settings of the active damping.
     """
     from rigd.control._closed_loop import continuous_poles
 
-    n, rate_hz = loop.b.size, loop.model.rate_hz
-    torque_reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
+    n, rate_hz = closed_loop.b.size, closed_loop.model.rate_hz
+    torque_reading = next(cut.reading for cut in closed_loop.cuts if cut.name == "torque reading")
     fast_row, slow_row, leaky_integral = np.eye(3, n + 3, n)
     next_states, displacement = _DampingLaw(settings, rate_hz).advance(
         (fast_row, slow_row, leaky_integral), np.append(torque_reading, np.zeros(3))
     )
     a = np.zeros((n + 3, n + 3))
-    a[:n, :n] = loop.a
-    a[:n] += np.outer(loop.b, displacement)
+    a[:n, :n] = closed_loop.a
+    a[:n] += np.outer(closed_loop.b, displacement)
     a[n:] = next_states
     return continuous_poles(a, rate_hz)

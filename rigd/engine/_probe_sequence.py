@@ -38,12 +38,12 @@ class ProbeSequence(SessionSequence):
         scheduler: TickScheduler,
         standstill: StandstillMonitor,
         channels: Channels,
-        display: ReadingPublisher,
+        reading_publisher: ReadingPublisher,
         parent: Parent,
-        stop: StopRequest,
+        stop_request: StopRequest,
     ) -> None:
         super().__init__(
-            profile, (0.0,), cycle, clock, scheduler, standstill, channels, display, parent, stop,
+            profile, (0.0,), cycle, clock, scheduler, standstill, channels, reading_publisher, parent, stop_request,
             Ending(),
         )  # fmt: skip
         self._rig = probed_rig(profile)

@@ -205,8 +205,8 @@ def shared_memory_fd() -> int:
     return fd
 
 
-def reserve(fd: int, size: int) -> None:
-    """Allocate `size` bytes of shared memory at the descriptor `fd`.
+def reserve(fd: int, byte_count: int) -> None:
+    """Allocate `byte_count` bytes of shared memory at the descriptor `fd`.
 
     Raises
     ------
@@ -215,6 +215,6 @@ def reserve(fd: int, size: int) -> None:
         bus error.
     """
     if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(fd, 0, size)
+        os.posix_fallocate(fd, 0, byte_count)
     else:
-        os.ftruncate(fd, size)
+        os.ftruncate(fd, byte_count)

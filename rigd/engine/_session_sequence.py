@@ -114,17 +114,17 @@ class SessionSequence:
         Check of the angles that are read without torque.
     channels
         Rings for samples, the controller's terms and events.
-    display
+    reading_publisher
         Publisher of the readings.
     parent
         Connection to the supervisor process.
-    stop
+    stop_request
         Stop signals that this process received itself.
     ending
         Steps after the record.
     touch
         Detector of touches, or None if the session does not search for an obstacle.
-    reader
+    reference_reader
         Reader of a reference that grows during the record, or None if the reference is complete.
     """
 
@@ -137,23 +137,23 @@ class SessionSequence:
         scheduler: TickScheduler,
         standstill: StandstillMonitor,
         channels: Channels,
-        display: ReadingPublisher,
+        reading_publisher: ReadingPublisher,
         parent: Parent,
-        stop: StopRequest,
+        stop_request: StopRequest,
         ending: Ending,
         touch: "TouchWatch | None" = None,
-        reader: ReferenceReader | None = None,
+        reference_reader: ReferenceReader | None = None,
     ) -> None:
         self._touch = touch
-        self._reader = reader
-        self._display = display
+        self._reader = reference_reader
+        self._display = reading_publisher
         self._profile = profile
         self._cycle = cycle
         self._clock = clock
         self._channels = channels
         self._shared_state = channels.shared_state
         self._parent = parent
-        self._stop = stop
+        self._stop = stop_request
         self._rate_hz = profile.rig.rate_hz
         self._scheduler = scheduler
         self._standstill = standstill
@@ -412,7 +412,7 @@ class SessionSequence:
         if end is not None:
             raise end
 
-    def _await_segment(self, reader: ReferenceReader, tick: int) -> None:
+    def _await_segment(self, reference_reader: ReferenceReader, tick: int) -> None:
         """Stop virtual time until the fit process has planned the reference of a tick.
 
         With devices on a bus or serial line, return after 1 s: the tick then holds the last angle,
@@ -420,7 +420,7 @@ class SessionSequence:
         """
         uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
-        while reader.must_wait(tick) and self._stop_reason() is None:
+        while reference_reader.must_wait(tick) and self._stop_reason() is None:
             if uses_line and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
             self._display.publish(self._cycle, self._scheduler.due_ns)

@@ -134,7 +134,7 @@ class Channels:
 
 
 def create_channels(
-    rate_hz: float, fds: Sequence[int], buffered_s: float = RECORDER_BUFFER_S
+    rate_hz: float, descriptors: Sequence[int], buffered_s: float = RECORDER_BUFFER_S
 ) -> Channels:
     """Create the rings and the shared state of a rig's processes in shared memory.
 
@@ -142,12 +142,12 @@ def create_channels(
     ----------
     rate_hz
         Ticks a second.
-    fds
+    descriptors
         Descriptors, as many as `DESCRIPTORS`: for the rings, the shared state and the reference.
     buffered_s
         Time in s whose records the rings hold.
     """
-    *ring_fds, shared_state_fd, reference_fd = fds
+    *ring_fds, shared_state_fd, reference_fd = descriptors
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
         for topic, fd in zip(TOPICS, ring_fds, strict=True)
@@ -163,8 +163,8 @@ def attach_channels(specs: ChannelSpecs) -> Channels:
 
 
 def _make_channels(
-    rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
+    topic_rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
 ) -> Channels:
     """Return channels from rings in the order of `TOPICS`, and the shared state."""
-    events, controls, timings, samples = rings
+    events, controls, timings, samples = topic_rings
     return Channels(events, controls, timings, samples, shared_state, reference_fd)

@@ -90,7 +90,7 @@ def run_control(
     clock: Clock,
     channels: Channels,
     parent: Parent,
-    stop: StopRequest,
+    stop_request: StopRequest,
     realtime_results: dict[str, str],
 ) -> None:
     """Connect the devices, execute the supervisor's orders, and close the devices in any case.
@@ -101,7 +101,7 @@ def run_control(
         Profile of the rig.
     devices
         Devices, not yet connected.
-    clock, channels, parent, stop
+    clock, channels, parent, stop_request
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
     realtime_results
         Real-time settings that were granted, for the file.
@@ -113,7 +113,9 @@ def run_control(
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        server = _ControlServer(profile, devices, clock, channels, parent, stop, realtime_results)
+        server = _ControlServer(
+            profile, devices, clock, channels, parent, stop_request, realtime_results
+        )
         channels.shared_state[StateField.PHASE] = Phase.OFF
         server.observe_standstill()
         name_this_process(IDLE_NAME)
@@ -146,8 +148,8 @@ class _ControlServer:
         clock: Clock,
         channels: Channels,
         parent: Parent,
-        stop: StopRequest,
-        granted: dict[str, str],
+        stop_request: StopRequest,
+        realtime_results: dict[str, str],
     ) -> None:
         self._profile = profile
         self._devices = devices
@@ -156,8 +158,8 @@ class _ControlServer:
         self._channels = channels
         self._shared_state = channels.shared_state
         self._parent = parent
-        self._stop = stop
-        self._granted = granted
+        self._stop = stop_request
+        self._granted = realtime_results
         self._zero_rad = 0.0
         self._silent_ticks = 0
         self._on_lines = devices.uses_line
@@ -259,7 +261,7 @@ class _ControlServer:
         self._cycle.observe(self._scheduler.due_ns)
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
-    def _run_session(self, job: SessionJob) -> None:
+    def _run_session(self, session_job: SessionJob) -> None:
         """Run one session, disable the drive in any case, and send `Finished` to the supervisor.
 
         Raises
@@ -282,20 +284,24 @@ class _ControlServer:
             StateField.BEGUN,
         ):
             shared_state[state_field] = 0
-        self._warn_of_refusals(job)
-        self._log_accepted(job)
-        cycle = self._cycle = self._make_cycle(job.profile)
-        reference_rad = map_reference(job.reference)
+        self._warn_of_refusals(session_job)
+        self._log_accepted(session_job)
+        cycle = self._cycle = self._make_cycle(session_job.profile)
+        reference_rad = map_reference(session_job.reference)
         touch_watch = None
-        if job.touch is not None:
+        if session_job.touch is not None:
             from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
 
-            touch_watch = TouchWatch(job.touch, cycle, reference_rad, job.profile.rig.rate_hz)
+            touch_watch = TouchWatch(
+                session_job.touch, cycle, reference_rad, session_job.profile.rig.rate_hz
+            )
         reference_reader = None
-        if job.reference.planned is not None:
-            reference_reader = ReferenceReader(reference_rad, job.reference.planned, shared_state)
+        if session_job.reference.planned is not None:
+            reference_reader = ReferenceReader(
+                reference_rad, session_job.reference.planned, shared_state
+            )
         session_sequence = SessionSequence(
-            job.profile,
+            session_job.profile,
             reference_rad,
             cycle,
             self._clock,
@@ -305,7 +311,7 @@ class _ControlServer:
             self._display,
             self._parent,
             self._stop,
-            job.ending,
+            session_job.ending,
             touch_watch,
             reference_reader,
         )
@@ -313,7 +319,7 @@ class _ControlServer:
         was_recorded = device_failed = False
         name_this_process(SESSION_NAME)
         try:
-            seed_metadata = self._restart_noise(job)
+            seed_metadata = self._restart_noise(session_job)
             tare_metadata = session_sequence.tare()
             devices.drive.enable(session_sequence.stop_requested)
             session_sequence.hold()
@@ -360,7 +366,7 @@ class _ControlServer:
         if device_failed:
             raise DeviceError(failure_text)
 
-    def _restart_noise(self, job: SessionJob) -> dict[str, str]:
+    def _restart_noise(self, session_job: SessionJob) -> dict[str, str]:
         """Restart the noise of a simulated rig and return its seed as metadata; {} for a real rig.
 
         Raises
@@ -369,7 +375,9 @@ class _ControlServer:
             If the simulated rig does not answer.
         """
         renew_noise = self._devices.renew_noise
-        return {} if renew_noise is None else {"simulation_seed": str(renew_noise(job.seed))}
+        return (
+            {} if renew_noise is None else {"simulation_seed": str(renew_noise(session_job.seed))}
+        )
 
     def _run_probe(self, profile: Profile) -> None:
         """Run the probing move of a profile, disable the drive, and send the result.
@@ -414,10 +422,10 @@ class _ControlServer:
         name_this_process(IDLE_NAME)
         self._parent.send(reply_message)
 
-    def _send_measurement(self, measure: Callable[[], dict[str, object]]) -> None:
+    def _send_measurement(self, measure_at_rest: Callable[[], dict[str, object]]) -> None:
         """Run a measurement at rest; send its result, or `Refused` with the reason of a failure."""
         try:
-            self._parent.send(Measured(measure()))
+            self._parent.send(Measured(measure_at_rest()))
         except SessionEnd as end:
             self._parent.send(Refused(end.reason))
 
@@ -504,7 +512,7 @@ class _ControlServer:
         cycle.zero_rad = self._zero_rad
         return cycle
 
-    def _warn_of_refusals(self, job: SessionJob) -> None:
+    def _warn_of_refusals(self, session_job: SessionJob) -> None:
         """Log the real-time settings that the system did not grant, as warnings."""
         own_refusals = {
             setting_name: refusal_text
@@ -513,7 +521,10 @@ class _ControlServer:
         }
         for refused_settings, consequence_text in (
             (own_refusals, "more ticks will be late"),
-            (job.refused, "a computer that is busy with other programs may end the session"),
+            (
+                session_job.refused,
+                "a computer that is busy with other programs may end the session",
+            ),
         ):
             if refused_settings:
                 setting_names = ", ".join(
@@ -523,9 +534,9 @@ class _ControlServer:
                 warning_message = f"The system did not grant {setting_names}: {consequence_text}."
                 write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
-    def _log_accepted(self, job: SessionJob) -> None:
+    def _log_accepted(self, session_job: SessionJob) -> None:
         """Log the failed checks of ``rigd check`` that the operator accepted, as warnings."""
-        for check_row in job.accepted:
+        for check_row in session_job.accepted:
             warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
             write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 

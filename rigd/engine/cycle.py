@@ -160,7 +160,7 @@ class Cycle:
         Connected drive and sensor.
     projection
         Coupling torque about the motor's axis = projection · wrench.
-    controller, watch
+    controller, limit_watch
         Controller and limit monitor. The monitor checks every reading before the controller
         uses it.
     reading_monitors
@@ -188,7 +188,7 @@ class Cycle:
         devices: Devices,
         projection: Wrench,
         controller: PidController,
-        watch: LimitWatch,
+        limit_watch: LimitWatch,
         reading_monitors: "ReadingMonitors",
     ) -> None:
         self.devices = devices
@@ -196,7 +196,7 @@ class Cycle:
         self._sensor = devices.sensor
         self._projection = projection
         self.controller = controller
-        self.watch = watch
+        self.watch = limit_watch
         self.encoder_watch: EncoderWatch | None = reading_monitors.encoder
         self.sensor_watch = reading_monitors.sensor
         self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None

@@ -436,18 +436,18 @@ class MessageReader:
         return message
 
 
-def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
+def is_ready(fd: int, poll_event: int, timeout_s: float | None) -> bool:
     """Wait until a descriptor can be read or written; return False after the timeout.
 
     Parameters
     ----------
     fd
         File descriptor. Unlike `select`, `poll` accepts numbers beyond 1023.
-    event
+    poll_event
         ``select.POLLIN`` to read or ``select.POLLOUT`` to write.
     timeout_s
         Longest time to wait in s; None: wait forever.
     """
     poller = select.poll()
-    poller.register(fd, event)
+    poller.register(fd, poll_event)
     return bool(poller.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))

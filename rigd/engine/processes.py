@@ -50,7 +50,7 @@ class Child:
     module
         Module that is run as ``python -m module``. It starts its imports at once and waits for its
         job.
-    fds
+    descriptors
         Descriptors that the child inherits.
     cores
         Cores that the child may use; empty: those of this process.
@@ -62,7 +62,7 @@ class Child:
     """
 
     def __init__(
-        self, name: str, module: str, fds: Sequence[int], cores: Collection[int] = ()
+        self, name: str, module: str, descriptors: Sequence[int], cores: Collection[int] = ()
     ) -> None:
         self.name = name
         try:
@@ -72,7 +72,7 @@ class Child:
                     bufsize=0,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
-                    pass_fds=fds,
+                    pass_fds=descriptors,
                     env=os.environ | SINGLE_THREADED,
                 )
         except OSError as error:

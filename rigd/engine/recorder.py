@@ -88,7 +88,7 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
 
 
 def _record_until_closed(
-    parent: Parent, channels: Channels, writer: SessionWriter, folder: Path
+    parent: Parent, channels: Channels, writer: SessionWriter, disk_folder: Path
 ) -> None:
     """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
@@ -97,7 +97,7 @@ def _record_until_closed(
         has_transferred = recorder.transfer()
         if time.monotonic() - polled_s > _DISK_POLL_S:
             polled_s = time.monotonic()
-            _publish_free_space(channels.shared_state, folder)
+            _publish_free_space(channels.shared_state, disk_folder)
         try:
             message = parent.poll(0.0 if has_transferred else _IDLE_PAUSE_S)
         except EOFError:
@@ -118,10 +118,12 @@ def _record_until_closed(
                 return
 
 
-def _publish_free_space(shared_state: SharedState, folder: Path) -> None:
+def _publish_free_space(shared_state: SharedState, disk_folder: Path) -> None:
     """Publish the free space on the disk of a folder, in MB, in the shared state."""
     with contextlib.suppress(OSError):
-        shared_state[StateField.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
+        shared_state[StateField.DISK_FREE_MB] = max(
+            1, ceil(shutil.disk_usage(disk_folder).free / 1e6)
+        )
 
 
 class Recorder:
@@ -159,14 +161,14 @@ class Recorder:
         """Header of the session; None until the supervisor has sent it."""
         self.begun = False
 
-    def _begin(self, header: FileHeader) -> None:
+    def _begin(self, file_header: FileHeader) -> None:
         """Write metadata, segments and attachments at the start of the file."""
         attachments = {
             attachment_name: attachment_text.encode()
-            for attachment_name, attachment_text in header.attachments.items()
+            for attachment_name, attachment_text in file_header.attachments.items()
         }
         start_utc_ns = self._channels.shared_state[StateField.START_UTC_NS]
-        self._writer.begin(start_utc_ns, header.metadata, header.segments, attachments)
+        self._writer.begin(start_utc_ns, file_header.metadata, file_header.segments, attachments)
         self.begun = True
 
     def transfer(self) -> bool:

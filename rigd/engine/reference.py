@@ -39,7 +39,7 @@ class ReferenceSpec:
 
 
 def write_reference(
-    fd: int, reference_rad: "NDArray[np.float64]", planned: int | None = None
+    fd: int, reference_rad: "NDArray[np.float64]", planned_ticks: int | None = None
 ) -> ReferenceSpec:
     """Write reference angles to shared memory; return what other processes need to attach.
 
@@ -49,7 +49,7 @@ def write_reference(
         Descriptor of the memory.
     reference_rad
         Angles from the rig's zero, one per tick; shape (n,).
-    planned
+    planned_ticks
         Number of ticks that are planned; None: all.
 
     Raises
@@ -61,7 +61,7 @@ def write_reference(
     reserve(fd, reference_bytes)
     with mmap.mmap(fd, reference_bytes) as shared_memory:
         shared_memory[:] = reference_rad.astype("float64").tobytes()
-    return ReferenceSpec(fd, reference_rad.size, planned)
+    return ReferenceSpec(fd, reference_rad.size, planned_ticks)
 
 
 def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
@@ -154,7 +154,7 @@ class ReferenceReader:
     ----------
     reference_rad
         Memory of the reference.
-    planned
+    planned_ticks
         Number of ticks that are planned at the start.
     shared_state
         `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
@@ -164,10 +164,10 @@ class ReferenceReader:
     """
 
     def __init__(
-        self, reference_rad: "memoryview[float]", planned: int, shared_state: SharedState
+        self, reference_rad: "memoryview[float]", planned_ticks: int, shared_state: SharedState
     ) -> None:
         self._reference_rad = reference_rad
-        self._planned = planned
+        self._planned = planned_ticks
         self._announced = shared_state.view(StateField.PLANNED)
         self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
         self._held_ticks = shared_state.view(StateField.HELD)

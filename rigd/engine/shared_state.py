@@ -242,22 +242,22 @@ class LogEvent:
     """Whether the operator sees the line at once, whatever its level; not stored in the file."""
 
 
-def write_event(ring: Ring, event: LogEvent) -> None:
+def write_event(ring: Ring, log_event: LogEvent) -> None:
     """Append a log event to a ring, or drop the event if the ring is full.
 
     Parameters
     ----------
     ring
         Ring of events.
-    event
+    log_event
         Event; its text is cut to the size of a record.
     """
     slot_offset = ring.next_slot()
     if slot_offset < 0:
         return
-    message_bytes = event.message.encode()[:_TEXT_SIZE]
+    message_bytes = log_event.message.encode()[:_TEXT_SIZE]
     _HEADER.pack_into(
-        ring.buffer, slot_offset, event.t_ns, LEVELS.index(event.level), len(message_bytes)
+        ring.buffer, slot_offset, log_event.t_ns, LEVELS.index(log_event.level), len(message_bytes)
     )
     text_offset = slot_offset + _HEADER.size
     ring.buffer[text_offset : text_offset + len(message_bytes)] = message_bytes

@@ -120,20 +120,22 @@ class TouchFollower:
         """Whether no touch waits for an estimate."""
         return not self._pending_touches
 
-    def take(self, samples: NDArray[np.void]) -> None:
+    def take(self, new_samples: NDArray[np.void]) -> None:
         """Add the next samples of the record, shape (n,), and register the touches in them."""
         earlier_samples = self._samples
         self._samples = (
-            samples if earlier_samples is None else np.concatenate([earlier_samples, samples])
+            new_samples
+            if earlier_samples is None
+            else np.concatenate([earlier_samples, new_samples])
         )
-        for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
+        for tick in new_samples["tick"][(new_samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
             estimate = self._estimator.follow()
             self._pending_touches.append(
                 _PendingTouch(self._count, tick, self._free_from, estimate)
             )
             self._free_from = tick + self._contact_ticks
-        self._record_ended |= bool(samples["status"][-1] & Status.TORQUE_OFF)
+        self._record_ended |= bool(new_samples["status"][-1] & Status.TORQUE_OFF)
         if not self._pending_touches:
             self._samples = self._samples[-self._history_ticks :]
 
@@ -161,14 +163,16 @@ class TouchFollower:
             pending_touch.estimate.preview(record)
         return []
 
-    def _estimate(self, touch: _PendingTouch, after_ticks: int, *, is_final: bool) -> TouchReport:
+    def _estimate(
+        self, pending_touch: _PendingTouch, after_ticks: int, *, is_final: bool
+    ) -> TouchReport:
         """Return the estimate of a touch from the record until `after_ticks` past its detection."""
-        record, start_s = self._record(touch, after_ticks)
-        touch_estimate = touch.estimate.update(record, scan=False, first=not is_final)
+        record, start_s = self._record(pending_touch, after_ticks)
+        touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
         document = touch_estimate.as_dict(start_s)
-        return TouchReport(touch.number, touch.tick, is_final, document)
+        return TouchReport(pending_touch.number, pending_touch.tick, is_final, document)
 
-    def _record(self, touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
+    def _record(self, pending_touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
         """Return the record around a touch until `after_ticks` past its detection, and its start.
 
         The start is the time in s since the start of the session's record.
@@ -176,9 +180,9 @@ class TouchFollower:
         assert self._samples is not None
         job = self._job
         # Soon after another touch the beam may not have been free: the estimate is then unknown.
-        free_from = min(touch.free_from, touch.tick)
-        samples = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
-        record = touch_record(samples, touch.tick, job.rate_hz, job.shear_projection)
+        free_from = min(pending_touch.free_from, pending_touch.tick)
+        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, free_from)
+        record = touch_record(samples, pending_touch.tick, job.rate_hz, job.shear_projection)
         return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
 
 

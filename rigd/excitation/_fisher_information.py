@@ -85,8 +85,8 @@ class TorqueModel:
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
-    def for_records(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Return the torque model of a beam for records of at least `ticks` ticks.
+    def for_records(cls, estimate: BeamEstimate, rate_hz: float, tick_count: int) -> "TorqueModel":
+        """Return the torque model of a beam for records of at least `tick_count` ticks.
 
         Parameters
         ----------
@@ -94,14 +94,14 @@ class TorqueModel:
             Beam, damping and noise.
         rate_hz
             Rate of the angle.
-        ticks
+        tick_count
             Smallest length of the records in ticks.
         """
         ticks_per_point = ticks_per_sample(rate_hz)
         # Twice the length, and one of which a transform is quick.
-        half_samples = -(-ticks // ticks_per_point)
+        half_samples = -(-tick_count // ticks_per_point)
         half_samples = _fast_transform_length(half_samples)
-        ticks = half_samples * ticks_per_point
+        tick_count = half_samples * ticks_per_point
         sample_count = 2 * half_samples
         sample_hz = rate_hz / ticks_per_point
         sigma_per_s = _WRAP_AROUND_DECAY * sample_hz / sample_count
@@ -113,7 +113,7 @@ class TorqueModel:
         return cls(
             estimate,
             rate_hz,
-            ticks,
+            tick_count,
             ticks_per_point,
             sigma_per_s,
             kernels,
@@ -135,28 +135,28 @@ class TorqueModel:
         spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
-    def whitened_derivatives(self, spectrum: Complex) -> Real:
+    def whitened_derivatives(self, angle_transform: Complex) -> Real:
         """Return derivatives of the torque by the free parameters over the noise, at each sample.
 
-        `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
+        `angle_transform` is the transform of the angle. The shape is (k, ticks / factor).
         """
         return self._inverse_transform(
-            self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1
+            self.kernels * (angle_transform / self.factor), self.ticks // self.factor, 1
         )
 
-    def torque_and_slope(self, spectrum: Complex) -> Real:
+    def torque_and_slope(self, angle_transform: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
-        `spectrum` is the transform of the angle.
+        `angle_transform` is the transform of the angle.
         """
-        return self._inverse_transform(self.channels * spectrum, self.ticks, self.factor)
+        return self._inverse_transform(self.channels * angle_transform, self.ticks, self.factor)
 
     def _inverse_transform(
-        self, spectra: Complex, sample_count: int, values_per_sample: int
+        self, laplace_spectra: Complex, sample_count: int, values_per_sample: int
     ) -> Real:
         """Return functions of time, with some values per sample, from Laplace transforms."""
         time_s = np.arange(sample_count) * (self.factor / values_per_sample / self.rate_hz)
-        time_values = np.fft.irfft(spectra, 2 * sample_count)[:, :sample_count]
+        time_values = np.fft.irfft(laplace_spectra, 2 * sample_count)[:, :sample_count]
         time_values *= np.exp(self.sigma_per_s * time_s)
         return time_values
 
@@ -365,21 +365,21 @@ class RecordSoFar:
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
-    def information_after(self, more: Real | None, samples: int) -> Real:
+    def information_after(self, added_rows: Real | None, sample_count: int) -> Real:
         """Return the Fisher information on the parameters after further samples, shape (k, k).
 
         Parameters
         ----------
-        more
-            Derivatives that a segment adds from now on, shape (k, n) with n at least `samples`;
+        added_rows
+            Derivatives that a segment adds from now on, shape (k, n) with n at least `sample_count`;
             None: the motor is held.
-        samples
+        sample_count
             Number of further samples that count.
         """
-        whitened_rows = self.ahead[:, :samples]
-        if more is not None:
+        whitened_rows = self.ahead[:, :sample_count]
+        if added_rows is not None:
             whitened_rows = whitened_rows.copy()
-            whitened_rows[: more.shape[0]] += more[:, :samples]
+            whitened_rows[: added_rows.shape[0]] += added_rows[:, :sample_count]
         return projected_information(
             self.before + whitened_rows @ whitened_rows.T, len(self.estimate.names)
         )
@@ -452,13 +452,15 @@ def _regression_coefficients(gram: Real, k: int) -> Real:
     return coefficients
 
 
-def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
+def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
     """Return the covariance of the parameters for a Fisher information plus prior knowledge."""
     prior_stds = np.array(
         [_prior_std(parameter_name, estimate) for parameter_name in estimate.names]
     )
     # In units of the prior the matrix is well scaled wherever something is known.
-    scaled_information = information * np.outer(prior_stds, prior_stds) + np.eye(len(prior_stds))
+    scaled_information = fisher_information * np.outer(prior_stds, prior_stds) + np.eye(
+        len(prior_stds)
+    )
     diagonal_roots = np.sqrt(np.diag(scaled_information))
     inverse_matrix: Real = np.linalg.inv(
         scaled_information / np.outer(diagonal_roots, diagonal_roots)
@@ -483,17 +485,17 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     return _PRIOR_STD[name]
 
 
-def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
+def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> Real:
     """Return effects on a record's torque that are not of interest: free decays, offset, drift.
 
     The shape is (m, samples).
     """
-    time_s = np.arange(samples) / sample_hz
+    time_s = np.arange(sample_count) / sample_hz
     mode_poles = np.array([beam_mode.pole_rad_s for beam_mode in estimate.modes()])
     free_decays = np.exp(np.outer(mode_poles, time_s))
     decay_weights = _whitening_weights(estimate, mode_poles.imag / (2 * pi), sample_hz)[:, None]
     constant_weight = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
-    offset_and_drift = np.stack([np.ones(samples), time_s]) * constant_weight
+    offset_and_drift = np.stack([np.ones(sample_count), time_s]) * constant_weight
     return np.concatenate(
         [free_decays.real * decay_weights, free_decays.imag * decay_weights, offset_and_drift]
     )

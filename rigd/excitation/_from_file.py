@@ -128,14 +128,14 @@ def _read_columns(
     return (None if time_column is None else time_column.values), angle_column.values
 
 
-def _read_table(stream: BinaryIO) -> TextTable:
+def _read_table(table_stream: BinaryIO) -> TextTable:
     """Read a table with the columns of times and angles, or with a single column of angles."""
     try:
-        return read_table(stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
+        return read_table(table_stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     try:
-        text_table = read_table(stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
+        text_table = read_table(table_stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     else:
@@ -145,7 +145,7 @@ def _read_table(stream: BinaryIO) -> TextTable:
                 f"name the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
             )
         return text_table
-    text_table = read_table(stream, ("#1",), most_rows=MAX_SAMPLES)
+    text_table = read_table(table_stream, ("#1",), most_rows=MAX_SAMPLES)
     if text_table.width > 1 or text_table.columns["#1"].title:
         raise TableError(
             f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "

@@ -192,10 +192,10 @@ def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
         ) from error
 
 
-def _describe_invalid_value(detail: ErrorDetails) -> str:
+def _describe_invalid_value(error_details: ErrorDetails) -> str:
     """Return a sentence that names an invalid value in a document, with a remedy."""
     document_path = ""
-    for path_part in detail["loc"]:
+    for path_part in error_details["loc"]:
         document_path += (
             f"[{path_part}]"
             if isinstance(path_part, int)
@@ -205,10 +205,10 @@ def _describe_invalid_value(detail: ErrorDetails) -> str:
         )
     if not document_path:
         return 'is no JSON object; it must have the key "modes".'
-    if detail["type"] == "missing":
+    if error_details["type"] == "missing":
         return f"{document_path} is missing; give it as analyze --json writes it."
     unit_text = " Hz" if document_path.endswith("_hz") else ""
-    given_text = json.dumps(detail["input"], default=str)
+    given_text = json.dumps(error_details["input"], default=str)
     given_text = given_text if len(given_text) <= 60 else f"{given_text[:60]}..."
     remedy_text = {
         "greater_than": f"must be more than 0{unit_text}",
@@ -217,14 +217,14 @@ def _describe_invalid_value(detail: ErrorDetails) -> str:
         "list_type": "must be a list of modes",
         "model_type": "must be an object with frequency_hz and damping_ratio",
         "string_type": "must be a text",
-    }.get(detail["type"], f"must be a number{' in Hz' if unit_text else ''}")
+    }.get(error_details["type"], f"must be a number{' in Hz' if unit_text else ''}")
     return f"{document_path} = {given_text}{unit_text} {remedy_text}."
 
 
-def _mode_groups(entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
+def _mode_groups(mode_entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
     """Yield lists of entries of several fits that describe the same mode, by rising frequency."""
     mode_group: list[_ModeEntry] = []
-    for mode_entry in sorted(entries, key=_frequency_hz):
+    for mode_entry in sorted(mode_entries, key=_frequency_hz):
         if mode_group and _frequency_hz(mode_entry) > SAME_MODE_FREQUENCY_RATIO * _frequency_hz(
             mode_group[0]
         ):
@@ -235,22 +235,24 @@ def _mode_groups(entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
         yield mode_group
 
 
-def _median_mode(group: Sequence[_ModeEntry]) -> FoundMode:
+def _median_mode(mode_entries: Sequence[_ModeEntry]) -> FoundMode:
     """Return the median of several fits' entries for one mode."""
-    middle_hz = median(_frequency_hz(mode_entry) for mode_entry in group)
-    stated_hz = median(mode_entry.frequency_std_hz or 0.0 for mode_entry in group)
+    middle_hz = median(_frequency_hz(mode_entry) for mode_entry in mode_entries)
+    stated_hz = median(mode_entry.frequency_std_hz or 0.0 for mode_entry in mode_entries)
     # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
-    scatter_hz = 1.4826 * median(abs(_frequency_hz(mode_entry) - middle_hz) for mode_entry in group)
+    scatter_hz = 1.4826 * median(
+        abs(_frequency_hz(mode_entry) - middle_hz) for mode_entry in mode_entries
+    )
     return FoundMode(
         frequency_hz=middle_hz,
-        damping_ratio=median(mode_entry.damping_ratio or 0.0 for mode_entry in group),
+        damping_ratio=median(mode_entry.damping_ratio or 0.0 for mode_entry in mode_entries),
         uncertainty_hz=2.0 * max(stated_hz, scatter_hz),
     )
 
 
-def _frequency_hz(entry: _ModeEntry) -> float:
+def _frequency_hz(mode_entry: _ModeEntry) -> float:
     """Return the frequency of a mode's entry in Hz, or 0 if it has none."""
-    return entry.frequency_hz or 0.0
+    return mode_entry.frequency_hz or 0.0
 
 
 # Bands, and the time spent in each
@@ -294,17 +296,20 @@ class Band:
     """Upper end of the band in Hz."""
 
     @classmethod
-    def around_mode(cls, mode: FoundMode, widths: float) -> "Band":
+    def around_mode(cls, found_mode: FoundMode, widths: float) -> "Band":
         """Return the band of frequencies to be swept around a mode.
 
         On either side it extends by the uncertainty of the frequency and by `widths` half-power
         widths.
         """
-        half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
+        half_hz = (
+            widths * 2.0 * found_mode.damping_ratio * found_mode.frequency_hz
+            + found_mode.uncertainty_hz
+        )
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
-            mode, max(mode.frequency_hz - half_hz, 0.2 * mode.frequency_hz),
-            mode.frequency_hz + half_hz,
+            found_mode, max(found_mode.frequency_hz - half_hz, 0.2 * found_mode.frequency_hz),
+            found_mode.frequency_hz + half_hz,
         )  # fmt: skip
 
     @property
@@ -313,7 +318,9 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
+def time_fractions(
+    sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig
+) -> Real:
     """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
@@ -322,7 +329,7 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
 
     Parameters
     ----------
-    bands, amplitudes_rad
+    sweep_bands, amplitudes_rad
         Bands, and the amplitude of the reference in each band.
     rig
         Predicted behaviour of the rig.
@@ -332,11 +339,13 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
     ndarray, shape (len(bands),)
         Fractions with the sum 1.
     """
-    beam_damping = first_order_damping([band.mode for band in bands], rig.beam)
-    information_rates, damping_count = _information_rates(bands, amplitudes_rad, rig, beam_damping)
+    beam_damping = first_order_damping([band.mode for band in sweep_bands], rig.beam)
+    information_rates, damping_count = _information_rates(
+        sweep_bands, amplitudes_rad, rig, beam_damping
+    )
     parameter_scales = np.sqrt(np.einsum("bii->i", information_rates))
     information_rates = information_rates / np.outer(parameter_scales, parameter_scales)
-    fractions = np.full(len(bands), 1.0 / len(bands))
+    fractions = np.full(len(sweep_bands), 1.0 / len(sweep_bands))
     for _ in range(_TIME_STEPS):
         information = np.tensordot(fractions, information_rates, axes=1)
         covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(parameter_scales)))
@@ -372,7 +381,7 @@ def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 
 def _information_rates(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
+    sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
     """Return the Fisher information per second of each band, and the number of damping parameters.
 
@@ -387,7 +396,7 @@ def _information_rates(
         if damping_factor > 0.0 and coefficients_by_order.get(n, 1.0) > 0.0
     ]
     information_rates = []
-    for sweep_band, amplitude_rad in zip(bands, amplitudes_rad, strict=True):
+    for sweep_band, amplitude_rad in zip(sweep_bands, amplitudes_rad, strict=True):
         frequency_hz = np.linspace(sweep_band.start_hz, sweep_band.stop_hz, _BAND_POINTS)
         s = 2j * pi * frequency_hz
         band_beam = _beam_with_mode(rig.beam, sweep_band.mode.frequency_hz)
@@ -547,7 +556,7 @@ def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> li
 
 
 def _admissible_amplitudes(
-    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
+    unit_sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
     """Return the amplitude of each sweep in rad, reduced where the rig's limits require it.
 
@@ -556,7 +565,7 @@ def _admissible_amplitudes(
     """
     amplitudes_rad = []
     earlier_sweeps_rad = np.empty(0)
-    for sweep in sweeps:
+    for sweep in unit_sweeps:
         reduced_rad = amplitude_rad
         for _ in range(_MAX_REDUCTIONS):
             sweeps_so_far_rad = np.concatenate([earlier_sweeps_rad, reduced_rad * sweep])
@@ -572,37 +581,39 @@ def _admissible_amplitudes(
     return amplitudes_rad
 
 
-def _divide_ticks(fractions: Real, ticks: int) -> list[int]:
-    """Return numbers of ticks in proportion to `fractions`; their sum is exactly `ticks`."""
-    end_ticks = np.round(np.cumsum(fractions) * ticks).astype(int)
+def _divide_ticks(band_fractions: Real, tick_count: int) -> list[int]:
+    """Return numbers of ticks in proportion to `band_fractions`; their sum is exactly `tick_count`."""
+    end_ticks = np.round(np.cumsum(band_fractions) * tick_count).astype(int)
     return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 
 
-def _raise_to_least(fractions: Real) -> Real:
+def _raise_to_least(band_fractions: Real) -> Real:
     """Return the bands' fractions of the time, each raised to the least that is allowed.
 
     The other fractions are reduced in proportion, so that the sum remains 1.
     """
-    least_fraction = LEAST_TIME_FRACTION / len(fractions)
-    is_low = fractions < least_fraction
-    for _ in fractions:
-        remaining_scale = (1.0 - least_fraction * np.count_nonzero(is_low)) / fractions[
+    least_fraction = LEAST_TIME_FRACTION / len(band_fractions)
+    is_low = band_fractions < least_fraction
+    for _ in band_fractions:
+        remaining_scale = (1.0 - least_fraction * np.count_nonzero(is_low)) / band_fractions[
             ~is_low
         ].sum()
-        raised_fractions = np.where(is_low, least_fraction, fractions * remaining_scale)
+        raised_fractions = np.where(is_low, least_fraction, band_fractions * remaining_scale)
         is_low = raised_fractions <= least_fraction
     return raised_fractions
 
 
-def _unit_sweep(band: Band, ticks: int, fade_ticks: int, rate_hz: float) -> Real:
+def _unit_sweep(band: Band, tick_count: int, fade_ticks: int, rate_hz: float) -> Real:
     """Return a sweep of amplitude 1 through a band, shape (ticks,).
 
     Both ends have a raised-cosine fade of ``fades / 2`` ticks.
     """
-    duration_s = ticks / rate_hz
-    t = np.arange(ticks) / rate_hz
+    duration_s = tick_count / rate_hz
+    t = np.arange(tick_count) / rate_hz
     phase_rad = (
         2.0 * pi * (band.start_hz * t + (band.stop_hz - band.start_hz) * t**2 / (2 * duration_s))
     )
-    edge_fraction = np.minimum(np.arange(ticks), ticks - np.arange(ticks)) / (fade_ticks / 2)
+    edge_fraction = np.minimum(np.arange(tick_count), tick_count - np.arange(tick_count)) / (
+        fade_ticks / 2
+    )
     return (0.5 - 0.5 * np.cos(pi * np.minimum(edge_fraction, 1.0))) * np.sin(phase_rad)

@@ -342,11 +342,11 @@ class SegmentSearch:
         return frequency_hz, 1.0 / (limit_fractions / self.limits[:, None]).max(axis=0)
 
     def best_candidate(
-        self, time_left_s: float, through: Collection[int] = ()
+        self, time_left_s: float, mode_numbers: Collection[int] = ()
     ) -> _SegmentCandidate:
         """Return the most informative candidate segment that fits into `time_left_s`.
 
-        It drives one of the modes in `through`, or any mode if `through` is empty.
+        It drives one of the modes in `mode_numbers`, or any mode if `mode_numbers` is empty.
         """
         durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
@@ -355,10 +355,13 @@ class SegmentSearch:
                 f"{DURATIONS_S[0]:g} s."
             )
         return max(
-            (self.best_of_duration(d, through) for d in durations_s), key=lambda each: each.value
+            (self.best_of_duration(d, mode_numbers) for d in durations_s),
+            key=lambda each: each.value,
         )
 
-    def best_of_duration(self, duration_s: float, through: Collection[int]) -> _SegmentCandidate:
+    def best_of_duration(
+        self, duration_s: float, mode_numbers: Collection[int]
+    ) -> _SegmentCandidate:
         """Return the most informative candidate segment of a given duration.
 
         The best band comes first; bands of further modes are added if they give more information.
@@ -385,7 +388,7 @@ class SegmentSearch:
         resonance_bands = {
             sweep_band.mode_number: sweep_band
             for sweep_band, _ in sweep_pairs
-            if sweep_band.at_mode and sweep_band.mode_number in through
+            if sweep_band.at_mode and sweep_band.mode_number in mode_numbers
         }
         candidates_at_rest = {
             mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
@@ -396,7 +399,7 @@ class SegmentSearch:
                 self.with_band(start_candidate, 1.0, sweep_band, sweep_pair, phase_index)
                 for sweep_band, sweep_pair in sweep_pairs
                 if sweep_band.at_mode
-                and (not through or sweep_band is resonance_bands.get(sweep_band.mode_number))
+                and (not mode_numbers or sweep_band is resonance_bands.get(sweep_band.mode_number))
                 for start_candidate in (empty_candidate, candidates_at_rest[sweep_band.mode_number])
                 for phase_index in range(_PHASE_COUNT)
             ),
@@ -431,7 +434,7 @@ class SegmentSearch:
 
     def with_modes_at_rest(
         self,
-        start: _SegmentCandidate,
+        start_candidate: _SegmentCandidate,
         mode_number: int,
         mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
     ) -> _SegmentCandidate:
@@ -446,8 +449,8 @@ class SegmentSearch:
             for other_sweep in sweep_pair
         ]
         if not other_sweeps:
-            return start
-        first_sample = self.model_samples(start.duration_s)
+            return start_candidate
+        first_sample = self.model_samples(start_candidate.duration_s)
         tail_samples = slice(first_sample, first_sample + self.model_samples(_TAIL_S))
         # One second of the tip's slope suffices to separate the modes.
         tip_slopes = np.stack(
@@ -459,21 +462,21 @@ class SegmentSearch:
             f * other_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
-        amplitude_fraction = min(1.0, largest_factor(start.channels, summed_channels))
+        amplitude_fraction = min(1.0, largest_factor(start_candidate.channels, summed_channels))
         summed_weighted = sum(
             f * other_sweep.weighted
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
         return _SegmentCandidate(
-            start.duration_s,
+            start_candidate.duration_s,
             (),
             tuple(
                 (amplitude_fraction * f, other_sweep)
                 for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
             ),
-            start.channels + amplitude_fraction * summed_channels,
-            start.weighted + amplitude_fraction * summed_weighted,
-            start.tip_slope
+            start_candidate.channels + amplitude_fraction * summed_channels,
+            start_candidate.weighted + amplitude_fraction * summed_weighted,
+            start_candidate.tip_slope
             + amplitude_fraction
             * sum(
                 f * other_sweep.slope
@@ -482,14 +485,16 @@ class SegmentSearch:
             0.0,
         )
 
-    def sweep_pair(self, band: _SweepBand, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
+    def sweep_pair(
+        self, sweep_band: _SweepBand, duration_s: float
+    ) -> tuple[_UnitSweep, _UnitSweep]:
         """Return two sweeps of 1 rad through a band, a quarter of a period apart in phase."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
-        phase_rad = 2 * pi * band.middle_hz * from_middle_s
-        phase_rad += 2 * pi * band.half_width_hz * from_middle_s**2 / duration_s
-        fade_factors = quintic(min(band.fade_s, 0.4 * duration_s), rate_hz)
+        phase_rad = 2 * pi * sweep_band.middle_hz * from_middle_s
+        phase_rad += 2 * pi * sweep_band.half_width_hz * from_middle_s**2 / duration_s
+        fade_factors = quintic(min(sweep_band.fade_s, 0.4 * duration_s), rate_hz)
         # The motor comes to rest as well before the segment ends.
         end_tick = n - self.ticks(self.plant.settling_s)
         fade_window = np.zeros(n)
@@ -533,15 +538,15 @@ class SegmentSearch:
 
     def with_band(
         self,
-        base: _SegmentCandidate,
-        fraction: float,
-        band: _SweepBand,
+        base_candidate: _SegmentCandidate,
+        amplitude_fraction: float,
+        sweep_band: _SweepBand,
         sweep_pair: tuple[_UnitSweep, _UnitSweep],
         phase_index: int,
     ) -> _SegmentCandidate:
         """Return a candidate segment with a further band, at the largest allowed amplitude.
 
-        The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
+        The amplitudes of the candidate `base_candidate` are multiplied by `amplitude_fraction`. The phase of the new
         sweep is ``phase_index / _PHASE_COUNT`` of a turn.
         """
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
@@ -552,31 +557,40 @@ class SegmentSearch:
             sine_factor * first_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
             + cosine_factor * second_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
         )
-        base_channels = ringing_channels + fraction * (base.channels - ringing_channels)
+        base_channels = ringing_channels + amplitude_fraction * (
+            base_candidate.channels - ringing_channels
+        )
         amplitude_rad = largest_factor(base_channels, unit_channels)
-        tip_slope_fractions = self.tip_slope + fraction * (base.tip_slope - self.tip_slope)
+        tip_slope_fractions = self.tip_slope + amplitude_fraction * (
+            base_candidate.tip_slope - self.tip_slope
+        )
         tip_slope_fractions += amplitude_rad * (
             sine_factor * first_sweep.slope + cosine_factor * second_sweep.slope
         )
-        weighted_rows = self.weighted_if_held + fraction * (base.weighted - self.weighted_if_held)
+        weighted_rows = self.weighted_if_held + amplitude_fraction * (
+            base_candidate.weighted - self.weighted_if_held
+        )
         weighted_rows += amplitude_rad * (
             sine_factor * first_sweep.weighted + cosine_factor * second_sweep.weighted
         )
-        leading_band = base.parts[0][0] if base.parts else band
+        leading_band = base_candidate.parts[0][0] if base_candidate.parts else sweep_band
         information_value = self.information_to_horizon(
-            leading_band, weighted_rows, tip_slope_fractions, base.duration_s
+            leading_band, weighted_rows, tip_slope_fractions, base_candidate.duration_s
         )
         return _SegmentCandidate(
-            base.duration_s,
+            base_candidate.duration_s,
             (
                 *(
-                    (base_part, fraction * part_amplitude)
-                    for base_part, part_amplitude in base.parts
+                    (base_part, amplitude_fraction * part_amplitude)
+                    for base_part, part_amplitude in base_candidate.parts
                 ),
-                (band, amplitude_rad),
+                (sweep_band, amplitude_rad),
             ),
             (
-                *((fraction * sweep_factor, base_sweep) for sweep_factor, base_sweep in base.terms),
+                *(
+                    (amplitude_fraction * sweep_factor, base_sweep)
+                    for sweep_factor, base_sweep in base_candidate.terms
+                ),
                 (amplitude_rad * sine_factor, first_sweep),
                 (amplitude_rad * cosine_factor, second_sweep),
             ),
@@ -587,7 +601,11 @@ class SegmentSearch:
         )
 
     def information_to_horizon(
-        self, band: _SweepBand, weighted: Real, tip_slope: Real, duration_s: float
+        self,
+        sweep_band: _SweepBand,
+        weighted_rows: Real,
+        tip_slope_fractions: Real,
+        duration_s: float,
     ) -> float:
         """Return the information up to the planning horizon if a mode is driven after a segment.
 
@@ -595,15 +613,15 @@ class SegmentSearch:
         """
         first_sample = self.model_samples(duration_s)
         remaining_samples = self.samples - first_sample
-        continued_drive = self.continued_drive(band)
+        continued_drive = self.continued_drive(sweep_band)
         mode_amplitudes = (
             self.amplitude_matrix
-            @ tip_slope[first_sample : first_sample + self.amplitude_matrix.shape[1]]
+            @ tip_slope_fractions[first_sample : first_sample + self.amplitude_matrix.shape[1]]
         )
-        mode_row = 2 * [beam_mode.number for beam_mode in self.modes].index(band.mode_number)
+        mode_row = 2 * [beam_mode.number for beam_mode in self.modes].index(sweep_band.mode_number)
         drive_factors = continued_drive.per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
-        rows_before = weighted[:, :first_sample]
-        rows_after = weighted[:, first_sample:] + np.tensordot(
+        rows_before = weighted_rows[:, :first_sample]
+        rows_after = weighted_rows[:, first_sample:] + np.tensordot(
             drive_factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
         )
         return float(np.vdot(rows_before, rows_before) + np.vdot(rows_after, rows_after))
@@ -623,14 +641,14 @@ class SegmentSearch:
         )
         return np.linalg.pinv(decay_columns.T)
 
-    def continued_drive(self, band: _SweepBand) -> _ContinuedDrive:
+    def continued_drive(self, sweep_band: _SweepBand) -> _ContinuedDrive:
         """Return the response to exciting a band's mode by a sine up to the planning horizon."""
-        if band.middle_hz not in self._continued_drives:
+        if sweep_band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
-            sine_pair = self.sweep_pair(replace(band, half_width_hz=0.0), duration_s)
+            sine_pair = self.sweep_pair(replace(sweep_band, half_width_hz=0.0), duration_s)
             weighted_rows = np.stack([sine_sweep.weighted for sine_sweep in sine_pair])
             driven_mode = next(
-                beam_mode for beam_mode in self.modes if beam_mode.number == band.mode_number
+                beam_mode for beam_mode in self.modes if beam_mode.number == sweep_band.mode_number
             )
             end_sample = self.model_samples(duration_s - _FADE_S)
             tail_window = slice(end_sample - self.model_samples(_TAIL_S), end_sample)
@@ -645,30 +663,30 @@ class SegmentSearch:
                 [sine_sweep.slope[tail_window] for sine_sweep in sine_pair], axis=1
             )
             drive_per_amplitude = np.linalg.inv(np.linalg.lstsq(oscillation_columns, tip_slopes)[0])
-            self._continued_drives[band.middle_hz] = _ContinuedDrive(
+            self._continued_drives[sweep_band.middle_hz] = _ContinuedDrive(
                 weighted_rows, drive_per_amplitude
             )
-        return self._continued_drives[band.middle_hz]
+        return self._continued_drives[sweep_band.middle_hz]
 
-    def segment(self, chosen: _SegmentCandidate, time_left_s: float) -> Segment:
+    def segment(self, chosen_candidate: _SegmentCandidate, time_left_s: float) -> Segment:
         """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
-        segment_samples = self.model_samples(chosen.duration_s)
-        segment_channels = chosen.weighted_sum("channels")
+        segment_samples = self.model_samples(chosen_candidate.duration_s)
+        segment_channels = chosen_candidate.weighted_sum("channels")
         ringing_channels = self.ringing[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
         amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
         present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
         later_covariance = covariance_of(
             self.record.information_after(
-                amplitude_fraction * chosen.weighted_sum("rows"), segment_samples
+                amplitude_fraction * chosen_candidate.weighted_sum("rows"), segment_samples
             ),
             estimate,
         )
         return Segment(
-            name=_describe_candidate(chosen),
-            reference_rad=amplitude_fraction * chosen.weighted_sum("reference_rad"),
-            angle_rad=amplitude_fraction * chosen.weighted_sum("angle_rad"),
+            name=_describe_candidate(chosen_candidate),
+            reference_rad=amplitude_fraction * chosen_candidate.weighted_sum("reference_rad"),
+            angle_rad=amplitude_fraction * chosen_candidate.weighted_sum("angle_rad"),
             names=estimate.names,
             covariance=later_covariance,
             now=quantities.precisions(present_covariance),
@@ -736,12 +754,12 @@ class SineMixture:
 
 
 def best_mixture(
-    information: Real,
+    fisher_information: Real,
     estimate: BeamEstimate,
     quantities: Quantities,
     frequency_hz: Real,
     angle_rad: Real,
-    relaxation: float = 1.0,
+    target_relaxation: float = 1.0,
 ) -> SineMixture:
     """Return durations of steady sines that together reach all target precisions soonest.
 
@@ -752,7 +770,7 @@ def best_mixture(
 
     Parameters
     ----------
-    information
+    fisher_information
         Information that the record contains already, shape (k, k).
     estimate
         Beam, damping and noise.
@@ -760,21 +778,21 @@ def best_mixture(
         The q target quantities.
     frequency_hz, angle_rad
         Frequencies of the sines and amplitudes of the angle, each of shape (m,).
-    relaxation
+    target_relaxation
         Factor by which all standard deviations may exceed their targets.
     """
     information_rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
         [inf if precision.impossible else precision.target_std for precision in quantities.items]
     )
-    scaled_gradients = quantities.gradients / (relaxation * target_stds[:, None])
+    scaled_gradients = quantities.gradients / (target_relaxation * target_stds[:, None])
     if not scaled_gradients.any():
         return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
     multipliers = np.ones(len(scaled_gradients))
     times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
     for _ in range(_MIXTURE_STEPS):
         covariance = covariance_of(
-            information + np.tensordot(times_s, information_rates, axes=1), estimate
+            fisher_information + np.tensordot(times_s, information_rates, axes=1), estimate
         )
         gain_directions = scaled_gradients @ covariance
         relative_variances = np.einsum("qi,qi->q", gain_directions, scaled_gradients)
@@ -804,7 +822,7 @@ def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Re
 
 
 def least_deviations(
-    information: Real,
+    fisher_information: Real,
     estimate: BeamEstimate,
     quantities: Quantities,
     frequency_hz: Real,
@@ -817,7 +835,7 @@ def least_deviations(
 
     Parameters
     ----------
-    information, estimate, quantities, frequency_hz, angle_rad
+    fisher_information, estimate, quantities, frequency_hz, angle_rad
         As for `best_mixture`.
     duration_s
         Total duration of all sines in s.
@@ -832,7 +850,9 @@ def least_deviations(
     for row, gradient in enumerate(quantities.gradients):
         times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
         for _ in range(_MIXTURE_STEPS):
-            total_information = information + np.tensordot(times_s, information_rates, axes=1)
+            total_information = fisher_information + np.tensordot(
+                times_s, information_rates, axes=1
+            )
             gain_direction = gradient @ covariance_of(total_information, estimate)
             least_stds[row] = np.sqrt(max(float(gain_direction @ gradient), 0.0))
             times_s = times_s * np.sqrt(
@@ -864,9 +884,9 @@ def largest_factor(existing_motion: Real, added_motion: Real) -> float:
     return max(float(allowed_factor.min()), 0.0)
 
 
-def _describe_candidate(chosen: _SegmentCandidate) -> str:
+def _describe_candidate(chosen_candidate: _SegmentCandidate) -> str:
     """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
-    sorted_parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
+    sorted_parts = sorted(chosen_candidate.parts, key=lambda part: part[0].middle_hz)
     band_texts = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
         if band.half_width_hz
@@ -876,6 +896,6 @@ def _describe_candidate(chosen: _SegmentCandidate) -> str:
     return (
         f"mode{'s' if len(sorted_parts) > 1 else ''} "
         f"{' + '.join(str(band.mode_number) for band, _ in sorted_parts)}, "
-        f"{' + '.join(band_texts)} Hz, {chosen.duration_s:g} s, "
+        f"{' + '.join(band_texts)} Hz, {chosen_candidate.duration_s:g} s, "
         f"{' + '.join(f'{amplitude:.2g}' for _, amplitude in sorted_parts)} rad"
     )

@@ -197,7 +197,9 @@ def shortest_move(
     )
 
 
-def _residual_torque_nm(plant: MovePlant, reference_rad: Real, ringing: Complex | None) -> float:
+def _residual_torque_nm(
+    plant: MovePlant, reference_rad: Real, initial_states: Complex | None
+) -> float:
     """Return the largest coupling torque in N·m of the beam's vibration after a move.
 
     It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
@@ -208,8 +210,8 @@ def _residual_torque_nm(plant: MovePlant, reference_rad: Real, ringing: Complex 
         modal_states = modal_state(
             np.concatenate([[0.0], reference_rad]), plant.rate_hz, shifted_poles
         )
-        if ringing is not None:
-            modal_states = modal_states + ringing * np.exp(
+        if initial_states is not None:
+            modal_states = modal_states + initial_states * np.exp(
                 shifted_poles * reference_rad.size / plant.rate_hz
             )
         residuals_nm.append(np.abs(modal_states) * plant.torque_per_state_nm_s)
@@ -224,18 +226,18 @@ class _MoveSearch:
         plant: MovePlant,
         distance_rad: float,
         start_rad: float,
-        order: int,
-        ringing: Complex | None,
+        zero_order: int,
+        initial_states: Complex | None,
     ) -> None:
         self._plant = plant
         self._distance_rad = distance_rad
         self._start_rad = start_rad
-        self._order = order
-        self._ringing = ringing
+        self._order = zero_order
+        self._ringing = initial_states
         self._unit_response = _UnitResponse(plant)
         ringing_torque_nm = 0.0
-        if ringing is not None:
-            ringing_torque_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
+        if initial_states is not None:
+            ringing_torque_nm = float(np.abs(initial_states) @ plant.torque_per_state_nm_s)
         # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
             "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - ringing_torque_nm,
@@ -456,32 +458,36 @@ class _MoveSearch:
 
 
 def _next_duration_ticks(
-    too_short: int,
-    sufficient: int,
+    too_short_ticks: int,
+    sufficient_ticks: int,
     fraction_short: float,
     fraction_sufficient: float,
     n: int,
-    fraction: float,
-    order: int,
+    amplitude_fraction: float,
+    zero_order: int,
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
-    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration,
+    `too_short_ticks` and `sufficient_ticks` are the longest insufficient and the shortest sufficient duration,
     with the fractions of the limits that they use. The fraction falls with a power of the duration:
     about the third, and more if the modes, not the distance, determine the duration.
     """
     if fraction_sufficient == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
-    if fraction_short == inf and n == sufficient:
-        guessed_ticks = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
+        return int(max(n + 2, round(1.03 * n * min(amplitude_fraction, 4.0) ** 0.3)))
+    if fraction_short == inf and n == sufficient_ticks:
+        guessed_ticks = round(
+            n * max(amplitude_fraction, 0.02) ** (0.08 if zero_order > 1 else 0.22)
+        )
     elif fraction_short == inf:
-        guessed_ticks = round((too_short * sufficient) ** 0.5)
+        guessed_ticks = round((too_short_ticks * sufficient_ticks) ** 0.5)
     else:
         duration_power = np.log(fraction_short / fraction_sufficient) / np.log(
-            sufficient / too_short
+            sufficient_ticks / too_short_ticks
         )
-        guessed_ticks = round(1.004 * sufficient * fraction_sufficient ** (1.0 / duration_power))
-    return int(min(max(guessed_ticks, too_short + 1), sufficient - 1))
+        guessed_ticks = round(
+            1.004 * sufficient_ticks * fraction_sufficient ** (1.0 / duration_power)
+        )
+    return int(min(max(guessed_ticks, too_short_ticks + 1), sufficient_ticks - 1))
 
 
 class _UnitResponse:
@@ -492,10 +498,10 @@ class _UnitResponse:
         self._rows: dict[str, Real] = {}
         self._ticks = 0
 
-    def for_ticks(self, ticks: int) -> dict[str, Real]:
+    def for_ticks(self, tick_count: int) -> dict[str, Real]:
         """Return the response of each quantity by name, for at least the given number of ticks."""
-        if ticks > self._ticks:
-            self._ticks = max(2 * ticks, 1024)
+        if tick_count > self._ticks:
+            self._ticks = max(2 * tick_count, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
             reference_rad = np.concatenate([[0.0], one[:-1]])
             loop_response = self._plant.respond(reference_rad)
@@ -510,14 +516,14 @@ class _UnitResponse:
 
 
 def _interval_responses(
-    unit_responses: Real, edge_ticks: NDArray[np.intp], ticks: NDArray[np.intp]
+    unit_responses: Real, edge_ticks: NDArray[np.intp], tick_count: NDArray[np.intp]
 ) -> Real:
     """Return the response at some ticks to an acceleration of 1 rad/s² in one interval only.
 
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
     1, and `edge_ticks` are the ticks at which the intervals begin and end.
     """
-    ticks_since_edge = ticks[:, None] - edge_ticks
+    ticks_since_edge = tick_count[:, None] - edge_ticks
     step_response: Real = np.where(
         ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
     )

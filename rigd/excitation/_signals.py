@@ -128,28 +128,32 @@ def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
     return tick_count
 
 
-def require_finite(option: str, value: float, unit: str) -> None:
+def require_finite(option: str, option_value: float, unit_text: str) -> None:
     """Raise `ExcitationError` if an option's value is not finite, or has no size of a real rig."""
-    if not isfinite(value):
-        raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
-    if not is_usable_size(value):
+    if not isfinite(option_value):
         raise ExcitationError(
-            f"{option} = {value:g} {unit} is of no size that a rig can have; check its unit."
+            f"{option} = {option_value} {unit_text} is not a finite number; give one."
+        )
+    if not is_usable_size(option_value):
+        raise ExcitationError(
+            f"{option} = {option_value:g} {unit_text} is of no size that a rig can have; check its unit."
         )
 
 
-def require_positive(option: str, value: float, unit: str) -> None:
+def require_positive(option: str, option_value: float, unit_text: str) -> None:
     """Raise `ExcitationError` unless an option's value is a finite number above 0."""
-    require_finite(option, value, unit)
-    if value <= 0.0:
-        raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
+    require_finite(option, option_value, unit_text)
+    if option_value <= 0.0:
+        raise ExcitationError(
+            f"{option} = {option_value:g} {unit_text} must be more than 0 {unit_text}."
+        )
 
 
-def require_not_negative(option: str, value: float) -> None:
+def require_not_negative(option: str, option_value: float) -> None:
     """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
-    require_finite(option, value, "s")
-    if value < 0.0:
-        raise ExcitationError(f"{option} = {value:g} s must not be negative.")
+    require_finite(option, option_value, "s")
+    if option_value < 0.0:
+        raise ExcitationError(f"{option} = {option_value:g} s must not be negative.")
 
 
 def require_within_turn(option: str, value_rad: float) -> None:
@@ -162,20 +166,20 @@ def require_within_turn(option: str, value_rad: float) -> None:
 
 
 def require_frequency(
-    option: str, value: float, rate_hz: float, *, zero_allowed: bool = False
+    option: str, option_value: float, rate_hz: float, *, zero_allowed: bool = False
 ) -> None:
     """Raise `ExcitationError` unless a frequency is above 0 Hz and at most a quarter of the rate.
 
     With `zero_allowed`, 0 Hz is valid as well.
     """
-    require_finite(option, value, "Hz")
+    require_finite(option, option_value, "Hz")
     highest_hz = rate_hz / SAMPLES_PER_PERIOD
-    if not (value > 0.0 or (zero_allowed and value == 0.0)):
+    if not (option_value > 0.0 or (zero_allowed and option_value == 0.0)):
         bound_text = "must not be negative" if zero_allowed else "must be more than 0 Hz"
-        raise ExcitationError(f"{option} = {value:g} Hz {bound_text}.")
-    if value > highest_hz:
+        raise ExcitationError(f"{option} = {option_value:g} Hz {bound_text}.")
+    if option_value > highest_hz:
         raise ExcitationError(
-            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
+            f"{option} = {option_value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
             f"{rate_hz:g} Hz; choose at most {highest_hz:g} Hz."
         )
 
@@ -210,10 +214,10 @@ def lay_out_segments(
     }
 
 
-def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
+def check_ticks(message_begin: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
     """Raise `ExcitationError` if a record has more ticks than can be analysed.
 
-    `what` begins the message, and `around_s` is the time of rest and ring-down together.
+    `message_begin` begins the message, and `around_s` is the time of rest and ring-down together.
     """
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
@@ -223,7 +227,7 @@ def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) 
             else ""
         )
         raise ExcitationError(
-            f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
+            f"{message_begin} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
             f"Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
             "or replayed: shorten it or run several sessions."
         )
@@ -234,14 +238,14 @@ def assemble_excitation(
     parameters: Mapping[str, float | int | str],
     rate_hz: float,
     segments: Mapping[str, tuple[int, int]],
-    sweep: FloatArray,
+    sweep_rad: FloatArray,
     *,
     approach: "Approach | None" = None,
 ) -> Excitation:
     """Return an excitation with a sweep, shape (n,) in rad, between rest and ring-down."""
     reference_rad = np.zeros(segments["ring_down"][1])
-    reference_rad[slice(*segments["sweep"])] = sweep
-    reference_rad[slice(*segments["ring_down"])] = sweep[-1]
+    reference_rad[slice(*segments["sweep"])] = sweep_rad
+    reference_rad[slice(*segments["ring_down"])] = sweep_rad[-1]
     reference_rad.flags.writeable = False
     return Excitation(kind, parameters, rate_hz, reference_rad, segments, approach=approach)
 
@@ -510,10 +514,10 @@ def multisine(
 
 
 def _random_phase_period(
-    ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
+    tick_count: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
     """Return one period of the multisine with peak 1, shape (ticks,), which starts near zero."""
-    frequency_hz = np.arange(1, ticks // 2) / period_s
+    frequency_hz = np.arange(1, tick_count // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
     is_in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (
         frequency_hz <= band_hz[1] + tolerance_hz
@@ -524,10 +528,10 @@ def _random_phase_period(
             f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "
             f"and stop_hz = {band_hz[1]:g} Hz; take a longer period or a wider band."
         )
-    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
+    spectrum = np.zeros(tick_count // 2 + 1, dtype=complex)
     phases_rad = 2 * pi * np.random.default_rng(seed).random(harmonics.size)
     spectrum[harmonics] = np.exp(1j * phases_rad)
-    unit_period: FloatArray = np.fft.irfft(spectrum, ticks)
+    unit_period: FloatArray = np.fft.irfft(spectrum, tick_count)
     unit_period = np.roll(unit_period, -int(np.argmin(np.abs(unit_period))))
     unit_period /= np.max(np.abs(unit_period))
     return unit_period

@@ -202,7 +202,7 @@ def touch(
 
 def reference_after_touch(
     approach: Approach,
-    ends: int,
+    pass_end: int,
     tick: int,
     recent_rad: tuple[float, float, float],
     start_rad: float,
@@ -213,7 +213,7 @@ def reference_after_touch(
     ----------
     approach
         Passes and reaction to a touch.
-    ends
+    pass_end
         First tick after the pass.
     tick
         Tick at which the touch was detected, before the way back begins.
@@ -235,7 +235,7 @@ def reference_after_touch(
     speed_rad_s = (
         present_angle - angle_one_tick_before
     ) * braking.rate_hz + acceleration_rad_s2 / (2 * braking.rate_hz)
-    reference_rad = np.full(ends - tick - 1, start_rad)
+    reference_rad = np.full(pass_end - tick - 1, start_rad)
     braking_rad = braking.path(present_angle, speed_rad_s, acceleration_rad_s2)
     return_index = reference_rad.size - return_path.size
     held_ticks = min(approach.hold_ticks, return_index)

@@ -187,12 +187,12 @@ def _motion_map(n: int, rate_hz: float) -> Real:
     return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
 
 
-def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
+def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_order: int) -> Real:
     """Return the linear map from n accelerations to the modes' residual vibration after them.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
-    path. With ``order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by the
+    path. With ``zero_order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by the
     pole as well. The shape is (rows, n).
 
     Parameters
@@ -203,14 +203,14 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: 
         Ticks a second.
     poles_rad_s
         Poles of the modes, shape (m,): one pole of each pair.
-    order
+    zero_order
         Order of the zeros: 1 or 2.
     """
     remaining_s = (n - np.arange(n)) / rate_hz
     map_rows: list[Real] = []
     for mode_pole in poles_rad_s:
         pole_transform = np.exp(mode_pole * remaining_s) / rate_hz
-        second_order = order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
+        second_order = zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
         for row in (
             (pole_transform, pole_transform * remaining_s / remaining_s[0])
             if second_order

@@ -239,25 +239,29 @@ class Quantities:
         )
 
 
-def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+def _targets_of_modes(given_target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
     """Return a target for each mode, if the given target applies to every mode in the band."""
-    if target.quantity not in MODE_QUANTITIES or target.mode is not None:
-        return [target]
-    return [replace(target, mode=estimated_mode.number) for estimated_mode in modes]
+    if given_target.quantity not in MODE_QUANTITIES or given_target.mode is not None:
+        return [given_target]
+    return [replace(given_target, mode=estimated_mode.number) for estimated_mode in modes]
 
 
 def _linearise(
-    target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
+    given_target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
     """Return the value of a quantity and its derivatives by the beam's parameters, shape (k,).
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """
     quantity_gradient = np.zeros(len(estimate.names))
-    quantity_name = target.quantity
+    quantity_name = given_target.quantity
     if quantity_name in MODE_QUANTITIES:
         target_mode = next(
-            (estimated_mode for estimated_mode in modes if estimated_mode.number == target.mode),
+            (
+                estimated_mode
+                for estimated_mode in modes
+                if estimated_mode.number == given_target.mode
+            ),
             None,
         )
         if target_mode is None:
@@ -267,7 +271,7 @@ def _linearise(
             return (
                 0.0,
                 quantity_gradient,
-                f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
+                f"mode {given_target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
             )
         if quantity_name == "damping":
             return target_mode.damping_ratio, target_mode.damping_gradient, ""

@@ -39,20 +39,20 @@ _WIDE_LIKELIHOOD_DROP = 8.0
 
 
 def estimate_from_explanations(
-    search: ExplanationSearch, explained: ExplainedRecord, *, scan: bool
+    explanation_search: ExplanationSearch, explained_record: ExplainedRecord, *, scan: bool
 ) -> TouchEstimate:
     """Return position, instant, force and stiffness of a touch from its likeliest explanations.
 
     Parameters
     ----------
-    search
+    explanation_search
         Search that found the explanations.
-    explained
+    explained_record
         Explanations of the record.
     scan
         Whether the estimate contains the likelihood of all positions; otherwise it is empty.
     """
-    explanations, sample_window = explained.explanations, explained.window
+    explanations, sample_window = explained_record.explanations, explained_record.window
     at_rest = explanations[0]
     best_explanation = min(explanations, key=lambda explanation: explanation.chi2)
     if at_rest.chi2 < best_explanation.chi2 + DECISIVE_CHI2_DIFFERENCE:
@@ -70,89 +70,94 @@ def estimate_from_explanations(
         likely_explanations += [
             explanation for explanation in explanations if explanation.kind == "two"
         ]
-    begin_s = search.begin / search.rate
+    begin_s = explanation_search.begin / explanation_search.rate
     x_m = time_s = force_n = stiffness_n_per_m = None
     force_history_n, force_times_s = np.zeros(0), np.zeros(0)
     obstacle_kind = "unknown"
-    if search.fits(best_explanation, sample_window):
-        is_poor_fit = not search.fits(best_explanation, sample_window, POOR_FIT_STDS)
+    if explanation_search.fits(best_explanation, sample_window):
+        is_poor_fit = not explanation_search.fits(best_explanation, sample_window, POOR_FIT_STDS)
         is_doubtful = (
-            explained.later_samples_contradict or explained.other_kinds_untried
+            explained_record.later_samples_contradict or explained_record.other_kinds_untried
             if best_explanation is at_rest
             else is_poor_fit
         )
         if is_unambiguous and not is_doubtful:
             obstacle_kind = best_explanation.kind
         x_m, time_s = (
-            _position_estimate(search, likely_explanations),
+            _position_estimate(explanation_search, likely_explanations),
             _common_parameter(likely_explanations, 1, begin_s),
         )
-        if is_poor_fit or explained.other_kinds_untried:
-            x_m = _with_wide_interval(search, x_m)
+        if is_poor_fit or explained_record.other_kinds_untried:
+            x_m = _with_wide_interval(explanation_search, x_m)
         force_history_n, force_times_s, force_n = _force_estimate(
-            search, best_explanation, sample_window
+            explanation_search, best_explanation, sample_window
         )
         if obstacle_kind == "rigid":
             stiffness_n_per_m = _stiffness_estimate(at_rest.posterior)
     elif (
-        search.any_force.chi2 < search.max_chi2(search.any_force.degrees)
-        and not search.begins_before_window
+        explanation_search.any_force.chi2
+        < explanation_search.max_chi2(explanation_search.any_force.degrees)
+        and not explanation_search.begins_before_window
     ):
-        x_m = _unexplained_position(search)
+        x_m = _unexplained_position(explanation_search)
     return TouchEstimate(
         x_m=x_m,
         time_s=time_s,
         force_n=force_n,
         stiffness_n_per_m=stiffness_n_per_m,
         kind=obstacle_kind,
-        model=search.tables.model.source,
-        channels=search.motion.noise.size,
-        samples=sample_window.end - search.detected,
+        model=explanation_search.tables.model.source,
+        channels=explanation_search.motion.noise.size,
+        samples=sample_window.end - explanation_search.detected,
         chi2_per_degree=best_explanation.chi2
         / (sample_window.data.size - best_explanation.parameters.size),
-        positions_m=search.any_force.x_m if scan else np.zeros(0),
-        log_likelihood=search.any_force.log_likelihood if scan else np.zeros(0),
-        innovations=search.motion.innovations / search.motion.noise[:, None],
-        innovation_times_s=search.motion.t + begin_s,
+        positions_m=explanation_search.any_force.x_m if scan else np.zeros(0),
+        log_likelihood=explanation_search.any_force.log_likelihood if scan else np.zeros(0),
+        innovations=explanation_search.motion.innovations
+        / explanation_search.motion.noise[:, None],
+        innovation_times_s=explanation_search.motion.t + begin_s,
         force_history_n=force_history_n,
         force_times_s=force_times_s + begin_s,
     )
 
 
-def _unexplained_position(search: ExplanationSearch) -> Estimated:
+def _unexplained_position(explanation_search: ExplanationSearch) -> Estimated:
     """Return the position of an unexplained touch in m, with a wide interval.
 
     The interval contains all positions at which any force could cause the first samples, or the
     first and later samples. Later more than one point may be touched.
     """
     early_likelihoods = [
-        search.tables.any_force.scan(search.window(time_s)) for time_s in _EARLY_TIMES_S
+        explanation_search.tables.any_force.scan(explanation_search.window(time_s))
+        for time_s in _EARLY_TIMES_S
     ]
     interval_ends = np.array(
         [
             likelihood.interval(_WIDE_LIKELIHOOD_DROP)[2:]
-            for likelihood in (search.any_force, *early_likelihoods)
+            for likelihood in (explanation_search.any_force, *early_likelihoods)
         ]
     )
     low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return Estimated(
-        search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0], (high_m - low_m) / 4, (low_m, high_m)
+        explanation_search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0],
+        (high_m - low_m) / 4,
+        (low_m, high_m),
     )
 
 
-def _with_wide_interval(search: ExplanationSearch, estimate: Estimated) -> Estimated:
+def _with_wide_interval(explanation_search: ExplanationSearch, estimate: Estimated) -> Estimated:
     """Return a touch position in m, with an interval that includes that for any force over time."""
-    *_, low_m, high_m = search.any_force.interval()
+    *_, low_m, high_m = explanation_search.any_force.interval()
     low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
     return Estimated(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
 
 def _position_estimate(
-    search: ExplanationSearch, likely_explanations: list[Explanation]
+    explanation_search: ExplanationSearch, likely_explanations: list[Explanation]
 ) -> Estimated:
     """Return the position of the touch in m, with the additional uncertainty from bounces."""
     position = _common_parameter(likely_explanations, 0)
-    is_near_tip = position.value > NEAR_TIP_FRACTION * search.tables.model.beam.length_m
+    is_near_tip = position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.beam.length_m
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
@@ -165,7 +170,7 @@ def _position_estimate(
         )
         for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
     )
-    length_m = search.tables.model.beam.length_m
+    length_m = explanation_search.tables.model.beam.length_m
     return Estimated(
         position.value,
         float(np.hypot(position.std, additional_std_m)),
@@ -174,7 +179,9 @@ def _position_estimate(
 
 
 def _force_estimate(
-    search: ExplanationSearch, best: Explanation, window: WhitenedWindow
+    explanation_search: ExplanationSearch,
+    best_explanation: Explanation,
+    sample_window: WhitenedWindow,
 ) -> tuple[Real, Real, Estimated]:
     """Return the contact force over time, its instants, and its peak with an interval.
 
@@ -182,26 +189,34 @@ def _force_estimate(
     spread over the posterior distribution.
     """
     rng = np.random.default_rng(2)
-    posterior = best.posterior
+    posterior = best_explanation.posterior
     drawn_indices = rng.choice(posterior.weights.size, 48, p=posterior.weights)
-    candidates = np.vstack([best.parameters, posterior.samples[drawn_indices]])
-    step_s = search.tables.middle.step_s
-    if best.kind == "knock":
+    candidates = np.vstack([best_explanation.parameters, posterior.samples[drawn_indices]])
+    step_s = explanation_search.tables.middle.step_s
+    if best_explanation.kind == "knock":
         peak_forces_n = np.abs(candidates[:, 3])
         pulse_phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(
             candidates[0, 2]
         )
         force_history_n = peak_forces_n[:1, None] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
-    elif best.kind == "two":
-        step_s = search.tables.coarse.step_s
-        force_history_n = np.abs(search.pairing().predict(candidates, window)[1])
+    elif best_explanation.kind == "two":
+        step_s = explanation_search.tables.coarse.step_s
+        force_history_n = np.abs(explanation_search.pairing().predict(candidates, sample_window)[1])
         peak_forces_n = force_history_n.max(axis=1)
     else:
-        obstacle_contact = ObstacleContact(search.tables.middle, search.tables.x_m, search.motion)
-        pressing_side = None if best.kind == "rigid" else search.pressing_direction()
-        if best.kind == "yielding":
+        obstacle_contact = ObstacleContact(
+            explanation_search.tables.middle,
+            explanation_search.tables.x_m,
+            explanation_search.motion,
+        )
+        pressing_side = (
+            None if best_explanation.kind == "rigid" else explanation_search.pressing_direction()
+        )
+        if best_explanation.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
-        force_history_n = np.abs(obstacle_contact.predict(candidates, window, pressing_side)[1])
+        force_history_n = np.abs(
+            obstacle_contact.predict(candidates, sample_window, pressing_side)[1]
+        )
         peak_forces_n = force_history_n.max(axis=1)
     low_n, high_n = np.quantile(peak_forces_n[1:], (0.025, 0.975))
     peak_force = Estimated(

@@ -80,36 +80,38 @@ class AnyForceEstimator:
     ----------
     kernels
         Contact kernels with two time steps a sample.
-    stride
+    position_stride
         Number of the kernels' positions from one scanned position to the next.
-    samples
+    sample_count
         Largest number of samples.
     """
 
     __slots__ = ("_effects", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, stride: int, samples: int) -> None:
-        self._x_m = kernels.x_m[::stride]
-        lag_samples = 2 * np.arange(samples)[:, None] - np.arange(2 * samples)
+    def __init__(self, kernels: ContactKernels, position_stride: int, sample_count: int) -> None:
+        self._x_m = kernels.x_m[::position_stride]
+        lag_samples = 2 * np.arange(sample_count)[:, None] - np.arange(2 * sample_count)
         self._effects = [
             np.where(
                 lag_samples >= 0,
-                response_table[::stride][:, np.clip(lag_samples, 0, response_table.shape[1] - 1)],
+                response_table[::position_stride][
+                    :, np.clip(lag_samples, 0, response_table.shape[1] - 1)
+                ],
                 0.0,
             )
             for response_table in (kernels.torque, kernels.shear)
         ]  # (positions, samples, forces)
 
-    def scan(self, window: WhitenedWindow) -> AnyForceLikelihood:
+    def scan(self, sample_window: WhitenedWindow) -> AnyForceLikelihood:
         """Return the likelihood of a touch at each position along the beam, for any force.
 
         Parameters
         ----------
-        window
+        sample_window
             Whitened innovations of at most the prepared number of samples.
         """
-        sample_count = window.end - window.first
-        noise_stds = window.motion.noise
+        sample_count = sample_window.end - sample_window.first
+        noise_stds = sample_window.motion.noise
         force_effects = np.concatenate(
             [
                 channel_effects[:, :sample_count, : 2 * sample_count] / noise_std
@@ -117,8 +119,8 @@ class AnyForceEstimator:
             ],
             axis=1,
         )
-        force_effects = window.whitening @ force_effects
-        whitened_data = window.data
+        force_effects = sample_window.whitening @ force_effects
+        whitened_data = sample_window.data
         n = whitened_data.size
         force_covariance = force_effects @ force_effects.transpose(0, 2, 1)
         bordered_corner = float(whitened_data @ whitened_data) + 1.0

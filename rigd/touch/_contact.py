@@ -216,7 +216,7 @@ def integrate_two_contacts(
     return forces_n[:, 0], forces_n[:, 1]
 
 
-def shift_rows(table: Real, begin: Real, count: int) -> Real:
+def shift_rows(value_table: Real, begin_columns: Real, pair_count: int) -> Real:
     """Shift each row of a table by a fraction of columns, by cubic interpolation.
 
     The result has the shape (k, count). Before the first column the values are 0, and after the
@@ -224,43 +224,43 @@ def shift_rows(table: Real, begin: Real, count: int) -> Real:
 
     Parameters
     ----------
-    table
+    value_table
         Rows of values, shape (k, n).
-    begin
+    begin_columns
         Column of each row's first value in the result, shape (k,); it may be between two columns.
-    count
+    pair_count
         Number of values of the result, one column apart.
     """
-    first_column = np.floor(begin).astype(np.intp)
-    u = (begin - first_column)[:, None]
-    rows, columns = table.shape
+    first_column = np.floor(begin_columns).astype(np.intp)
+    u = (begin_columns - first_column)[:, None]
+    rows, columns = value_table.shape
     first_column = np.clip(
-        first_column, -count - 2, columns + 1
+        first_column, -pair_count - 2, columns + 1
     )  # farther off the result is the same
     padding_before = max(0, 1 - int(first_column.min()))
-    padding_after = max(0, int(first_column.max()) + count + 2 - columns)
+    padding_after = max(0, int(first_column.max()) + pair_count + 2 - columns)
     padded_table = np.empty((rows, padding_before + columns + padding_after))
     padded_table[:, :padding_before], padded_table[:, padding_before : padding_before + columns] = (
         0.0,
-        table,
+        value_table,
     )
-    padded_table[:, padding_before + columns :] = table[:, -1:]
+    padded_table[:, padding_before + columns :] = value_table[:, -1:]
     # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
     column_stride, row_stride = padded_table.strides[1], padded_table.strides[0]
     column_blocks = np.ndarray(
-        (rows, padded_table.shape[1] - count - 2, count + 3),
+        (rows, padded_table.shape[1] - pair_count - 2, pair_count + 3),
         buffer=padded_table,
         strides=(row_stride, column_stride, column_stride),
     )
     neighbours = column_blocks[np.arange(rows), first_column - 1 + padding_before]
-    shifted_rows = neighbours[:, :count] * (-u * (u - 1) * (u - 2) / 6)
-    shifted_rows += neighbours[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
-    shifted_rows += neighbours[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)
+    shifted_rows = neighbours[:, :pair_count] * (-u * (u - 1) * (u - 2) / 6)
+    shifted_rows += neighbours[:, 1 : pair_count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
+    shifted_rows += neighbours[:, 2 : pair_count + 2] * (-(u + 1) * u * (u - 2) / 2)
     shifted_rows += neighbours[:, 3:] * ((u + 1) * u * (u - 1) / 6)
     return shifted_rows
 
 
-def contact_responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) -> Real:
+def contact_responses(kernels: tuple[Real, ...], forces_n: Real, every: int, samples: int) -> Real:
     """Return the responses to a force at some of its time steps, shape (k, kernels, samples).
 
     They are the convolution of the force with the kernels.
@@ -269,14 +269,14 @@ def contact_responses(kernels: tuple[Real, ...], force: Real, every: int, sample
     ----------
     kernels
         Responses to a hat of force, each of shape (k, n) or (1, n), which are 0 from column n on.
-    force
+    forces_n
         Force at each step, shape (k, (samples - 1) · every + 1).
     every
         Number of steps from one sample to the next; the first sample is at the first step.
     samples
         Number of samples.
     """
-    candidate_count, step_count = force.shape
+    candidate_count, step_count = forces_n.shape
     kernel_tables = np.stack(kernels, axis=1)
     kernel_steps = min(kernel_tables.shape[2], step_count)
     if len(kernel_tables) == 1 and candidate_count > _SAMPLES:  # one matrix for all
@@ -286,10 +286,10 @@ def contact_responses(kernels: tuple[Real, ...], force: Real, every: int, sample
             kernel_tables[0][:, np.clip(lag_steps, 0, kernel_steps - 1)],
             0,
         )
-        return (force @ lag_table).transpose(1, 0, 2)
+        return (forces_n @ lag_table).transpose(1, 0, 2)
     # The latest force first, and zeros before the first one: each sample uses one block.
     reversed_force = np.zeros((candidate_count, step_count + kernel_steps))
-    reversed_force[:, :step_count] = force[:, ::-1]
+    reversed_force[:, :step_count] = forces_n[:, ::-1]
     row_stride, column_stride = reversed_force.strides
     summed_responses = np.empty((candidate_count, len(kernels), samples))
     for first_index in range(0, samples, _SAMPLES):

@@ -125,9 +125,9 @@ class ExplanationSearch:
 
     Parameters
     ----------
-    tables
+    touch_tables
         Precomputed tables of the model at the record's rate.
-    record
+    touch_record
         Samples from 0.3 s or more before the touch.
     detection_delay_s
         Longest time in s from the touch to its detection.
@@ -138,27 +138,29 @@ class ExplanationSearch:
 
     def __init__(
         self,
-        tables: TouchTables,
-        record: TouchRecord,
+        touch_tables: TouchTables,
+        touch_record: TouchRecord,
         detection_delay_s: float,
         previous_search: "ExplanationSearch | None" = None,
     ) -> None:
-        rate_hz = tables.rate_hz
-        self.tables, self.rate, self.given = tables, rate_hz, record
-        self.begin = max(0, record.detected - round(HISTORY_S * rate_hz))
-        record_end = min(record.angle_rad.size, record.detected + round(FINAL_S * rate_hz))
+        rate_hz = touch_tables.rate_hz
+        self.tables, self.rate, self.given = touch_tables, rate_hz, touch_record
+        self.begin = max(0, touch_record.detected - round(HISTORY_S * rate_hz))
+        record_end = min(
+            touch_record.angle_rad.size, touch_record.detected + round(FINAL_S * rate_hz)
+        )
         self.record = TouchRecord(
             rate_hz,
-            record.angle_rad[self.begin : record_end],
-            record.torque_nm[self.begin : record_end],
-            None if record.shear_n is None else record.shear_n[self.begin : record_end],
-            record.detected - self.begin,
+            touch_record.angle_rad[self.begin : record_end],
+            touch_record.torque_nm[self.begin : record_end],
+            None if touch_record.shear_n is None else touch_record.shear_n[self.begin : record_end],
+            touch_record.detected - self.begin,
         )
         self.detected = self.record.detected
         self.quiet = self.detected - round(detection_delay_s * rate_hz)
-        self.motion = tables.free.motion(self.record, self.quiet, self.quiet - 4)
+        self.motion = touch_tables.free.motion(self.record, self.quiet, self.quiet - 4)
         self.available = self.record.angle_rad.size - self.detected
-        self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
+        self.edges = (float(touch_tables.x_m[0]) + 0.002, float(touch_tables.x_m[-1]))
         self.deviations: Real | None = None
         self._uncertainties_s = 0.0
         covers_grid = previous_search is not None and previous_search.available >= round(
@@ -285,31 +287,43 @@ class ExplanationSearch:
         assert previous_stage is not None  # there is at least one stage, or an earlier one
         return *previous_stage, None, False
 
-    def _is_sufficient(self, at_rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
+    def _is_sufficient(
+        self,
+        resting_explanation: Explanation,
+        sample_window: WhitenedWindow,
+        after_detection_s: float,
+    ) -> bool:
         """Return whether a longer part of the record would not improve a touch's estimate."""
-        x_m = at_rest.posterior.mean(0)
+        x_m = resting_explanation.posterior.mean(0)
         is_precise = (
-            at_rest.posterior.std(0) < _PRECISE_STD_M or x_m > _TIP_FRACTION * self.edges[1]
+            resting_explanation.posterior.std(0) < _PRECISE_STD_M
+            or x_m > _TIP_FRACTION * self.edges[1]
         )
-        return seconds > FIRST_S and bool(is_precise or not self.fits(at_rest, window))
+        return after_detection_s > FIRST_S and bool(
+            is_precise or not self.fits(resting_explanation, sample_window)
+        )
 
-    def _include_uncertainties(self, likeliest: Real, seconds: float) -> None:
-        """Compute the effects of all uncertainties up to `seconds` after the detection.
+    def _include_uncertainties(self, likely_obstacle: Real, after_detection_s: float) -> None:
+        """Compute the effects of all uncertainties up to `after_detection_s` after the detection.
 
-        They are computed for the first candidate of `likeliest`, unless this was done before.
+        They are computed for the first candidate of `likely_obstacle`, unless this was done before.
         """
-        if self._uncertainties_s < seconds:
-            self._uncertainties_s = min(max(seconds, _UNCERTAINTIES_S), self.available / self.rate)
+        if self._uncertainties_s < after_detection_s:
+            self._uncertainties_s = min(
+                max(after_detection_s, _UNCERTAINTIES_S), self.available / self.rate
+            )
             whole_window = WhitenedWindow.from_motion(
                 self.motion, self.quiet, self.end(self._uncertainties_s)
             )
             self.deviations = uncertainty_effects(
-                self.tables, self.record, likeliest[:1], whole_window
+                self.tables, self.record, likely_obstacle[:1], whole_window
             )
 
-    def _next_candidates(self, at_rest: Explanation) -> Real:
+    def _next_candidates(self, resting_explanation: Explanation) -> Real:
         """Return candidate obstacles for a longer part of the record, from a shorter part."""
-        return np.vstack([at_rest.parameters, self._draw_candidates(at_rest.posterior)])
+        return np.vstack(
+            [resting_explanation.parameters, self._draw_candidates(resting_explanation.posterior)]
+        )
 
     @cached_property
     def any_force(self) -> AnyForceLikelihood:
@@ -321,26 +335,30 @@ class ExplanationSearch:
 
     # Data for the comparison of candidates
 
-    def window(self, seconds: float) -> WhitenedWindow:
-        """Return the whitened innovations from before a touch to `seconds` after its detection."""
+    def window(self, after_detection_s: float) -> WhitenedWindow:
+        """Return the whitened innovations from before a touch to `after_detection_s` after its detection."""
         return WhitenedWindow.from_motion(
-            self.motion, self.quiet, self.end(seconds), self.deviations
+            self.motion, self.quiet, self.end(after_detection_s), self.deviations
         )
 
-    def end(self, seconds: float) -> int:
-        """Return the index of the sample `seconds` after the detection, or the record's end."""
-        return self.detected + min(self.available, round(seconds * self.rate))
+    def end(self, after_detection_s: float) -> int:
+        """Return the index of the sample `after_detection_s` after the detection, or the record's end."""
+        return self.detected + min(self.available, round(after_detection_s * self.rate))
 
-    def space(self, width: int) -> ParameterRanges:
-        """Return the allowed ranges of the first `width` of the `OBSTACLE_PARAMETERS`."""
+    def space(self, parameter_count: int) -> ParameterRanges:
+        """Return the allowed ranges of the first `parameter_count` of the `OBSTACLE_PARAMETERS`."""
         t = self.motion.t
         return ParameterRanges(
-            low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[:width],
-            high=np.array([self.edges[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0])[:width],
-            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
-            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
-            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
-            largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
+            low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[
+                :parameter_count
+            ],
+            high=np.array([self.edges[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0])[
+                :parameter_count
+            ],
+            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:parameter_count],
+            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:parameter_count],
+            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:parameter_count],
+            largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:parameter_count],
         )
 
     def predictor(self, rows: Real, *, first: bool = False) -> Prediction:
@@ -432,52 +450,59 @@ class ExplanationSearch:
     def explain_by_kind(
         self,
         kind: str,
-        predict: Prediction,
-        window: WhitenedWindow,
-        starts: Real,
-        space: ParameterRanges,
+        predict_effect: Prediction,
+        sample_window: WhitenedWindow,
+        start_candidates: Real,
+        parameter_ranges: ParameterRanges,
     ) -> Explanation:
         """Return the explanation by one kind of obstacle: search for minima, and sample around."""
-        if starts.shape[0] > 12:
-            starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
-        minima = find_minima(predict, window, starts, space, rounds=9)
-        return self._explain_from_minima(kind, predict, window, minima, space)
+        if start_candidates.shape[0] > 12:
+            start_candidates = start_candidates[
+                np.argsort(chi2_of(predict_effect, sample_window, start_candidates))[:12]
+            ]
+        minima = find_minima(
+            predict_effect, sample_window, start_candidates, parameter_ranges, rounds=9
+        )
+        return self._explain_from_minima(
+            kind, predict_effect, sample_window, minima, parameter_ranges
+        )
 
     def _explain_from_minima(
         self,
         kind: str,
-        predict: Prediction,
-        window: WhitenedWindow,
-        minima: Minima,
-        space: ParameterRanges,
+        predict_effect: Prediction,
+        sample_window: WhitenedWindow,
+        local_minima: Minima,
+        parameter_ranges: ParameterRanges,
         variance_factor: float = 1.0,
     ) -> Explanation:
-        """Return an explanation with samples of the posterior around the minima in `minima`.
+        """Return an explanation with samples of the posterior around the minima in `local_minima`.
 
         `variance_factor` is a factor on the variance of the residuals.
         """
-        parameter_count = minima.parameters.shape[1]
-        near_best_indices = np.flatnonzero(minima.chi2 < minima.chi2.min() + 30)
+        parameter_count = local_minima.parameters.shape[1]
+        near_best_indices = np.flatnonzero(local_minima.chi2 < local_minima.chi2.min() + 30)
         covariances = np.array(
             [
                 np.linalg.inv(
-                    minima.jacobian[k].T @ minima.jacobian[k] + np.diag(1 / space.largest_std**2)
+                    local_minima.jacobian[k].T @ local_minima.jacobian[k]
+                    + np.diag(1 / parameter_ranges.largest_std**2)
                 )
-                + np.diag(space.smallest_std**2)
+                + np.diag(parameter_ranges.smallest_std**2)
                 for k in near_best_indices
             ]
         )
-        degrees = max(window.data.size - parameter_count, 1)
+        degrees = max(sample_window.data.size - parameter_count, 1)
         posterior = sample_posterior(
-            lambda rows: chi2_of(predict, window, rows),
-            minima.parameters[near_best_indices],
+            lambda rows: chi2_of(predict_effect, sample_window, rows),
+            local_minima.parameters[near_best_indices],
             covariances,
-            (space.low, space.high),
-            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, minima.chi2.min() / degrees),
+            (parameter_ranges.low, parameter_ranges.high),
+            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, local_minima.chi2.min() / degrees),
             count=120,
             rounds=5,
             enough_samples=150.0,
-            smallest_std=space.smallest_std,
+            smallest_std=parameter_ranges.smallest_std,
         )
         best_index = int(np.argmin(posterior.chi2))
         return Explanation(
@@ -487,21 +512,24 @@ class ExplanationSearch:
     # Other kinds
 
     def fits(
-        self, explanation: Explanation, window: WhitenedWindow, max_stds: float = _MAX_MISFIT_STDS
+        self,
+        explanation: Explanation,
+        sample_window: WhitenedWindow,
+        max_stds: float = _MAX_MISFIT_STDS,
     ) -> bool:
         """Return whether an explanation's residuals are no larger than noise.
 
         `max_stds` is the number of standard deviations by which they may exceed their expectation.
         """
-        return bool(explanation.chi2 < self.max_chi2(window.data.size, max_stds))
+        return bool(explanation.chi2 < self.max_chi2(sample_window.data.size, max_stds))
 
-    def max_chi2(self, degrees: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
+    def max_chi2(self, expected_chi2: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
         """Return the largest sum of squared residuals that noise explains.
 
-        `degrees` is its expectation, and `max_stds` the allowed number of standard deviations.
+        `expected_chi2` is its expectation, and `max_stds` the allowed number of standard deviations.
         """
-        noise_variance = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
-        return float(degrees + max_stds * np.sqrt(2 * degrees + noise_variance))
+        noise_variance = 2 * expected_chi2**2 / (self.quiet * self.motion.noise.size)
+        return float(expected_chi2 + max_stds * np.sqrt(2 * expected_chi2 + noise_variance))
 
     def _later_samples_fit_worse(
         self,
@@ -517,33 +545,38 @@ class ExplanationSearch:
             added_samples, _MAX_LATER_MISFIT_STDS
         )
 
-    def _may_move_or_yield(self, at_rest: Explanation, window: WhitenedWindow) -> bool:
+    def _may_move_or_yield(
+        self, resting_explanation: Explanation, sample_window: WhitenedWindow
+    ) -> bool:
         """Return whether a moving or yielding obstacle is clearly likelier than one at rest."""
         motion_parameters = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
         start_candidates = np.hstack(
-            [np.tile(at_rest.parameters, (len(motion_parameters), 1)), motion_parameters]
+            [
+                np.tile(resting_explanation.parameters, (len(motion_parameters), 1)),
+                motion_parameters,
+            ]
         )
         is_free = np.hstack(
             [
-                np.ones((len(motion_parameters), at_rest.parameters.size), dtype=bool),
+                np.ones((len(motion_parameters), resting_explanation.parameters.size), dtype=bool),
                 motion_parameters != 0,
             ]
         )
         obstacle_contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        pressing_side = obstacle_contact.pressing_direction(at_rest.parameters)
+        pressing_side = obstacle_contact.pressing_direction(resting_explanation.parameters)
         minima = find_minima(
-            lambda candidates, window: obstacle_contact.predict(candidates, window, pressing_side)[
-                0
-            ],
-            window,
+            lambda candidates, sample_window: obstacle_contact.predict(
+                candidates, sample_window, pressing_side
+            )[0],
+            sample_window,
             start_candidates,
             self.space(5),
             rounds=5,
             free=is_free,
         )
-        return bool(minima.chi2.min() < at_rest.chi2 - CHANCE_CHI2_REDUCTION)
+        return bool(minima.chi2.min() < resting_explanation.chi2 - CHANCE_CHI2_REDUCTION)
 
-    def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
+    def _explain_by_other_kinds(self, sample_window: WhitenedWindow) -> list[Explanation]:
         """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
         any_force, pressing_side = self.any_force, self.pressing_direction()
         likeliest_positions = any_force.x_m[np.argsort(-any_force.log_likelihood)[:24]]
@@ -568,7 +601,7 @@ class ExplanationSearch:
                 self._moving_predictor(obstacle_kind, self.tables.middle, pressing_side),
                 self._moving_space(obstacle_kind),
             )
-            if window.end > self.end(FIRST_S):
+            if sample_window.end > self.end(FIRST_S):
                 early_minima = find_minima(
                     predict_effect,
                     self.window(FIRST_S),
@@ -579,7 +612,7 @@ class ExplanationSearch:
                 start_candidates = early_minima.parameters
             explanations.append(
                 self.explain_by_kind(
-                    obstacle_kind, predict_effect, window, start_candidates, parameter_ranges
+                    obstacle_kind, predict_effect, sample_window, start_candidates, parameter_ranges
                 )
             )
         obstacle_contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
@@ -591,7 +624,7 @@ class ExplanationSearch:
         )
         explanations.append(
             self.explain_by_kind(
-                "knock", knock_response.predict, window, start_candidates, parameter_ranges
+                "knock", knock_response.predict, sample_window, start_candidates, parameter_ranges
             )
         )
         return explanations
@@ -602,19 +635,25 @@ class ExplanationSearch:
         obstacle_contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
         return TwoObstacleContact(obstacle_contact, tables.coarse, tables.crossing)
 
-    def _explain_by_two(self, at_rest: Explanation, window: WhitenedWindow) -> Explanation | None:
+    def _explain_by_two(
+        self, resting_explanation: Explanation, sample_window: WhitenedWindow
+    ) -> Explanation | None:
         """Return the explanation by two obstacles, or None if one obstacle explains as much."""
         two_contacts = self.pairing()
         parameter_ranges = two_contacts.space(self.space(3))
         # The first samples show in less time whether more iterations are worthwhile.
         early_window = (
-            self.window(_UNCERTAINTIES_S) if window.end > self.end(_UNCERTAINTIES_S) else window
+            self.window(_UNCERTAINTIES_S)
+            if sample_window.end > self.end(_UNCERTAINTIES_S)
+            else sample_window
         )
-        start_pairs = two_contacts.starts(at_rest.parameters, early_window, parameter_ranges, 2)
+        start_pairs = two_contacts.starts(
+            resting_explanation.parameters, early_window, parameter_ranges, 2
+        )
         minima = find_minima(
             two_contacts.predict_channels, early_window, start_pairs, parameter_ranges, rounds=4
         )
-        single_obstacle = at_rest.parameters[None]
+        single_obstacle = resting_explanation.parameters[None]
         if (
             minima.chi2.min()
             > chi2_of(self.predictor(single_obstacle), early_window, single_obstacle)[0]
@@ -624,14 +663,19 @@ class ExplanationSearch:
         likeliest = minima.parameters[np.argsort(minima.chi2)[:3]]
         start_pairs = np.vstack([likeliest, two_contacts.in_reverse_order(likeliest[:1])])
         minima = find_minima(
-            two_contacts.predict_channels, window, start_pairs, parameter_ranges, rounds=8
+            two_contacts.predict_channels, sample_window, start_pairs, parameter_ranges, rounds=8
         )
-        chi2_gain = at_rest.chi2 - minima.chi2.min()
+        chi2_gain = resting_explanation.chi2 - minima.chi2.min()
         if chi2_gain < _MIN_TWO_OBSTACLES_GAIN:
             return None
         variance_factor = _TWO_OBSTACLES_VARIANCE if chi2_gain > DECISIVE_CHI2_DIFFERENCE else 1.0
         return self._explain_from_minima(
-            "two", two_contacts.predict_channels, window, minima, parameter_ranges, variance_factor
+            "two",
+            two_contacts.predict_channels,
+            sample_window,
+            minima,
+            parameter_ranges,
+            variance_factor,
         )
 
     def pressing_direction(self) -> float:
@@ -641,17 +685,19 @@ class ExplanationSearch:
         """
         return -1.0 if self.any_force.force_n.sum() > 0 else 1.0
 
-    def _moving_predictor(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
+    def _moving_predictor(
+        self, kind: str, kernels: ContactKernels, pressing_side: float
+    ) -> Prediction:
         """Return the function that predicts the effect of moving or yielding obstacles.
 
         Their fourth parameter is the speed or the mobility.
         """
         obstacle_contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
 
-        def predict(candidates: Real, window: WhitenedWindow) -> Real:
+        def predict(candidates: Real, sample_window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return obstacle_contact.predict(candidates, window, side)[0]
+            return obstacle_contact.predict(candidates, sample_window, pressing_side)[0]
 
         return predict
 
@@ -669,12 +715,12 @@ class ExplanationSearch:
         )
 
 
-def _distinct_minima(minima: Minima) -> Real:
+def _distinct_minima(local_minima: Minima) -> Real:
     """Return the parameters of minima that are not close to a better minimum, best first."""
-    minimum_order = np.argsort(minima.chi2)
+    minimum_order = np.argsort(local_minima.chi2)
     distinct_minima: list[Real] = []
-    for row in minima.parameters[
-        minimum_order[minima.chi2[minimum_order] < 2 * minima.chi2.min() + 60]
+    for row in local_minima.parameters[
+        minimum_order[local_minima.chi2[minimum_order] < 2 * local_minima.chi2.min() + 60]
     ]:
         if all(
             np.any(np.abs(row - other_minimum)[:2] > (5e-4, 4e-5))

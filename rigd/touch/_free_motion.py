@@ -82,7 +82,7 @@ class FreeBeam:
         Positions at which the displacement is computed, shape (m,).
     rate_hz
         Samples a second.
-    samples
+    sample_count
         Largest number of samples in a record.
     """
 
@@ -100,11 +100,11 @@ class FreeBeam:
         "x_m",
     )
 
-    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, samples: int) -> None:
+    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, sample_count: int) -> None:
         from scipy.fft import next_fast_len
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
-        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * samples + 0.1 * rate_hz), real=True)
+        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * sample_count + 0.1 * rate_hz), real=True)
         self.line = LaplaceLine(n, 1 / (STEPS_PER_SAMPLE * rate_hz), _BAND_FRACTION)
         s = self.line.s
         self._grid = force_grid = PointForceGrid(s, model.beam, model.damping)
@@ -143,14 +143,14 @@ class FreeBeam:
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
 
-    def displacement_per_sample(self, position_index: int, samples: int) -> Real:
+    def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:
         """Return the displacement at a position that one sample of the angle causes, in m/rad.
 
         Parameters
         ----------
         position_index
             Index of the position.
-        samples
+        sample_count
             Number of samples after the sample of the angle.
 
         Returns
@@ -161,13 +161,13 @@ class FreeBeam:
         """
         laplace_response = (self._between[position_index] @ self._displacement) * self._sample
         return self.line.to_time(
-            laplace_response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + samples)
+            laplace_response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + sample_count)
         )
 
     def motion(
         self,
-        record: TouchRecord,
-        quiet: int,
+        touch_record: TouchRecord,
+        quiet_samples: int,
         first_sample: int,
         angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
@@ -175,28 +175,28 @@ class FreeBeam:
 
         Parameters
         ----------
-        record
+        touch_record
             Samples around the touch.
-        quiet
+        quiet_samples
             Number of samples that are certainly before the touch.
         first_sample
             Index of the sample from which the displacement is computed.
         angle_transform
             Transform of the record's angle, if it is known from another beam; None: it is computed.
         """
-        n = record.angle_rad.size
+        n = touch_record.angle_rad.size
         rate_hz = self.rate_hz
         angle_transform = angle_transform or AngleTransform.from_samples(
-            record.angle_rad, rate_hz, self.line
+            touch_record.angle_rad, rate_hz, self.line
         )
         spectrum, start_rad, speed_rad_s = (
             angle_transform.spectrum,
             angle_transform.start_rad,
             angle_transform.speed_rad_s,
         )
-        measured_channels = [(record.torque_nm, self._torque)]
-        if record.shear_n is not None:
-            measured_channels.append((record.shear_n, self._shear))
+        measured_channels = [(touch_record.torque_nm, self._torque)]
+        if touch_record.shear_n is not None:
+            measured_channels.append((touch_record.shear_n, self._shear))
         t = np.arange(n) / rate_hz
         delay_s = self.model.wrench_delay_s - self.model.angle_delay_s
         vibration_columns = self.modes.channels(t - delay_s)
@@ -208,9 +208,9 @@ class FreeBeam:
             innovations.append(measured_samples - free_reading)
             offset_and_drift = np.zeros((n, 2 * len(measured_channels)))
             offset_and_drift[:, 2 * i] = 1.0
-            offset_and_drift[:, 2 * i + 1] = t - t[quiet // 2]
+            offset_and_drift[:, 2 * i + 1] = t - t[quiet_samples // 2]
             design_matrices.append(np.hstack([vibration_columns[i], offset_and_drift]))
-        motion_fit = _FreeMotionFit.fit(innovations, design_matrices, quiet)
+        motion_fit = _FreeMotionFit.fit(innovations, design_matrices, quiet_samples)
         step_count = STEPS_PER_SAMPLE * n
         node_displacement_m = self.line.to_time(self._displacement * spectrum, step_count)
         displacement_m = self._between @ node_displacement_m[:, STEPS_PER_SAMPLE * first_sample :]
@@ -228,7 +228,7 @@ class FreeBeam:
             spread=np.linalg.cholesky(motion_fit.covariance).astype(np.float64),
             angle_transform=angle_transform,
             ringing=self.modes,
-            angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
+            angle_noise_rad=_angle_noise(touch_record.angle_rad[:quiet_samples]),
             displacement_m=displacement_m,
             first_s=first_sample / rate_hz - self.model.angle_delay_s,
             step_s=1 / (STEPS_PER_SAMPLE * rate_hz),
@@ -264,12 +264,12 @@ class FreeMotion:
     """Time between two steps of the displacement."""
 
 
-def _angle_noise(angle: Real) -> float:
+def _angle_noise(angle_rad: Real) -> float:
     """Return the standard deviation of an angle's noise in rad, including encoder steps.
 
     Fourth differences of the samples remove the motion.
     """
-    return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
+    return float(np.sqrt(np.mean(np.diff(angle_rad, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,28 +284,34 @@ class AngleTransform:
     """Speed at the record's beginning."""
 
     @classmethod
-    def from_samples(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
+    def from_samples(
+        cls, angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+    ) -> "AngleTransform":
         """Return the transform of an angle's samples at the frequencies of a Laplace line."""
-        remaining_angle, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, line)
-        return cls(line.to_laplace(remaining_angle), start_rad, speed_rad_s)
+        remaining_angle, start_rad, speed_rad_s = _interpolate_angle(
+            angle_rad, rate_hz, laplace_line
+        )
+        return cls(laplace_line.to_laplace(remaining_angle), start_rad, speed_rad_s)
 
 
-def _interpolate_angle(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
+def _interpolate_angle(
+    angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+) -> tuple[Real, float, float]:
     """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
 
     Return the remaining angle, and angle and speed at the record's beginning.
     """
     from scipy.interpolate import CubicSpline
 
-    t = np.arange(angle.size) / rate_hz
+    t = np.arange(angle_rad.size) / rate_hz
     window_samples = max(4, round(_SPEED_WINDOW_S * rate_hz))
-    polynomial = np.polyfit(t[:window_samples], angle[:window_samples], 2)
+    polynomial = np.polyfit(t[:window_samples], angle_rad[:window_samples], 2)
     start_rad, speed_rad_s = float(polynomial[2]), float(polynomial[1])
-    relative_angle_rad = angle - start_rad - speed_rad_s * t
+    relative_angle_rad = angle_rad - start_rad - speed_rad_s * t
     angle_spline = CubicSpline(t, relative_angle_rad)
-    step_times_s = np.arange(STEPS_PER_SAMPLE * angle.size) * line.step_s
+    step_times_s = np.arange(STEPS_PER_SAMPLE * angle_rad.size) * laplace_line.step_s
     record_steps_s = step_times_s[step_times_s <= t[-1]]
-    times_after_s = np.arange(1, line.n - record_steps_s.size + 1) * line.step_s
+    times_after_s = np.arange(1, laplace_line.n - record_steps_s.size + 1) * laplace_line.step_s
     end_speed_rad_s = np.polyfit(t[-6:] - t[-1], relative_angle_rad[-6:], 1)[0]
     ending_angle_rad = relative_angle_rad[-1] + end_speed_rad_s * _SETTLING_S * (
         1 - np.exp(-times_after_s / _SETTLING_S)

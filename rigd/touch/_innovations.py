@@ -102,7 +102,7 @@ def observed_beam(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
-    noise: ChannelNoise,
+    noise_stds: ChannelNoise,
     *,
     tool_inertia_kg_m2: float = 0.0,
     torque_after_angle_s: float = 0.0,
@@ -116,7 +116,7 @@ def observed_beam(
         Parameters of the exact model.
     rate_hz
         Ticks a second.
-    noise
+    noise_stds
         Noise of torque, base shear and angle.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
@@ -133,8 +133,8 @@ def observed_beam(
     angle_filter = _fit_filter(
         beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter
     )
-    has_shear = noise.shear_n is not None
-    observer = _design_observer(beam, damping, rate_hz, noise, angle_filter.noise_gain)
+    has_shear = noise_stds.shear_n is not None
+    observer = _design_observer(beam, damping, rate_hz, noise_stds, angle_filter.noise_gain)
     f, o = angle_filter.a.shape[0], observer.a.shape[0]
     n = f + o
     step_matrix = np.zeros((n + 4, n + 3))

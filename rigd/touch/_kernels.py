@@ -71,22 +71,24 @@ class LaplaceLine:
         spectrum: Complex = rfft(damped_samples, self.n, axis=-1)[..., : self.s.size]
         return spectrum
 
-    def to_time(self, transform: Complex, steps: int) -> Real:
+    def to_time(self, laplace_values: Complex, step_count: int) -> Real:
         """Return a function of time from its Laplace transform, along the last axis.
 
         Parameters
         ----------
-        transform
+        laplace_values
             Laplace transform at the frequencies of the line, along the last axis.
-        steps
+        step_count
             Number of time steps that are returned, from the first on.
         """
         from scipy.fft import irfft
 
-        if transform.shape[-1] == self.n // 2 + 1:
-            transform = transform.copy()
-            transform[..., -1] = transform[..., -1].real
-        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._growth[:steps]
+        if laplace_values.shape[-1] == self.n // 2 + 1:
+            laplace_values = laplace_values.copy()
+            laplace_values[..., -1] = laplace_values[..., -1].real
+        samples: Real = (
+            irfft(laplace_values, self.n, axis=-1)[..., :step_count] * self._growth[:step_count]
+        )
         return samples
 
 
@@ -97,33 +99,35 @@ class ForcePulse:
     ----------
     step_s
         Half the width of the pulse, which is the time between two values of a kernel.
-    steps
+    step_count
         Number of values of a kernel.
     """
 
     __slots__ = ("_delayed_pulse", "_steps", "line")
 
-    def __init__(self, step_s: float, steps: int) -> None:
+    def __init__(self, step_s: float, step_count: int) -> None:
         from scipy.fft import next_fast_len
 
-        self._steps = steps
+        self._steps = step_count
         fine_step_s = step_s / _OVERSAMPLING
-        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLING * steps, real=True), fine_step_s)
+        self.line = LaplaceLine(
+            next_fast_len(2 * _OVERSAMPLING * step_count, real=True), fine_step_s
+        )
         s = self.line.s
         pulse_transform = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
-    def kernels(self, response: Complex) -> Real:
+    def kernels(self, laplace_response: Complex) -> Real:
         """Return responses over time to one triangular pulse of force, shape (k, steps).
 
         Parameters
         ----------
-        response
+        laplace_response
             Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
         """
         fine_values = self.line.to_time(
-            self._delayed_pulse * response, _OVERSAMPLING * (self._steps + 1)
+            self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
         )
         return fine_values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
 
@@ -149,50 +153,61 @@ class ContactKernels:
         """Number of time steps of the kernels."""
         return int(self.displacement.shape[1])
 
-    def at_positions(self, x_m: Real, steps: int) -> "ContactKernels":
+    def at_positions(self, x_m: Real, step_count: int) -> "ContactKernels":
         """Return the responses at other positions, by cubic interpolation of four positions.
 
         Parameters
         ----------
         x_m
             Positions within the range of those of the kernels, shape (k,).
-        steps
+        step_count
             Number of time steps of the result.
         """
         first_rows, weights = cubic_weights(x_m, self.x_m)
         kernel_tables = (
-            self.displacement[:, :steps],
-            self.torque[:, :steps],
-            self.shear[:, :steps],
+            self.displacement[:, :step_count],
+            self.torque[:, :step_count],
+            self.shear[:, :step_count],
         )
         return ContactKernels(
             x_m, self.step_s, *(interpolate_rows(t, first_rows, weights) for t in kernel_tables)
         )
 
-    def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
+    def with_wider_pulses(self, widening_factor: int, step_count: int) -> "ContactKernels":
         """Return the responses to wider triangular pulses of force, with longer time steps.
 
         Parameters
         ----------
-        factor
+        widening_factor
             Ratio of the longer time step to the present one.
-        steps
+        step_count
             Number of time steps of the result.
         """
-        pulse_weights = 1 - np.abs(np.arange(1 - factor, factor)) / factor
+        pulse_weights = (
+            1 - np.abs(np.arange(1 - widening_factor, widening_factor)) / widening_factor
+        )
         wide_tables = []
         for kernel_table in (self.displacement, self.torque, self.shear):
-            padded_table = np.pad(kernel_table, ((0, 0), (factor - 1, factor - 1)))
+            padded_table = np.pad(
+                kernel_table, ((0, 0), (widening_factor - 1, widening_factor - 1))
+            )
             # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
             wide_response = sum(
                 pulse_weight
                 * padded_table[
-                    :, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor
+                    :,
+                    widening_factor - 1 - i : widening_factor
+                    - 1
+                    - i
+                    + (step_count - 1) * widening_factor
+                    + 1 : widening_factor,
                 ]
-                for i, pulse_weight in zip(range(1 - factor, factor), pulse_weights, strict=True)
+                for i, pulse_weight in zip(
+                    range(1 - widening_factor, widening_factor), pulse_weights, strict=True
+                )
             )
             wide_tables.append(np.ascontiguousarray(wide_response))
-        return ContactKernels(self.x_m, factor * self.step_s, *wide_tables)
+        return ContactKernels(self.x_m, widening_factor * self.step_s, *wide_tables)
 
 
 def contact_kernels(
@@ -200,7 +215,7 @@ def contact_kernels(
     damping: Damping,
     x_m: Real,
     step_s: float,
-    steps: int,
+    step_count: int,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
     """Return the responses of the exact model to a triangular pulse of force at some positions.
@@ -213,17 +228,17 @@ def contact_kernels(
         Positions of the force along the beam, shape (m,).
     step_s
         Time between two values of a kernel.
-    steps
+    step_count
         Number of values of a kernel.
     sensor_filter
         Filters of torque and shear.
     """
-    force_pulse = ForcePulse(step_s, steps)
+    force_pulse = ForcePulse(step_s, step_count)
     s = force_pulse.line.s
     force_grid = PointForceGrid(s, beam, damping)
     filter_response = sensor_filter.response(s)
     complex_stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
-    kernel_tables = np.empty((3, x_m.size, steps))
+    kernel_tables = np.empty((3, x_m.size, step_count))
     for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
         x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
@@ -251,31 +266,31 @@ class CrossKernels:
     """Displacement over time of each mode for a pulse of force, where its shape is 1; shape
     (modes, n)."""
 
-    def between_positions(self, x_m: Real, other_m: Real, steps: int) -> Real:
+    def between_positions(self, x_m: Real, other_m: Real, step_count: int) -> Real:
         """Return displacement per force pulse between pairs of positions, shape (pairs, steps).
 
         Parameters
         ----------
         x_m, other_m
             Positions of force and displacement, shape (k,); they may be exchanged.
-        steps
+        step_count
             Number of time steps of the result.
         """
         first_shapes, second_shapes = (
             interpolate_rows(self.shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
         )
-        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :steps]
+        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :step_count]
         return cross_kernels_of_pairs
 
 
 def cross_kernels(
-    beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
+    beam: Beam, damping: Damping, x_m: Real, step_s: float, step_count: int
 ) -> CrossKernels:
     """Return the displacements over time at one position per force pulse at another.
 
     The arguments are those of `contact_kernels`.
     """
-    force_pulse = ForcePulse(step_s, steps)
+    force_pulse = ForcePulse(step_s, step_count)
     s = force_pulse.line.s
     inertial_factor = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
     stiffness_factor = 1 + damping.zeta * s**damping.alpha
@@ -308,14 +323,14 @@ def positions(length_m: float, spacing_m: float) -> Real:
     return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
-def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
+def chebyshev_nodes(x_m: Real, pair_count: int) -> tuple[Real, Real]:
     """Return Chebyshev nodes, and the matrix that interpolates from them to given positions.
 
     Parameters
     ----------
     x_m
         Increasing positions, shape (m,).
-    count
+    pair_count
         Number of nodes.
 
     Returns
@@ -327,23 +342,24 @@ def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
     """
     from numpy.polynomial import chebyshev
 
-    unit_nodes = chebyshev.chebpts1(count)
+    unit_nodes = chebyshev.chebpts1(pair_count)
     unit_positions = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
     at_nodes, at_positions = (
-        chebyshev.chebvander(unit_points, count - 1) for unit_points in (unit_nodes, unit_positions)
+        chebyshev.chebvander(unit_points, pair_count - 1)
+        for unit_points in (unit_nodes, unit_positions)
     )
     interpolation_matrix: Real = at_positions @ np.linalg.inv(at_nodes)
     return x_m[0] + (x_m[-1] - x_m[0]) * (unit_nodes + 1) / 2, interpolation_matrix
 
 
-def cubic_weights(positions_at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(positions_at: Real, grid_points: Real) -> tuple[NDArray[np.intp], Real]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
     positions_at
         Points to which is interpolated, shape (k,).
-    grid
+    grid_points
         At least four equally spaced, increasing points.
 
     Returns
@@ -353,8 +369,8 @@ def cubic_weights(positions_at: Real, grid: Real) -> tuple[NDArray[np.intp], Rea
     weights : ndarray, shape (k, 4)
         Weights of these four grid points.
     """
-    grid_positions = (np.asarray(positions_at) - grid[0]) / (grid[1] - grid[0])
-    first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid.size - 4)
+    grid_positions = (np.asarray(positions_at) - grid_points[0]) / (grid_points[1] - grid_points[0])
+    first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid_points.size - 4)
     u = grid_positions - first_indices
     weights = np.stack(
         [
@@ -368,9 +384,9 @@ def cubic_weights(positions_at: Real, grid: Real) -> tuple[NDArray[np.intp], Rea
     return first_indices, weights
 
 
-def interpolate_rows(table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
+def interpolate_rows(value_table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
     """Interpolate between the rows of a table (m, n) by `cubic_weights`; shape (k, n)."""
-    weighted_sum = weights[:, 0, None] * table[first_rows]
+    weighted_sum = weights[:, 0, None] * value_table[first_rows]
     for i in range(1, 4):
-        weighted_sum += weights[:, i, None] * table[first_rows + i]
+        weighted_sum += weights[:, i, None] * value_table[first_rows + i]
     return weighted_sum

@@ -38,29 +38,29 @@ class TwoObstacleContact:
 
     Parameters
     ----------
-    contact
+    obstacle_contact
         Integration of the contact with one obstacle.
     kernels
         Contact kernels on the time steps of the integration.
-    crossing
+    pair_kernels
         Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
     __slots__ = ("_contact", "_crossing", "_kernels")
 
     def __init__(
-        self, contact: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
+        self, obstacle_contact: ObstacleContact, kernels: ContactKernels, pair_kernels: CrossKernels
     ) -> None:
-        self._contact, self._kernels, self._crossing = contact, kernels, crossing
+        self._contact, self._kernels, self._crossing = obstacle_contact, kernels, pair_kernels
 
-    def predict(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
+    def predict(self, parameters: Real, sample_window: WhitenedWindow) -> tuple[Real, Real]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
-        window
+        sample_window
             Samples for which the effect is predicted.
 
         Returns
@@ -71,7 +71,7 @@ class TwoObstacleContact:
             Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
         obstacle_contact, instants_s = self._contact, parameters[:, 1]
-        step_count = obstacle_contact.step_count(instants_s, window)
+        step_count = obstacle_contact.step_count(instants_s, sample_window)
         positions_m = parameters[:, 0], parameters[:, 3]
         local_kernels = [self._kernels.at_positions(x, step_count) for x in positions_m]
         (beyond_first_m, first_side), (beyond_second_m, second_side) = (
@@ -91,27 +91,31 @@ class TwoObstacleContact:
             -first_side[:, None] * pressing_forces_n[0],
             -second_side[:, None] * pressing_forces_n[1],
         )
-        channel_count = window.motion.noise.size
+        channel_count = sample_window.motion.noise.size
         first_effect, second_effect = (
             obstacle_contact.effects(
                 (position_kernels.torque, position_kernels.shear)[:channel_count],
                 force_n,
                 instants_s,
-                window,
+                sample_window,
             )
             for position_kernels, force_n in zip(local_kernels, forces_n, strict=True)
         )
         return first_effect + second_effect, forces_n[0]
 
-    def predict_channels(self, parameters: Real, window: WhitenedWindow) -> Real:
+    def predict_channels(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
         """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
 
         The arguments are those of `predict`.
         """
-        return self.predict(parameters, window)[0]
+        return self.predict(parameters, sample_window)[0]
 
     def starts(
-        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+        self,
+        single_obstacle: Real,
+        sample_window: WhitenedWindow,
+        parameter_ranges: ParameterRanges,
+        pair_count: int,
     ) -> Real:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
@@ -122,11 +126,11 @@ class TwoObstacleContact:
         single_obstacle
             Position, instant and logarithm of the stiffness of the single obstacle that explains
             the record best.
-        window
+        sample_window
             Whitened innovations with which the pairs are compared.
-        space
+        parameter_ranges
             Ranges of the parameters.
-        count
+        pair_count
             Number of positions of a second obstacle: those with the largest reduction of the
             residuals, by first-order effects.
         """
@@ -137,19 +141,28 @@ class TwoObstacleContact:
         equivalent_pairs[:, [2, 5]] -= np.log(2 * _EQUIVALENT_POSITIONS**2)
         equivalent_pairs[:, 4] = 0.0
         return np.vstack(
-            [equivalent_pairs, self._with_second_obstacle(single_obstacle, window, space, count)]
+            [
+                equivalent_pairs,
+                self._with_second_obstacle(
+                    single_obstacle, sample_window, parameter_ranges, pair_count
+                ),
+            ]
         )
 
     def _with_second_obstacle(
-        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+        self,
+        single_obstacle: Real,
+        sample_window: WhitenedWindow,
+        parameter_ranges: ParameterRanges,
+        pair_count: int,
     ) -> Real:
         """Return pairs of one obstacle and a likely second obstacle, shape (count, 6).
 
         Their likelihood is computed from the first-order effect of the second obstacle.
         """
-        x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
+        x_m = np.linspace(parameter_ranges.low[3], parameter_ranges.high[3], _POSITION_COUNT)
         instants_s = np.full(_POSITION_COUNT, single_obstacle[1])
-        step_count = self._contact.step_count(instants_s, window)
+        step_count = self._contact.step_count(instants_s, sample_window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
         beyond_m, _ = self._contact.motion_beyond_obstacle(x_m, instants_s, step_count)
         distances_m = np.maximum(beyond_m[:, np.minimum(delay_steps, step_count - 1)], 0.0)
@@ -157,15 +170,15 @@ class TwoObstacleContact:
         with_second = np.tile(trial_pair, (_POSITION_COUNT * delay_steps.size, 1))
         with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
         without_second = np.concatenate(
-            [single_obstacle, [x_m[-1], space.high[4], MIN_LN_STIFFNESS]]
+            [single_obstacle, [x_m[-1], parameter_ranges.high[4], MIN_LN_STIFFNESS]]
         )
-        changed_first = without_second + np.diag(space.difference)[:3]
+        changed_first = without_second + np.diag(parameter_ranges.difference)[:3]
         candidate_rows = np.vstack([without_second, changed_first, with_second])
-        residuals = window.residuals(self.predict_channels(candidate_rows, window))
+        residuals = sample_window.residuals(self.predict_channels(candidate_rows, sample_window))
         residual_without_second, second_effects = residuals[0], residuals[4:] - residuals[0]
         # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(
-            ((residuals[1:4] - residual_without_second) / space.difference[:3, None]).T
+            ((residuals[1:4] - residual_without_second) / parameter_ranges.difference[:3, None]).T
         )
         projected_effect = second_effects - (second_effects @ q) @ q.T
         effect_power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
@@ -173,7 +186,7 @@ class TwoObstacleContact:
             -(projected_effect @ residual_without_second) / effect_power, 0.0
         )
         chi2_gain = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
-        likeliest_positions = np.argsort(-chi2_gain.max(axis=1))[:count]
+        likeliest_positions = np.argsort(-chi2_gain.max(axis=1))[:pair_count]
         chosen_rows = likeliest_positions * delay_steps.size + chi2_gain[
             likeliest_positions
         ].argmax(axis=1)
@@ -184,7 +197,9 @@ class TwoObstacleContact:
             + effect_factors[chosen_rows, None] * second_effects[chosen_rows]
         ) @ q
         first_obstacle_changes = -np.linalg.solve(triangle, first_obstacle_residuals.T).T
-        starts[:, :3] += np.clip(first_obstacle_changes, -4 * space.scale[:3], 4 * space.scale[:3])
+        starts[:, :3] += np.clip(
+            first_obstacle_changes, -4 * parameter_ranges.scale[:3], 4 * parameter_ranges.scale[:3]
+        )
         return starts
 
     @staticmethod

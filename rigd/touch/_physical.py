@@ -69,13 +69,13 @@ class WhitenedWindow:
 
     @classmethod
     def from_motion(
-        cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
+        cls, free_motion: FreeMotion, first: int, end: int, deviations: Real | None = None
     ) -> "WhitenedWindow":
         """Return the whitened innovations of the samples from `first` to `end`.
 
         Parameters
         ----------
-        motion
+        free_motion
             Motion of the beam without a touch in the record.
         first, end
             Index of the first sample, and of the sample after the last.
@@ -85,31 +85,35 @@ class WhitenedWindow:
             used, without those that the touch transmits.
         """
         if deviations is None:
-            deviations = motion.design[:, first:end] @ motion.spread
-        noise_stds = motion.noise[:, None, None]
+            deviations = free_motion.design[:, first:end] @ free_motion.spread
+        noise_stds = free_motion.noise[:, None, None]
         scaled_deviations = (deviations[:, : end - first] / noise_stds).reshape(
             -1, deviations.shape[2]
         )
         covariance = np.eye(scaled_deviations.shape[0]) + scaled_deviations @ scaled_deviations.T
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        scaled_innovations = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
-        return cls(motion, first, end, whitening, whitening @ scaled_innovations)
+        scaled_innovations = (
+            free_motion.innovations[:, first:end] / free_motion.noise[:, None]
+        ).ravel()
+        return cls(free_motion, first, end, whitening, whitening @ scaled_innovations)
 
-    def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    def residuals(self, predicted_effects: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Return the whitened innovations minus predicted effects of touches, shape (k, n).
 
         The result has the floating-point precision of the prediction.
 
         Parameters
         ----------
-        predicted
+        predicted_effects
             Effect of each touch on torque and base shear, shape (k, c, samples).
         """
         noise_stds, whitening, whitened_data = (
-            float_array.astype(predicted.dtype, copy=False)
+            float_array.astype(predicted_effects.dtype, copy=False)
             for float_array in (self.motion.noise, self.whitening, self.data)
         )
-        scaled_predictions = (predicted / noise_stds[:, None]).reshape(predicted.shape[0], -1)
+        scaled_predictions = (predicted_effects / noise_stds[:, None]).reshape(
+            predicted_effects.shape[0], -1
+        )
         return whitened_data - scaled_predictions @ whitening.T
 
 
@@ -122,20 +126,20 @@ class ObstacleContact:
         Contact kernels at some positions, on the time steps of the integration.
     x_m
         Positions at which the displacement of the free motion is given.
-    motion
+    free_motion
         Motion of the beam without a touch in the record.
     """
 
     __slots__ = ("_kernels", "_motion", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, x_m: Real, motion: FreeMotion) -> None:
-        self._kernels, self._x_m, self._motion = kernels, x_m, motion
+    def __init__(self, kernels: ContactKernels, x_m: Real, free_motion: FreeMotion) -> None:
+        self._kernels, self._x_m, self._motion = kernels, x_m, free_motion
 
     def predict(
         self,
         parameters: Real,
-        window: WhitenedWindow,
-        side: float | None = None,
+        sample_window: WhitenedWindow,
+        pressing_side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
         """Return the effect of obstacles on torque and shear, and the contact forces in N.
@@ -145,9 +149,9 @@ class ObstacleContact:
         parameters
             Candidates with the columns of `OBSTACLE_PARAMETERS`, at least the first three; shape
             (k, p).
-        window
+        sample_window
             Samples for which the effect is predicted.
-        side
+        pressing_side
             Direction in which the beam presses, 1 or -1; None: the direction of its motion.
         kernels
             Kernels with one row for the only position; None: they are interpolated.
@@ -162,9 +166,11 @@ class ObstacleContact:
         free_motion = self._motion
         x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        time_steps = self.step_count(instants_s, window)
+        time_steps = self.step_count(instants_s, sample_window)
         local_kernels = self._kernels.at_positions(x, time_steps) if kernels is None else kernels
-        approaches_m, pressing_sides = self.motion_beyond_obstacle(x, instants_s, time_steps, side)
+        approaches_m, pressing_sides = self.motion_beyond_obstacle(
+            x, instants_s, time_steps, pressing_side
+        )
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
             np.broadcast_to(local_kernels.displacement[:, :time_steps], approaches_m.shape),
@@ -178,10 +184,10 @@ class ObstacleContact:
         kernel_tables = (local_kernels.torque, local_kernels.shear)[
             : free_motion.innovations.shape[0]
         ]
-        return self.effects(kernel_tables, forces_n, instants_s, window), forces_n
+        return self.effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
 
     def effect_of_changed_motion(
-        self, parameters: Real, window: WhitenedWindow, displacement_changes_m: Real
+        self, parameters: Real, sample_window: WhitenedWindow, displacement_changes_m: Real
     ) -> Real:
         """Return how changes of the free motion act on torque and shear through the contact.
 
@@ -192,14 +198,14 @@ class ObstacleContact:
         ----------
         parameters
             Position, instant and logarithm of the stiffness of an obstacle at rest.
-        window
+        sample_window
             Samples for which the effect is predicted.
         displacement_changes_m
             Changes of the displacement at the obstacle's position, on the free motion's steps from
             its first step on, shape (r, columns).
         """
         x, instant_s = parameters[:1], parameters[1:2]
-        time_steps = self.step_count(instant_s, window)
+        time_steps = self.step_count(instant_s, sample_window)
         local_kernels = self._kernels.at_positions(x, time_steps)
         approach_m, pressing_side = self.motion_beyond_obstacle(x, instant_s, time_steps)
         repeated_instants_s = np.repeat(instant_s, len(displacement_changes_m))
@@ -223,21 +229,23 @@ class ObstacleContact:
             kernel_tables,
             -pressing_side * (pressing_force_n[1:] - pressing_force_n[0]),
             repeated_instants_s,
-            window,
+            sample_window,
         )
 
-    def step_count(self, instant: Real, window: WhitenedWindow) -> int:
+    def step_count(self, instants_s: Real, sample_window: WhitenedWindow) -> int:
         """Return the number of time steps from the earliest touch to the end of the window.
 
         Parameters
         ----------
-        instant
+        instants_s
             Instants of touch, shape (k,).
-        window
+        sample_window
             Samples at whose end the integration ends.
         """
         step_s = self._kernels.step_s
-        needed_steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
+        needed_steps = (
+            int(np.ceil((self._motion.t[sample_window.end - 1] - instants_s.min()) / step_s)) + 3
+        )
         return min(max(needed_steps, 4), self._kernels.steps)
 
     def pressing_direction(self, parameters: Real) -> float:
@@ -251,38 +259,44 @@ class ObstacleContact:
         return float(self.motion_beyond_obstacle(parameters[:1], parameters[1:2], 1)[1][0])
 
     def effects(
-        self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow
+        self,
+        tables: tuple[Real, ...],
+        forces_n: Real,
+        instants_s: Real,
+        sample_window: WhitenedWindow,
     ) -> Real:
         """Return the effect of contact forces on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         tables
-            Kernel of torque, and of shear if it is measured, with as many rows as `force` or one.
-        force
+            Kernel of torque, and of shear if it is measured, with as many rows as `forces_n` or one.
+        forces_n
             Forces on the beam at the steps of the kernels, shape (k, n).
-        instant
+        instants_s
             Instant of each force's first step, shape (k,).
-        window
+        sample_window
             Samples for which the effect is predicted.
         """
         free_motion = self._motion
         step_s = self._kernels.step_s
         steps_per_sample = round((free_motion.t[1] - free_motion.t[0]) / step_s)
-        sample_count = window.end - window.first
-        begin_steps = (free_motion.t[window.first] - instant) / step_s
+        sample_count = sample_window.end - sample_window.first
+        begin_steps = (free_motion.t[sample_window.first] - instants_s) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
-        aligned_forces = shift_rows(force, begin_steps, (sample_count - 1) * steps_per_sample + 1)
+        aligned_forces = shift_rows(
+            forces_n, begin_steps, (sample_count - 1) * steps_per_sample + 1
+        )
         return contact_responses(tables, aligned_forces, steps_per_sample, sample_count)
 
     def motion_beyond_obstacle(
-        self, x: Real, instant: Real, steps: int, given_direction: float | None = None
+        self, positions_m: Real, instants_s: Real, steps: int, given_direction: float | None = None
     ) -> tuple[Real, Real]:
         """Return how far the free beam would move beyond the obstacle, and in which direction.
 
         Parameters
         ----------
-        x, instant
+        positions_m, instants_s
             Positions and instants of touches, shape (k,).
         steps
             Number of time steps from the instants on.
@@ -298,22 +312,22 @@ class ObstacleContact:
             Direction of the motion, 1 or -1.
         """
         free_motion = self._motion
-        first_rows, weights = cubic_weights(x, self._x_m)
+        first_rows, weights = cubic_weights(positions_m, self._x_m)
         displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
-        free_motion_m = self._on_kernel_steps(displacement_m, instant, steps)
+        free_motion_m = self._on_kernel_steps(displacement_m, instants_s, steps)
         if given_direction is None:
             position_before_m = shift_rows(
-                displacement_m, (instant - free_motion.first_s) / free_motion.step_s - 1.0, 1
+                displacement_m, (instants_s - free_motion.first_s) / free_motion.step_s - 1.0, 1
             )
             pressing_sides = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
-            pressing_sides = np.full(x.size, given_direction)
+            pressing_sides = np.full(positions_m.size, given_direction)
         return pressing_sides[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_sides
 
-    def _on_kernel_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
+    def _on_kernel_steps(self, displacement_m: Real, instants_s: Real, steps: int) -> Real:
         """Interpolate displacements to the time steps of the contact, each row from its instant."""
         free_motion = self._motion
-        begin_steps = (instant - free_motion.first_s) / free_motion.step_s
+        begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
         substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
         interpolated_m = np.empty((begin_steps.size, substeps * -(-steps // substeps)))
         for i in range(substeps):
@@ -340,10 +354,10 @@ step that fails, the predicted reduction counts."""
 
 
 def find_minima(
-    predict: Prediction,
-    window: WhitenedWindow,
-    starts: Real,
-    space: ParameterRanges,
+    predict_effect: Prediction,
+    sample_window: WhitenedWindow,
+    start_candidates: Real,
+    parameter_ranges: ParameterRanges,
     rounds: int = 12,
     free: NDArray[np.bool_] | None = None,
 ) -> Minima:
@@ -351,25 +365,27 @@ def find_minima(
 
     Parameters
     ----------
-    predict
+    predict_effect
         Function that predicts the effect of candidates.
-    window
+    sample_window
         Whitened innovations with which the predictions are compared.
-    starts
+    start_candidates
         Candidates from which the iterations start, shape (k, p).
-    space
+    parameter_ranges
         Ranges of the parameters.
     rounds
         Largest number of iterations.
     free
         Whether each parameter of each start is free, shape (k, p); None: all are free.
     """
-    best_parameters = np.clip(starts, space.low, space.high)
+    best_parameters = np.clip(start_candidates, parameter_ranges.low, parameter_ranges.high)
     damping_factors = np.full(len(best_parameters), 1e-2)
-    current_residuals, jacobians = _linearise(predict, window, best_parameters, space)
+    current_residuals, jacobians = _linearise(
+        predict_effect, sample_window, best_parameters, parameter_ranges
+    )
     chi2 = np.einsum("kn,kn->k", current_residuals, current_residuals)
     is_active = np.ones(len(best_parameters), dtype=bool)
-    regularisation = 1e-6 / space.scale**2
+    regularisation = 1e-6 / parameter_ranges.scale**2
     for _ in range(rounds):
         active_rows = np.flatnonzero(is_active)
         j, r = jacobians[active_rows], current_residuals[active_rows]
@@ -383,9 +399,13 @@ def find_minima(
         )
         normal_matrices += normal_diagonals[:, :, None] * np.eye(best_parameters.shape[1])
         parameter_steps = -np.linalg.solve(normal_matrices, gradients[:, :, None])[:, :, 0]
-        parameter_steps = np.clip(parameter_steps, -8 * space.scale, 8 * space.scale)
+        parameter_steps = np.clip(
+            parameter_steps, -8 * parameter_ranges.scale, 8 * parameter_ranges.scale
+        )
         trial_parameters = np.clip(
-            best_parameters[active_rows] + parameter_steps, space.low, space.high
+            best_parameters[active_rows] + parameter_steps,
+            parameter_ranges.low,
+            parameter_ranges.high,
         )
         predicted_residual = r + np.einsum(
             "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
@@ -393,7 +413,9 @@ def find_minima(
         predicted_gain = chi2[active_rows] - np.einsum(
             "kn,kn->k", predicted_residual, predicted_residual
         )
-        new_residuals, new_jacobian = _linearise(predict, window, trial_parameters, space)
+        new_residuals, new_jacobian = _linearise(
+            predict_effect, sample_window, trial_parameters, parameter_ranges
+        )
         new_chi2 = np.einsum("kn,kn->k", new_residuals, new_residuals)
         chi2_gain = chi2[active_rows] - new_chi2
         is_improved = chi2_gain > 0
@@ -419,24 +441,29 @@ def find_minima(
 
 
 def _linearise(
-    predict: Prediction, window: WhitenedWindow, current: Real, space: ParameterRanges
+    predict_effect: Prediction,
+    sample_window: WhitenedWindow,
+    current_candidates: Real,
+    parameter_ranges: ParameterRanges,
 ) -> tuple[Real, Real]:
     """Return candidates' residuals (k, n), and their derivatives by the parameters (k, n, p)."""
-    parameter_count = current.shape[1]
+    parameter_count = current_candidates.shape[1]
     parameter_shifts = np.where(
-        current + space.difference > space.high, -space.difference, space.difference
+        current_candidates + parameter_ranges.difference > parameter_ranges.high,
+        -parameter_ranges.difference,
+        parameter_ranges.difference,
     )
     shifted_candidates = np.concatenate(
         [
-            current,
+            current_candidates,
             *(
-                current + np.eye(parameter_count)[i] * parameter_shifts
+                current_candidates + np.eye(parameter_count)[i] * parameter_shifts
                 for i in range(parameter_count)
             ),
         ]
     )
-    residuals = window.residuals(predict(shifted_candidates, window)).reshape(
-        parameter_count + 1, len(current), -1
+    residuals = sample_window.residuals(predict_effect(shifted_candidates, sample_window)).reshape(
+        parameter_count + 1, len(current_candidates), -1
     )
     derivatives = (residuals[1:] - residuals[0]) / parameter_shifts.T[:, :, None]
     return residuals[0], np.moveaxis(derivatives, 0, -1)
@@ -451,70 +478,77 @@ class CandidateGrid:
     ----------
     kernels
         Contact kernels whose step divides the sampling period.
-    stride
+    position_stride
         Number of the kernels' positions from one position of the grid to the next.
     rate_hz
         Samples a second.
-    samples
+    sample_count
         Number of samples that are compared.
     """
 
     __slots__ = ("_channels", "_kernel", "_ratio", "_samples", "_step_s", "_stride", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, stride: int, rate_hz: float, samples: int) -> None:
+    def __init__(
+        self, kernels: ContactKernels, position_stride: int, rate_hz: float, sample_count: int
+    ) -> None:
         self._ratio = round(1 / (rate_hz * kernels.step_s))
-        self._samples, self._stride, self._step_s = samples, stride, kernels.step_s
-        time_steps = self._ratio * samples
-        self._x_m = kernels.x_m[::stride]
+        self._samples, self._stride, self._step_s = sample_count, position_stride, kernels.step_s
+        time_steps = self._ratio * sample_count
+        self._x_m = kernels.x_m[::position_stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._kernel = kernels.displacement[::stride, :time_steps].astype(np.float32)
-        lag_steps = self._ratio * np.arange(samples)[:, None] - np.arange(time_steps)
+        self._kernel = kernels.displacement[::position_stride, :time_steps].astype(np.float32)
+        lag_steps = self._ratio * np.arange(sample_count)[:, None] - np.arange(time_steps)
         self._channels = [
-            np.where(lag_steps >= 0, kernel_table[::stride][:, np.maximum(lag_steps, 0)], 0.0)
+            np.where(
+                lag_steps >= 0, kernel_table[::position_stride][:, np.maximum(lag_steps, 0)], 0.0
+            )
             .transpose(0, 2, 1)
             .astype(np.float32)
             for kernel_table in (kernels.torque, kernels.shear)
         ]  # (positions, steps, samples)
 
     def integrate(
-        self, motion: FreeMotion, window: WhitenedWindow, latest: int
+        self, free_motion: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
     ) -> tuple[Real, Real]:
         """Return all candidate obstacles of the grid, and their sums of squared residuals.
 
         Parameters
         ----------
-        motion
+        free_motion
             Motion of the beam without a touch in the record.
-        window
+        sample_window
             Whitened innovations with which the candidates are compared.
-        latest
+        latest_sample
             Index of the last sample at which the touch may begin. The earliest is the first sample
             of the window.
         """
-        touch_samples = np.arange(window.first + 1, latest + 1)
+        touch_samples = np.arange(sample_window.first + 1, latest_sample + 1)
         sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
         chi2 = [
-            self._sums_of_squares(motion, window, sample_batch) for sample_batch in sample_batches
+            self._sums_of_squares(free_motion, sample_window, sample_batch)
+            for sample_batch in sample_batches
         ]
         grid_axes = np.meshgrid(
-            self._x_m, motion.t[touch_samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
+            self._x_m, free_motion.t[touch_samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
         )
         return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _sums_of_squares(
-        self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]
+        self, free_motion: FreeMotion, sample_window: WhitenedWindow, samples: NDArray[np.intp]
     ) -> Real:
         """Return the grid candidates' sums of squared residuals for touches at some samples.
 
         The shape is (positions, instants, stiffnesses).
         """
         position_count, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
-        sample_count = window.end - int(samples[0])
+        sample_count = sample_window.end - int(samples[0])
         time_steps = self._ratio * sample_count
-        begin_steps = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
+        begin_steps = np.round(
+            (free_motion.t[samples] - free_motion.first_s) / free_motion.step_s
+        ).astype(np.intp)
         step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
-        last_column = motion.displacement_m.shape[1] - 1
-        displacement_m = motion.displacement_m[:: self._stride][
+        last_column = free_motion.displacement_m.shape[1] - 1
+        displacement_m = free_motion.displacement_m[:: self._stride][
             :, np.minimum(step_columns, last_column)
         ]
         # Axes: position, instant, step.
@@ -536,22 +570,22 @@ class CandidateGrid:
                 position_count,
                 samples.size,
                 stiffness_count,
-                motion.noise.size,
-                window.end - window.first,
+                free_motion.noise.size,
+                sample_window.end - sample_window.first,
             ),
             dtype=np.float32,
         )
-        for channel_index in range(motion.noise.size):
+        for channel_index in range(free_motion.noise.size):
             channel_effect = forces_n @ self._channels[channel_index][:, :time_steps, :sample_count]
             channel_effect = channel_effect.reshape(
                 position_count, samples.size, stiffness_count, sample_count
             )
             for i, touch_sample in enumerate(samples):
-                later_samples = window.end - touch_sample
+                later_samples = sample_window.end - touch_sample
                 predicted_effects[:, i, :, channel_index, -later_samples:] = channel_effect[
                     :, i, :, :later_samples
                 ]
-        sample_residuals = window.residuals(
+        sample_residuals = sample_window.residuals(
             predicted_effects.reshape(-1, *predicted_effects.shape[3:])
         )
         chi2: Real = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
@@ -564,18 +598,18 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 """Stiffnesses of the grid's candidates in N/m."""
 
 
-def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
+def chi2_of(predict_effect: Prediction, sample_window: WhitenedWindow, candidates: Real) -> Real:
     """Return the sum of squared residuals of each candidate obstacle, shape (k,).
 
     Parameters
     ----------
-    predict
+    predict_effect
         Function that predicts the effect of candidates.
-    window
+    sample_window
         Whitened innovations with which the predictions are compared.
     candidates
         Parameters of the candidates, shape (k, p).
     """
-    candidate_residuals = window.residuals(predict(candidates, window))
+    candidate_residuals = sample_window.residuals(predict_effect(candidates, sample_window))
     chi2: Real = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
     return chi2

@@ -41,40 +41,40 @@ class Posterior:
         """Effective number of samples: number of equal weights with the same precision."""
         return float(1 / np.sum(self.weights**2))
 
-    def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
+    def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> Real:
         """Return quantiles of the posterior distribution of one obstacle parameter.
 
         Parameters
         ----------
-        column
+        parameter_column
             Column of the parameter.
-        levels
+        quantile_levels
             Probabilities of the quantiles, between 0 and 1.
         """
-        parameter_values = self.samples[:, column]
+        parameter_values = self.samples[:, parameter_column]
         value_order = np.argsort(parameter_values)
         cumulated_weights = np.cumsum(self.weights[value_order]) - 0.5 * self.weights[value_order]
-        return np.interp(levels, cumulated_weights, parameter_values[value_order])
+        return np.interp(quantile_levels, cumulated_weights, parameter_values[value_order])
 
-    def mean(self, column: int) -> float:
+    def mean(self, parameter_column: int) -> float:
         """Return the mean of one obstacle parameter's posterior distribution.
 
         Parameters
         ----------
-        column
+        parameter_column
             Column of the parameter.
         """
-        return float(self.weights @ self.samples[:, column])
+        return float(self.weights @ self.samples[:, parameter_column])
 
-    def std(self, column: int) -> float:
+    def std(self, parameter_column: int) -> float:
         """Return the standard deviation of one obstacle parameter's posterior distribution.
 
         Parameters
         ----------
-        column
+        parameter_column
             Column of the parameter.
         """
-        deviations = self.samples[:, column] - self.mean(column)
+        deviations = self.samples[:, parameter_column] - self.mean(parameter_column)
         return float(np.sqrt(self.weights @ deviations**2))
 
 
@@ -176,7 +176,7 @@ def sample_posterior(
     return posterior
 
 
-def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> Real:
+def _density(samples: Real, centres: Real, covariances: Real, mixture_weights: Real) -> Real:
     """Return the density of a mixture of Student distributions at samples, shape (n,).
 
     A constant factor is omitted.
@@ -184,7 +184,7 @@ def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> 
     parameter_count = samples.shape[1]
     total_density = np.zeros(samples.shape[0])
     for proposal_centre, covariance, centre_weight in zip(
-        centres, covariances, mixture, strict=True
+        centres, covariances, mixture_weights, strict=True
     ):
         cholesky_factor = np.linalg.cholesky(covariance)
         scaled_deviations = np.linalg.solve(cholesky_factor, (samples - proposal_centre).T)

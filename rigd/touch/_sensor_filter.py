@@ -35,7 +35,7 @@ class SensorFilter:
 
     @classmethod
     def of_records(
-        cls, corner_hz: float, order: int, kind: str, records: int, spacing_s: float
+        cls, corner_hz: float, order: int, kind: str, record_count: int, spacing_s: float
     ) -> "SensorFilter":
         """Return the filter of a sensor that sends several readings per tick, which are averaged.
 
@@ -46,12 +46,12 @@ class SensorFilter:
         kind
             How the records form a sample: "mean" of those in one tick, or weighted by a "triangle"
             over two ticks.
-        records
+        record_count
             Number of records a tick.
         spacing_s
             Time between two records.
         """
-        record_weights = np.full(records, 1 / records)
+        record_weights = np.full(record_count, 1 / record_count)
         if kind == "triangle":
             record_weights = np.convolve(record_weights, record_weights)
         return cls(corner_hz, order, tuple(record_weights.tolist()), spacing_s)

@@ -51,7 +51,7 @@ class WatchedBeam:
     """Signatures of touches from the function `signatures`, shape (signatures, 2 · ticks)."""
 
 
-def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> WatchedBeam:
+def watched_beam(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) -> WatchedBeam:
     """Return the model and the signatures of a beam, with which touches are detected.
 
     Parameters
@@ -60,14 +60,14 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> Wa
         Model of the beam.
     rate_hz
         Ticks a second.
-    noise
+    noise_stds
         Noise of torque, base shear and angle.
     """
     observed_model = observed_beam(
         model.beam,
         model.damping,
         rate_hz,
-        noise,
+        noise_stds,
         tool_inertia_kg_m2=model.tool_inertia_kg_m2,
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,

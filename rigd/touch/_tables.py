@@ -66,8 +66,8 @@ class TouchTables:
         ]
         """Beams in each of which one uncertain parameter is changed by its standard deviation."""
 
-    def starts(self, samples: int) -> CandidateGrid:
+    def starts(self, sample_count: int) -> CandidateGrid:
         """Return the grid of candidate obstacles for a comparison over a number of samples."""
-        if samples not in self._grids:
-            self._grids[samples] = CandidateGrid(self.coarse, 2, self.rate_hz, samples)
-        return self._grids[samples]
+        if sample_count not in self._grids:
+            self._grids[sample_count] = CandidateGrid(self.coarse, 2, self.rate_hz, sample_count)
+        return self._grids[sample_count]
