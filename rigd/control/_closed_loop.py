@@ -439,8 +439,8 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
     growth_rate_per_s = closed_loop.growth_per_s
     instability_text = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
-        f"{closed_loop.spectral_radius:.7f}): {_describe_pole(closed_loop.poles_rad_s[0])} grows at "
-        f"{growth_rate_per_s:.2g} /s"
+        f"{closed_loop.spectral_radius:.7f}): {_describe_pole(closed_loop.poles_rad_s[0])} grows "
+        f"at {growth_rate_per_s:.2g} /s"
     )
     if growth_rate_per_s > MAX_GROWTH_PER_S:
         raise ControlDesignError(f"{instability_text}; {remedy_text}.")

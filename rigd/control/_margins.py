@@ -232,17 +232,17 @@ def _examined_frequencies(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Rea
 
 
 def _negative_real_crossings(
-    gain_curve: Curve, phases_rad: Real, curve_gain: Complex
+    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
 ) -> tuple[Real, Real]:
     """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
-    crossings = _sign_changes(np.imag, gain_curve, phases_rad, curve_gain)
+    crossings = _sign_changes(np.imag, gain_curve, phase_per_tick_rad, curve_gain)
     # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
     end_indices = [
         end
         for end in (0, -1)
         if abs(curve_gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(curve_gain[end].real)
     ]
-    crossing_frequencies = np.concatenate([crossings, phases_rad[end_indices]])
+    crossing_frequencies = np.concatenate([crossings, phase_per_tick_rad[end_indices]])
     real_gains = np.concatenate([gain_curve(crossings).real, curve_gain[end_indices].real])
     return crossing_frequencies[real_gains < 0.0], real_gains[real_gains < 0.0]
 
@@ -250,15 +250,15 @@ def _negative_real_crossings(
 def _sign_changes(
     real_function: Callable[[Complex], Real],
     gain_curve: Curve,
-    phases_rad: Real,
+    phase_per_tick_rad: Real,
     curve_gain: Complex,
 ) -> Real:
     """Return the frequencies at which a real function of the open loop's gain changes its sign."""
     is_negative = np.signbit(real_function(curve_gain))
     interval_indices = np.flatnonzero(is_negative[:-1] != is_negative[1:])
     lower_frequencies, upper_frequencies = (
-        phases_rad[interval_indices],
-        phases_rad[interval_indices + 1],
+        phase_per_tick_rad[interval_indices],
+        phase_per_tick_rad[interval_indices + 1],
     )
     for _ in range(_BISECTIONS):
         middle_frequencies = 0.5 * (lower_frequencies + upper_frequencies)
@@ -288,15 +288,15 @@ def _smallest_with_frequency(
 
 
 def _distance_to_critical_point(
-    gain_curve: Curve, phases_rad: Real, curve_gain: Complex
+    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
 ) -> tuple[float, float]:
     """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
     for _ in range(_REFINEMENTS):
         nearest_index = int(np.abs(1.0 + curve_gain).argmin())
         lower_frequency, upper_frequency = (
-            phases_rad[max(nearest_index - 1, 0)],
-            phases_rad[min(nearest_index + 1, phases_rad.size - 1)],
+            phase_per_tick_rad[max(nearest_index - 1, 0)],
+            phase_per_tick_rad[min(nearest_index + 1, phase_per_tick_rad.size - 1)],
         )
-        phases_rad = np.linspace(lower_frequency, upper_frequency, 21)
-        curve_gain = gain_curve(phases_rad)
-    return _smallest_with_frequency(phases_rad, np.abs(1.0 + curve_gain))
+        phase_per_tick_rad = np.linspace(lower_frequency, upper_frequency, 21)
+        curve_gain = gain_curve(phase_per_tick_rad)
+    return _smallest_with_frequency(phase_per_tick_rad, np.abs(1.0 + curve_gain))

@@ -43,8 +43,8 @@ class ProbeSequence(SessionSequence):
         stop_request: StopRequest,
     ) -> None:
         super().__init__(
-            profile, (0.0,), cycle, clock, scheduler, standstill, channels, reading_publisher, parent, stop_request,
-            Ending(),
+            profile, (0.0,), cycle, clock, scheduler, standstill, channels,
+            reading_publisher, parent, stop_request, Ending(),
         )  # fmt: skip
         self._rig = probed_rig(profile)
         self._move: ProbingMove | None = None

@@ -371,7 +371,7 @@ class RecordSoFar:
         Parameters
         ----------
         added_rows
-            Derivatives that a segment adds from now on, shape (k, n) with n at least `sample_count`;
+            Derivatives that a segment adds from now on, shape (k, n), n at least `sample_count`;
             None: the motor is held.
         sample_count
             Number of further samples that count.

@@ -582,7 +582,7 @@ def _admissible_amplitudes(
 
 
 def _divide_ticks(band_fractions: Real, tick_count: int) -> list[int]:
-    """Return numbers of ticks in proportion to `band_fractions`; their sum is exactly `tick_count`."""
+    """Divide `tick_count` ticks in proportion to `band_fractions`; the sum is exact."""
     end_ticks = np.round(np.cumsum(band_fractions) * tick_count).astype(int)
     return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 

@@ -546,8 +546,8 @@ class SegmentSearch:
     ) -> _SegmentCandidate:
         """Return a candidate segment with a further band, at the largest allowed amplitude.
 
-        The amplitudes of the candidate `base_candidate` are multiplied by `amplitude_fraction`. The phase of the new
-        sweep is ``phase_index / _PHASE_COUNT`` of a turn.
+        The amplitudes of `base_candidate` are multiplied by `amplitude_fraction`. The phase of the
+        new sweep is ``phase_index / _PHASE_COUNT`` of a turn.
         """
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
         sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))

@@ -463,21 +463,19 @@ def _next_duration_ticks(
     fraction_short: float,
     fraction_sufficient: float,
     n: int,
-    amplitude_fraction: float,
+    used_fraction: float,
     zero_order: int,
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
-    `too_short_ticks` and `sufficient_ticks` are the longest insufficient and the shortest sufficient duration,
-    with the fractions of the limits that they use. The fraction falls with a power of the duration:
+    `too_short_ticks` and `sufficient_ticks` are the longest insufficient and the shortest
+    sufficient duration, with the fractions of the limits that they use. The fraction falls with a power of the duration:
     about the third, and more if the modes, not the distance, determine the duration.
     """
     if fraction_sufficient == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(amplitude_fraction, 4.0) ** 0.3)))
+        return int(max(n + 2, round(1.03 * n * min(used_fraction, 4.0) ** 0.3)))
     if fraction_short == inf and n == sufficient_ticks:
-        guessed_ticks = round(
-            n * max(amplitude_fraction, 0.02) ** (0.08 if zero_order > 1 else 0.22)
-        )
+        guessed_ticks = round(n * max(used_fraction, 0.02) ** (0.08 if zero_order > 1 else 0.22))
     elif fraction_short == inf:
         guessed_ticks = round((too_short_ticks * sufficient_ticks) ** 0.5)
     else:

@@ -128,32 +128,28 @@ def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
     return tick_count
 
 
-def require_finite(option: str, option_value: float, unit_text: str) -> None:
+def require_finite(option: str, value: float, unit: str) -> None:
     """Raise `ExcitationError` if an option's value is not finite, or has no size of a real rig."""
-    if not isfinite(option_value):
+    if not isfinite(value):
+        raise ExcitationError(f"{option} = {value} {unit} is not a finite number; give one.")
+    if not is_usable_size(value):
         raise ExcitationError(
-            f"{option} = {option_value} {unit_text} is not a finite number; give one."
-        )
-    if not is_usable_size(option_value):
-        raise ExcitationError(
-            f"{option} = {option_value:g} {unit_text} is of no size that a rig can have; check its unit."
+            f"{option} = {value:g} {unit} is of no size that a rig can have; check its unit."
         )
 
 
-def require_positive(option: str, option_value: float, unit_text: str) -> None:
+def require_positive(option: str, value: float, unit: str) -> None:
     """Raise `ExcitationError` unless an option's value is a finite number above 0."""
-    require_finite(option, option_value, unit_text)
-    if option_value <= 0.0:
-        raise ExcitationError(
-            f"{option} = {option_value:g} {unit_text} must be more than 0 {unit_text}."
-        )
+    require_finite(option, value, unit)
+    if value <= 0.0:
+        raise ExcitationError(f"{option} = {value:g} {unit} must be more than 0 {unit}.")
 
 
-def require_not_negative(option: str, option_value: float) -> None:
+def require_not_negative(option: str, value: float) -> None:
     """Raise `ExcitationError` unless an option's time is finite and at least 0 s."""
-    require_finite(option, option_value, "s")
-    if option_value < 0.0:
-        raise ExcitationError(f"{option} = {option_value:g} s must not be negative.")
+    require_finite(option, value, "s")
+    if value < 0.0:
+        raise ExcitationError(f"{option} = {value:g} s must not be negative.")
 
 
 def require_within_turn(option: str, value_rad: float) -> None:
@@ -166,20 +162,20 @@ def require_within_turn(option: str, value_rad: float) -> None:
 
 
 def require_frequency(
-    option: str, option_value: float, rate_hz: float, *, zero_allowed: bool = False
+    option: str, value: float, rate_hz: float, *, zero_allowed: bool = False
 ) -> None:
     """Raise `ExcitationError` unless a frequency is above 0 Hz and at most a quarter of the rate.
 
     With `zero_allowed`, 0 Hz is valid as well.
     """
-    require_finite(option, option_value, "Hz")
+    require_finite(option, value, "Hz")
     highest_hz = rate_hz / SAMPLES_PER_PERIOD
-    if not (option_value > 0.0 or (zero_allowed and option_value == 0.0)):
+    if not (value > 0.0 or (zero_allowed and value == 0.0)):
         bound_text = "must not be negative" if zero_allowed else "must be more than 0 Hz"
-        raise ExcitationError(f"{option} = {option_value:g} Hz {bound_text}.")
-    if option_value > highest_hz:
+        raise ExcitationError(f"{option} = {value:g} Hz {bound_text}.")
+    if value > highest_hz:
         raise ExcitationError(
-            f"{option} = {option_value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
+            f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
             f"{rate_hz:g} Hz; choose at most {highest_hz:g} Hz."
         )
 
@@ -214,10 +210,10 @@ def lay_out_segments(
     }
 
 
-def check_ticks(message_begin: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
+def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
     """Raise `ExcitationError` if a record has more ticks than can be analysed.
 
-    `message_begin` begins the message, and `around_s` is the time of rest and ring-down together.
+    `what` begins the message, and `around_s` is the time of rest and ring-down together.
     """
     if ticks > MAX_SAMPLES:
         longest_s = MAX_SAMPLES / rate_hz
@@ -227,7 +223,7 @@ def check_ticks(message_begin: str, ticks: float, rate_hz: float, around_s: floa
             else ""
         )
         raise ExcitationError(
-            f"{message_begin} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
+            f"{what} would take {ticks / rate_hz:g} s; {longest_s:g} s is the most at {rate_hz:g} "
             f"Hz{limit_text}, because no more than {MAX_SAMPLES} samples can be analysed, exported "
             "or replayed: shorten it or run several sessions."
         )

@@ -192,8 +192,8 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_or
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
-    path. With ``zero_order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by the
-    pole as well. The shape is (rows, n).
+    path. With ``zero_order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by
+    the pole as well. The shape is (rows, n).
 
     Parameters
     ----------

@@ -216,7 +216,7 @@ def integrate_two_contacts(
     return forces_n[:, 0], forces_n[:, 1]
 
 
-def shift_rows(value_table: Real, begin_columns: Real, pair_count: int) -> Real:
+def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Real:
     """Shift each row of a table by a fraction of columns, by cubic interpolation.
 
     The result has the shape (k, count). Before the first column the values are 0, and after the
@@ -228,17 +228,17 @@ def shift_rows(value_table: Real, begin_columns: Real, pair_count: int) -> Real:
         Rows of values, shape (k, n).
     begin_columns
         Column of each row's first value in the result, shape (k,); it may be between two columns.
-    pair_count
+    column_count
         Number of values of the result, one column apart.
     """
     first_column = np.floor(begin_columns).astype(np.intp)
     u = (begin_columns - first_column)[:, None]
     rows, columns = value_table.shape
     first_column = np.clip(
-        first_column, -pair_count - 2, columns + 1
+        first_column, -column_count - 2, columns + 1
     )  # farther off the result is the same
     padding_before = max(0, 1 - int(first_column.min()))
-    padding_after = max(0, int(first_column.max()) + pair_count + 2 - columns)
+    padding_after = max(0, int(first_column.max()) + column_count + 2 - columns)
     padded_table = np.empty((rows, padding_before + columns + padding_after))
     padded_table[:, :padding_before], padded_table[:, padding_before : padding_before + columns] = (
         0.0,
@@ -248,14 +248,14 @@ def shift_rows(value_table: Real, begin_columns: Real, pair_count: int) -> Real:
     # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
     column_stride, row_stride = padded_table.strides[1], padded_table.strides[0]
     column_blocks = np.ndarray(
-        (rows, padded_table.shape[1] - pair_count - 2, pair_count + 3),
+        (rows, padded_table.shape[1] - column_count - 2, column_count + 3),
         buffer=padded_table,
         strides=(row_stride, column_stride, column_stride),
     )
     neighbours = column_blocks[np.arange(rows), first_column - 1 + padding_before]
-    shifted_rows = neighbours[:, :pair_count] * (-u * (u - 1) * (u - 2) / 6)
-    shifted_rows += neighbours[:, 1 : pair_count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
-    shifted_rows += neighbours[:, 2 : pair_count + 2] * (-(u + 1) * u * (u - 2) / 2)
+    shifted_rows = neighbours[:, :column_count] * (-u * (u - 1) * (u - 2) / 6)
+    shifted_rows += neighbours[:, 1 : column_count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
+    shifted_rows += neighbours[:, 2 : column_count + 2] * (-(u + 1) * u * (u - 2) / 2)
     shifted_rows += neighbours[:, 3:] * ((u + 1) * u * (u - 1) / 6)
     return shifted_rows
 

@@ -336,13 +336,13 @@ class ExplanationSearch:
     # Data for the comparison of candidates
 
     def window(self, after_detection_s: float) -> WhitenedWindow:
-        """Return the whitened innovations from before a touch to `after_detection_s` after its detection."""
+        """Return the whitened innovations from before a touch to a time after its detection."""
         return WhitenedWindow.from_motion(
             self.motion, self.quiet, self.end(after_detection_s), self.deviations
         )
 
     def end(self, after_detection_s: float) -> int:
-        """Return the index of the sample `after_detection_s` after the detection, or the record's end."""
+        """Return the index of the sample at a time after the detection, or the record's end."""
         return self.detected + min(self.available, round(after_detection_s * self.rate))
 
     def space(self, parameter_count: int) -> ParameterRanges:
@@ -526,7 +526,7 @@ class ExplanationSearch:
     def max_chi2(self, expected_chi2: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
         """Return the largest sum of squared residuals that noise explains.
 
-        `expected_chi2` is its expectation, and `max_stds` the allowed number of standard deviations.
+        `expected_chi2` is its expectation, and `max_stds` the allowed standard deviations.
         """
         noise_variance = 2 * expected_chi2**2 / (self.quiet * self.motion.noise.size)
         return float(expected_chi2 + max_stds * np.sqrt(2 * expected_chi2 + noise_variance))

@@ -323,14 +323,14 @@ def positions(length_m: float, spacing_m: float) -> Real:
     return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
-def chebyshev_nodes(x_m: Real, pair_count: int) -> tuple[Real, Real]:
+def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
     """Return Chebyshev nodes, and the matrix that interpolates from them to given positions.
 
     Parameters
     ----------
     x_m
         Increasing positions, shape (m,).
-    pair_count
+    node_count
         Number of nodes.
 
     Returns
@@ -342,10 +342,10 @@ def chebyshev_nodes(x_m: Real, pair_count: int) -> tuple[Real, Real]:
     """
     from numpy.polynomial import chebyshev
 
-    unit_nodes = chebyshev.chebpts1(pair_count)
+    unit_nodes = chebyshev.chebpts1(node_count)
     unit_positions = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
     at_nodes, at_positions = (
-        chebyshev.chebvander(unit_points, pair_count - 1)
+        chebyshev.chebvander(unit_points, node_count - 1)
         for unit_points in (unit_nodes, unit_positions)
     )
     interpolation_matrix: Real = at_positions @ np.linalg.inv(at_nodes)

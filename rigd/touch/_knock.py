@@ -54,7 +54,7 @@ class KnockResponse:
         kernel_tables = (local_kernels.torque, local_kernels.shear)[: free_motion.noise.size]
         return self._contact.effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 
-    def starts(self, sample_window: WhitenedWindow, latest_sample: int, pair_count: int) -> Real:
+    def starts(self, sample_window: WhitenedWindow, latest_sample: int, knock_count: int) -> Real:
         """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).
 
         Parameters
@@ -63,7 +63,7 @@ class KnockResponse:
             Whitened innovations with which the knocks are compared.
         latest_sample
             Index of the last sample at which the knock may begin.
-        pair_count
+        knock_count
             Number of knocks that are returned.
         """
         positions_m = self._kernels.x_m[:: self._stride]
@@ -89,7 +89,7 @@ class KnockResponse:
             effect_power = np.einsum("kn,kn->k", delayed_effects, delayed_effects) + 1e-300
             peaks_n = delayed_effects @ sample_window.data / effect_power
             chi2_gain = peaks_n**2 * effect_power
-            best_rows = np.argsort(-chi2_gain)[:pair_count]
+            best_rows = np.argsort(-chi2_gain)[:knock_count]
             candidate_parts.append(
                 np.column_stack(
                     [
@@ -102,7 +102,7 @@ class KnockResponse:
                 )
             )
         all_candidates = np.concatenate(candidate_parts)
-        return all_candidates[np.argsort(all_candidates[:, 0])[:pair_count], 1:]
+        return all_candidates[np.argsort(all_candidates[:, 0])[:knock_count], 1:]
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> ParameterRanges:

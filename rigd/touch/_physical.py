@@ -270,7 +270,7 @@ class ObstacleContact:
         Parameters
         ----------
         tables
-            Kernel of torque, and of shear if it is measured, with as many rows as `forces_n` or one.
+            Kernel of torque, and of shear if measured, with as many rows as `forces_n` or one.
         forces_n
             Forces on the beam at the steps of the kernels, shape (k, n).
         instants_s
