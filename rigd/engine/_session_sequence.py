@@ -692,7 +692,7 @@ class SessionSequence:
             self.results["true_rate_hz"] = repr(interval_count / (executed_ns * 1e-9))
 
     def _publish_readings(self) -> None:
-        """Publish the readings, and log each doubt about the stated age of readings once."""
+        """Write the readings to the shared state, and log each doubt about their age once."""
         self._display.publish(self._cycle, self._scheduler.due_ns)
         for doubt in self._display.doubts:
             if doubt not in self._doubts_reported:

@@ -18,7 +18,7 @@ disturbed reading."""
 
 @dataclass(frozen=True, slots=True)
 class DetectedContact:
-    """Contact of the beam with an obstacle, as the control loop has detected it."""
+    """Contact of the beam with an obstacle that the control loop has detected: message, outcome."""
 
     message: str
     """Sentence for the operator."""

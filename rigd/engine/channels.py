@@ -40,7 +40,7 @@ class Topic:
     """Whether the live publisher reads the records, and drops those it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = RECORDER_BUFFER_S) -> int:
-        """Return the number of records that a topic's ring must hold.
+        """Return the number of records for which the ring buffer of a topic needs space.
 
         Parameters
         ----------

@@ -139,7 +139,7 @@ def run_control(
 
 
 class _ControlServer:
-    """Executor of the supervisor's orders on connected devices."""
+    """Executor of the supervisor's orders, such as to run a session, on connected devices."""
 
     def __init__(
         self,
@@ -380,7 +380,7 @@ class _ControlServer:
         )
 
     def _run_probe(self, profile: Profile) -> None:
-        """Run the probing move of a profile, disable the drive, and send the result.
+        """Run the probing move of a profile, disable the drive, send the result to the supervisor.
 
         Raises
         ------
@@ -473,7 +473,7 @@ class _ControlServer:
         return {"moved_rad": moved_rad}
 
     def _publish_readings(self) -> None:
-        """Publish the last readings in the shared state."""
+        """Write the last readings of angle and torque to the shared state."""
         self._display.publish(self._cycle, self._scheduler.due_ns)
 
     def _read_rest(self, duration_s: float) -> RestReadings:

@@ -49,7 +49,7 @@ else, such as text."""
 
 @dataclass(frozen=True, slots=True)
 class ControlJob:
-    """Job of the control process: the rig to connect and control."""
+    """First message to the control process: the profile of the rig to connect and control."""
 
     profile: "Profile"
     """Profile whose devices are connected."""
@@ -194,7 +194,7 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class RecorderJob:
-    """Job of the recorder process: the session file to write."""
+    """First message to the recorder process: the path of the session file to write."""
 
     path: Path
     """Path of the session file; an existing file is not overwritten."""
@@ -230,7 +230,7 @@ class Close:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """Message that the session file exists."""
+    """Message of the recorder that it has created the session file."""
 
     realtime: Mapping[str, str]
     """Real-time scheduling that the system granted to the recorder."""
@@ -243,7 +243,7 @@ class Armed:
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """Message that the session file is complete."""
+    """Message of the recorder that it has completed and closed the session file."""
 
     path: Path | None = None
     """Path of the file; None: no record had begun, and there is no file."""
@@ -272,7 +272,7 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class TouchJob:
-    """Job of the touch process: estimate the touches of a session."""
+    """First message to the touch process, which estimates the touches of a session."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
@@ -296,7 +296,7 @@ class TouchReady:
 
 @dataclass(frozen=True, slots=True)
 class TouchReport:
-    """Message with the estimate of a touch."""
+    """Message of the touch process with the estimated position and force of a touch."""
 
     number: int
     """Number of the touch in its session, from 1 on."""

@@ -26,7 +26,7 @@ from rigd.engine._ring import Ring, reserve
 
 
 class Phase(IntEnum):
-    """Phase of the control process."""
+    """Phase of the control process, such as taring or recording, as a number."""
 
     PREPARING = 0
     """Connecting the devices."""
@@ -195,7 +195,7 @@ class SharedState:
         self._fields[field] = value
 
     def known(self, field: StateField) -> int | None:
-        """Return the value of a field, or None if the value is `UNKNOWN`."""
+        """Return the value of a field of the shared state, or None if it is `UNKNOWN`."""
         return None if (field_value := self._fields[field]) == UNKNOWN else field_value
 
     def view(self, field: StateField) -> "memoryview[int]":

@@ -367,7 +367,7 @@ class _MoveSearch:
         )
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return the modes' state to which the initial vibration decays by the end of the move.
+        """Return the modes' complex states to which the initial vibration decays during a move.
 
         Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
         """
@@ -469,8 +469,9 @@ def _next_duration_ticks(
     """Return the duration in ticks that the search for the shortest move tries next.
 
     `too_short_ticks` and `sufficient_ticks` are the longest insufficient and the shortest
-    sufficient duration, with the fractions of the limits that they use. The fraction falls with a power of the duration:
-    about the third, and more if the modes, not the distance, determine the duration.
+    sufficient duration, with the fractions of the limits that they use. The fraction falls with a
+    power of the duration: about the third, and more if the modes, not the distance, determine the
+    duration.
     """
     if fraction_sufficient == 0.0:  # none has sufficed yet
         return int(max(n + 2, round(1.03 * n * min(used_fraction, 4.0) ** 0.3)))

@@ -512,7 +512,7 @@ def multisine(
 def _random_phase_period(
     tick_count: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
-    """Return one period of the multisine with peak 1, shape (ticks,), which starts near zero."""
+    """Return one period of the multisine with peak 1, which starts near 0, (tick_count,)."""
     frequency_hz = np.arange(1, tick_count // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
     is_in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (

@@ -219,8 +219,8 @@ def integrate_two_contacts(
 def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Real:
     """Shift each row of a table by a fraction of columns, by cubic interpolation.
 
-    The result has the shape (k, count). Before the first column the values are 0, and after the
-    last column they are constant.
+    The result has the shape (k, column_count). Before the first column the values are 0,
+    and after the last column they are constant.
 
     Parameters
     ----------

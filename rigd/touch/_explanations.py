@@ -517,7 +517,7 @@ class ExplanationSearch:
         sample_window: WhitenedWindow,
         max_stds: float = _MAX_MISFIT_STDS,
     ) -> bool:
-        """Return whether an explanation's residuals are no larger than noise.
+        """Return whether the residuals of a touch's explanation are no larger than noise.
 
         `max_stds` is the number of standard deviations by which they may exceed their expectation.
         """

@@ -297,7 +297,7 @@ class AngleTransform:
 def _interpolate_angle(
     angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
 ) -> tuple[Real, float, float]:
-    """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
+    """Interpolate an angle to the time steps of a transform, and subtract constant speed.
 
     Return the remaining angle, and angle and speed at the record's beginning.
     """

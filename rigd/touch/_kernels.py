@@ -93,7 +93,7 @@ class LaplaceLine:
 
 
 class ForcePulse:
-    """Triangular pulse of force, with which responses in the Laplace domain become kernels.
+    """Triangular pulse of force, to compute responses over time from Laplace transforms.
 
     Parameters
     ----------
@@ -150,7 +150,7 @@ class ContactKernels:
 
     @property
     def steps(self) -> int:
-        """Number of time steps of the kernels."""
+        """Number of time steps of the responses."""
         return int(self.displacement.shape[1])
 
     def at_positions(self, x_m: Real, step_count: int) -> "ContactKernels":
@@ -335,7 +335,7 @@ def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
 
     Returns
     -------
-    nodes_m : ndarray, shape (count,)
+    nodes_m : ndarray, shape (node_count,)
         Positions of the nodes.
     between : ndarray, shape (m, count)
         Matrix that interpolates values at the nodes to the given positions.

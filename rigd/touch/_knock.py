@@ -55,7 +55,7 @@ class KnockResponse:
         return self._contact.effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 
     def starts(self, sample_window: WhitenedWindow, latest_sample: int, knock_count: int) -> Real:
-        """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).
+        """Return the likeliest knocks of a grid, each with its best peak, (knock_count, 4).
 
         Parameters
         ----------

@@ -156,7 +156,7 @@ class TwoObstacleContact:
         parameter_ranges: ParameterRanges,
         pair_count: int,
     ) -> Real:
-        """Return pairs of one obstacle and a likely second obstacle, shape (count, 6).
+        """Return pairs of one obstacle and a likely second obstacle, shape (pair_count, 6).
 
         Their likelihood is computed from the first-order effect of the second obstacle.
         """

@@ -27,7 +27,7 @@ _MAX_CENTRES = 16
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Posterior distribution of an obstacle's parameters, as weighted samples."""
+    """Posterior distribution of an obstacle's parameters, such as position, as weighted samples."""
 
     samples: Real
     """Parameters of each sample, shape (n, p)."""
