@@ -57,7 +57,7 @@ class Ring:
 
     @classmethod
     def create(cls, record_size: int, capacity: int, fd: int) -> Self:
-        """Return a new empty ring in shared memory.
+        """Return a new empty ring buffer in the shared memory of descriptor `fd`.
 
         Parameters
         ----------

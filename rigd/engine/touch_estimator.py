@@ -117,7 +117,7 @@ class TouchFollower:
 
     @property
     def idle(self) -> bool:
-        """Whether no touch waits for an estimate."""
+        """Whether all detected touches have their final estimate."""
         return not self._pending_touches
 
     def take(self, new_samples: NDArray[np.void]) -> None:

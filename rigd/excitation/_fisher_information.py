@@ -453,7 +453,7 @@ def _regression_coefficients(gram: Real, k: int) -> Real:
 
 
 def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
-    """Return the covariance of the parameters for a Fisher information plus prior knowledge."""
+    """Return the parameters' covariance from a Fisher information and prior knowledge."""
     prior_stds = np.array(
         [_prior_std(parameter_name, estimate) for parameter_name in estimate.names]
     )

@@ -169,7 +169,7 @@ class _SegmentCandidate:
     the time in s in which the best mixture would give it."""
 
     def weighted_sum(self, attribute_name: str) -> Real:
-        """Return an array of the whole segment: the weighted sum of an attribute of its sweeps.
+        """Return the sum of an array attribute of the segment's sweeps, weighted by amplitude.
 
         `attribute_name` is an attribute of `_UnitSweep`.
         """
@@ -294,7 +294,7 @@ class SegmentSearch:
         return sweep_bands
 
     def steady_sines(self) -> tuple[Real, Real]:
-        """Return the steady sines of the forecast, at the largest amplitudes that limits allow.
+        """Return frequencies and largest allowed amplitudes of the forecast's steady sines.
 
         The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
         """

@@ -515,14 +515,14 @@ class _UnitResponse:
 
 
 def _interval_responses(
-    unit_responses: Real, edge_ticks: NDArray[np.intp], tick_count: NDArray[np.intp]
+    unit_responses: Real, edge_ticks: NDArray[np.intp], response_ticks: NDArray[np.intp]
 ) -> Real:
     """Return the response at some ticks to an acceleration of 1 rad/s² in one interval only.
 
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
     1, and `edge_ticks` are the ticks at which the intervals begin and end.
     """
-    ticks_since_edge = tick_count[:, None] - edge_ticks
+    ticks_since_edge = response_ticks[:, None] - edge_ticks
     step_response: Real = np.where(
         ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
     )

@@ -64,7 +64,7 @@ class DesignRig(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """Designed excitation of a whole session, segment after segment."""
+    """Designed excitation of a session: its segments, reference angle and expected precision."""
 
     segments: tuple[Segment, ...]
     """Segments in the order of time."""

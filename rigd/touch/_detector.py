@@ -152,7 +152,7 @@ class TouchDetector:
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:
-        """Return the approximate contact force in N at the last tick.
+        """Return the approximate force in N between beam and obstacle at the last tick.
 
         It is the measured base shear minus the shear predicted for the free beam.
 
