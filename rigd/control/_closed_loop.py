@@ -62,7 +62,7 @@ _OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, s
 
 @dataclass(frozen=True, slots=True)
 class LoopModel:
-    """Parameters of the closed loop of motor, beam and controller."""
+    """Parameters of motor, beam, delays and controller, from which a closed loop is computed."""
 
     rate_hz: float
     """Ticks a second."""
@@ -194,38 +194,42 @@ class ClosedLoop:
             If the loop is unstable and the response overflows.
         """
         n = reference_rad.size
-        blocks = -(-n // _BLOCK_TICKS)
-        padded_reference = np.zeros((blocks, _BLOCK_TICKS))
+        block_count = -(-n // _BLOCK_TICKS)
+        padded_reference = np.zeros((block_count, _BLOCK_TICKS))
         padded_reference.ravel()[:n] = reference_rad
-        rows = np.empty((_OUTPUT_ROWS, blocks * _BLOCK_TICKS))
+        output_rows = np.empty((_OUTPUT_ROWS, block_count * _BLOCK_TICKS))
         free_response, forced_response, state_step, reference_drive = self._block_matrices()
-        state = np.zeros(self.b.size)
-        for first in range(0, blocks, _BLOCKS_AT_ONCE):
-            block_references = padded_reference[first : first + _BLOCKS_AT_ONCE]
+        block_state = np.zeros(self.b.size)
+        for block_begin in range(0, block_count, _BLOCKS_AT_ONCE):
+            block_references = padded_reference[block_begin : block_begin + _BLOCKS_AT_ONCE]
             reference_effects = block_references @ reference_drive
-            states = np.empty_like(reference_effects)
-            for index in range(len(block_references)):
-                states[index] = state
-                state = state_step @ state
-                state += reference_effects[index]
-            if not np.isfinite(state).all():
+            block_states = np.empty_like(reference_effects)
+            for block_index in range(len(block_references)):
+                block_states[block_index] = block_state
+                block_state = state_step @ block_state
+                block_state += reference_effects[block_index]
+            if not np.isfinite(block_state).all():
                 raise ControlDesignError(
                     f"The closed loop is unstable and grows at {self.growth_per_s:.3g} /s: its "
                     "response cannot be computed."
                 )
             for row in range(_OUTPUT_ROWS):
-                out = rows[row].reshape(blocks, _BLOCK_TICKS)[first : first + len(block_references)]
+                out = output_rows[row].reshape(block_count, _BLOCK_TICKS)[
+                    block_begin : block_begin + len(block_references)
+                ]
                 np.matmul(block_references, forced_response[row], out=out)
-                out += states @ free_response[row]
+                out += block_states @ free_response[row]
         del padded_reference
-        angle, velocity, torque, speed, coupling = rows[:, :n]
+        angle_rad, velocity_rad_s, torque_nm, friction_speed_rad_s, coupling_torque_nm = (
+            output_rows[:, :n]
+        )
         settings = self.model.settings
         # Without a copy: an hour of record takes 30 MB a channel.
-        speed /= settings.friction_velocity_rad_s
-        np.tanh(speed, out=speed)
-        speed *= settings.friction_compensation_nm
-        torque += speed
-        return LoopResponse(angle, velocity, torque, coupling)
+        friction_speed_rad_s /= settings.friction_velocity_rad_s
+        np.tanh(friction_speed_rad_s, out=friction_speed_rad_s)
+        friction_speed_rad_s *= settings.friction_compensation_nm
+        torque_nm += friction_speed_rad_s
+        return LoopResponse(angle_rad, velocity_rad_s, torque_nm, coupling_torque_nm)
 
     def response(self, frequency_hz: Real) -> Complex:
         """Return the complex frequency response from reference to angle at given frequencies.
@@ -233,12 +237,13 @@ class ClosedLoop:
         The result has the shape of the frequencies.
         """
         z = np.exp(2j * pi * np.atleast_1d(frequency_hz) / self.model.rate_hz)
-        identity = np.eye(self.b.size)
-        values = [
-            self.c[0] @ np.linalg.solve(point * identity - self.a, self.b) + self.d[0]
-            for point in z.ravel()
+        identity_matrix = np.eye(self.b.size)
+        response_values = [
+            self.c[0] @ np.linalg.solve(unit_circle_point * identity_matrix - self.a, self.b)
+            + self.d[0]
+            for unit_circle_point in z.ravel()
         ]
-        return np.array(values).reshape(np.shape(frequency_hz))
+        return np.array(response_values).reshape(np.shape(frequency_hz))
 
     def _block_matrices(self) -> tuple[Real, Real, Real, Real]:
         """Return the matrices that compute the response of a block of L ticks.
@@ -251,23 +256,27 @@ class ClosedLoop:
         free_response = np.empty((_BLOCK_TICKS, _OUTPUT_ROWS, n))  # c aⁱ
         reference_drive = np.empty((_BLOCK_TICKS, n))  # aⁱ b, turned round at the end
         free_response[0], reference_drive[0] = self.c, self.b
-        power, rows_done = self.a, 1
+        matrix_power, rows_done = self.a, 1
         while rows_done < _BLOCK_TICKS:  # doubling: rows i + done from rows i
-            free_response[rows_done : 2 * rows_done] = free_response[:rows_done] @ power
-            reference_drive[rows_done : 2 * rows_done] = reference_drive[:rows_done] @ power.T
-            power = power @ power
+            free_response[rows_done : 2 * rows_done] = free_response[:rows_done] @ matrix_power
+            reference_drive[rows_done : 2 * rows_done] = (
+                reference_drive[:rows_done] @ matrix_power.T
+            )
+            matrix_power = matrix_power @ matrix_power
             rows_done *= 2
-        impulse = np.empty((_OUTPUT_ROWS, _BLOCK_TICKS))
-        impulse[:, 0] = self.d
-        impulse[:, 1:] = reference_drive[:-1].dot(self.c.T).T
+        impulse_response = np.empty((_OUTPUT_ROWS, _BLOCK_TICKS))
+        impulse_response[:, 0] = self.d
+        impulse_response[:, 1:] = reference_drive[:-1].dot(self.c.T).T
         forced_response = np.zeros((_OUTPUT_ROWS, _BLOCK_TICKS, _BLOCK_TICKS))
-        for tick in range(_BLOCK_TICKS):
-            forced_response[:, tick, tick:] = impulse[:, : _BLOCK_TICKS - tick]
+        for tick_number in range(_BLOCK_TICKS):
+            forced_response[:, tick_number, tick_number:] = impulse_response[
+                :, : _BLOCK_TICKS - tick_number
+            ]
         free_by_row = np.ascontiguousarray(free_response.transpose(1, 2, 0))
         return (
             free_by_row,
             forced_response,
-            np.ascontiguousarray(power),
+            np.ascontiguousarray(matrix_power),
             reference_drive[::-1].copy(),
         )
 
@@ -313,11 +322,11 @@ def close_loop(model: LoopModel) -> ClosedLoop:
             stiffness_offsets=model.stiffness_offsets,
         )
     )
-    plant = _DiscretePlant(model, realisation)
-    n = plant.a.shape[0]
+    discrete_plant = _DiscretePlant(model, realisation)
+    n = discrete_plant.a.shape[0]
 
     # States: plant, integral, derivative, two low-pass filters of the reference.
-    integral, derivative, filter_once, filter_twice = range(n, n + 4)
+    integral_index, derivative_index, first_filter_index, second_filter_index = range(n, n + 4)
     period_s = 1.0 / model.rate_hz
     integral_gain = gains.ki_nm_per_rad_s * period_s
     derivative_decay, derivative_gain = derivative_coefficients(gains, model.rate_hz)
@@ -325,65 +334,73 @@ def close_loop(model: LoopModel) -> ClosedLoop:
 
     a = np.zeros((n + 4, n + 4))
     b = np.zeros(n + 4)
-    measured_angle, measured_torque, command = np.zeros((3, n + 4))
-    measured_angle[:n] = plant.measured_angle
-    measured_torque[:n] = plant.measured_torque
-    command[:n] = plant.b
+    measured_angle_row, measured_torque_row, command_column = np.zeros((3, n + 4))
+    measured_angle_row[:n] = discrete_plant.measured_angle
+    measured_torque_row[:n] = discrete_plant.measured_torque
+    command_column[:n] = discrete_plant.b
 
     # The integral carries Ki T/2 of the last error, the derivative its decayed last step.
     torque_from_angle = -(kp + 0.5 * integral_gain + derivative_gain)
     torque_from_reference = kp * b_p + 0.5 * integral_gain + derivative_gain * b_d
-    torque = torque_from_angle * measured_angle + settings.feedforward_gain * measured_torque
-    torque[[integral, derivative]] = 1.0
+    torque_row = (
+        torque_from_angle * measured_angle_row + settings.feedforward_gain * measured_torque_row
+    )
+    torque_row[[integral_index, derivative_index]] = 1.0
 
-    from_angle = torque_from_angle * command
-    from_angle[integral] = -integral_gain
-    from_angle[derivative] = -(derivative_decay - 1.0) * derivative_gain
-    cuts = (
-        CutSignal("torque command", command, torque),
-        CutSignal("angle reading", from_angle, measured_angle),
-        CutSignal("torque reading", settings.feedforward_gain * command, measured_torque),
+    angle_action = torque_from_angle * command_column
+    angle_action[integral_index] = -integral_gain
+    angle_action[derivative_index] = -(derivative_decay - 1.0) * derivative_gain
+    cut_signals = (
+        CutSignal("torque command", command_column, torque_row),
+        CutSignal("angle reading", angle_action, measured_angle_row),
+        CutSignal(
+            "torque reading", settings.feedforward_gain * command_column, measured_torque_row
+        ),
     )
 
-    a[:n, :n] = plant.a
-    a[:n] += np.outer(plant.b, torque)
-    b[:n] = plant.b * torque_from_reference
-    a[integral] = -integral_gain * measured_angle
-    a[integral, integral] += 1.0
-    b[integral] = integral_gain
-    a[derivative] = -(derivative_decay - 1.0) * derivative_gain * measured_angle
-    a[derivative, derivative] += derivative_decay
-    b[derivative] = (derivative_decay - 1.0) * derivative_gain * b_d
+    a[:n, :n] = discrete_plant.a
+    a[:n] += np.outer(discrete_plant.b, torque_row)
+    b[:n] = discrete_plant.b * torque_from_reference
+    a[integral_index] = -integral_gain * measured_angle_row
+    a[integral_index, integral_index] += 1.0
+    b[integral_index] = integral_gain
+    a[derivative_index] = -(derivative_decay - 1.0) * derivative_gain * measured_angle_row
+    a[derivative_index, derivative_index] += derivative_decay
+    b[derivative_index] = (derivative_decay - 1.0) * derivative_gain * b_d
 
     # Low-pass filters: output = state + gain · input, next state = decay · output + gain · input.
-    decay, gain = lowpass_coefficients(settings, model.rate_hz)
-    a[filter_once, filter_once] = decay
-    b[filter_once] = gain * (decay + 1.0)
-    a[filter_twice, filter_twice] = decay
-    a[filter_twice, filter_once] = gain * (decay + 1.0)
-    b[filter_twice] = gain * gain * (decay + 1.0)
-    speed = np.zeros(n + 4)
-    speed[filter_once], speed[filter_twice] = (
-        settings.pole_rad_s * (1.0 - gain),
+    lowpass_decay, lowpass_gain = lowpass_coefficients(settings, model.rate_hz)
+    a[first_filter_index, first_filter_index] = lowpass_decay
+    b[first_filter_index] = lowpass_gain * (lowpass_decay + 1.0)
+    a[second_filter_index, second_filter_index] = lowpass_decay
+    a[second_filter_index, first_filter_index] = lowpass_gain * (lowpass_decay + 1.0)
+    b[second_filter_index] = lowpass_gain * lowpass_gain * (lowpass_decay + 1.0)
+    speed_row = np.zeros(n + 4)
+    speed_row[first_filter_index], speed_row[second_filter_index] = (
+        settings.pole_rad_s * (1.0 - lowpass_gain),
         -settings.pole_rad_s,
     )
-    speed_from_reference = settings.pole_rad_s * (gain - gain * gain)
+    speed_from_reference = settings.pole_rad_s * (lowpass_gain - lowpass_gain * lowpass_gain)
 
     c = np.zeros((_OUTPUT_ROWS, n + 4))
-    c[0, :n], c[1, :n], c[4, :n] = plant.angle, plant.velocity, plant.sensor_torque
-    c[2], c[3] = torque, speed
+    c[0, :n], c[1, :n], c[4, :n] = (
+        discrete_plant.angle,
+        discrete_plant.velocity,
+        discrete_plant.sensor_torque,
+    )
+    c[2], c[3] = torque_row, speed_row
     d = np.array([0.0, 0.0, torque_from_reference, speed_from_reference, 0.0])
 
-    poles = continuous_poles(a, model.rate_hz)
+    loop_poles = continuous_poles(a, model.rate_hz)
     return ClosedLoop(
         a,
         b,
         c,
         d,
         model,
-        cuts,
-        poles[np.argsort(-poles.real)],
-        np.append(plant.shaft_torque, np.zeros(4)),
+        cut_signals,
+        loop_poles[np.argsort(-loop_poles.real)],
+        np.append(discrete_plant.shaft_torque, np.zeros(4)),
         realisation,
     )
 
@@ -404,8 +421,8 @@ def continuous_poles(a: Real, rate_hz: float) -> Complex:
     return poles
 
 
-def check_stability(loop: ClosedLoop) -> str | None:
-    """Check the stability of a closed loop before the motor moves.
+def check_stability(closed_loop: ClosedLoop) -> str | None:
+    """Return a warning if a closed loop is slightly unstable, or None; raise if it is more so.
 
     Returns
     -------
@@ -418,29 +435,32 @@ def check_stability(loop: ClosedLoop) -> str | None:
         If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
         the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
-    remedy = _stability_remedy(loop.model.settings)
-    growth = loop.growth_per_s
-    instability = (
+    remedy_text = _stability_remedy(closed_loop.model.settings)
+    growth_rate_per_s = closed_loop.growth_per_s
+    instability_text = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
-        f"{loop.spectral_radius:.7f}): {_describe_pole(loop.poles_rad_s[0])} grows at "
-        f"{growth:.2g} /s"
+        f"{closed_loop.spectral_radius:.7f}): {_describe_pole(closed_loop.poles_rad_s[0])} grows "
+        f"at {growth_rate_per_s:.2g} /s"
     )
-    if growth > MAX_GROWTH_PER_S:
-        raise ControlDesignError(f"{instability}; {remedy}.")
-    if loop.model.beam is not None:
-        lightly_damped_loop = close_loop(lightly_damped_model(loop.model, loop.model.beam))
-        pole = lightly_damped_loop.least_damped()
-        if _damping_ratio(pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
+    if growth_rate_per_s > MAX_GROWTH_PER_S:
+        raise ControlDesignError(f"{instability_text}; {remedy_text}.")
+    if closed_loop.model.beam is not None:
+        lightly_damped_loop = close_loop(
+            lightly_damped_model(closed_loop.model, closed_loop.model.beam)
+        )
+        least_damped_pole = lightly_damped_loop.least_damped()
+        if _damping_ratio(least_damped_pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
                 "The closed loop is stable only by the beam's own damping: without it (spectral "
-                f"radius {lightly_damped_loop.spectral_radius:.7f}), {_describe_pole(pole)} grows "
-                f"at {pole.real:.2g} /s; {remedy}."
+                f"radius {lightly_damped_loop.spectral_radius:.7f}), "
+                f"{_describe_pole(least_damped_pole)} grows at {least_damped_pole.real:.2g} /s; "
+                f"{remedy_text}."
             )
-    if growth <= 0.0:
+    if growth_rate_per_s <= 0.0:
         return None
     return (
-        f"{instability}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost no "
-        "damping does that, so keep sessions short."
+        f"{instability_text}, which is accepted up to {MAX_GROWTH_PER_S:g} /s; a beam with almost "
+        "no damping does that, so keep sessions short."
     )
 
 
@@ -474,9 +494,9 @@ def stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
 
 @lru_cache(maxsize=4)
 def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
-    """Return the closed loop and its warning, cached by model."""
-    loop = close_loop(model)
-    return loop, check_stability(loop)
+    """Return the closed loop and the warning of `check_stability`, cached by loop model."""
+    closed_loop = close_loop(model)
+    return closed_loop, check_stability(closed_loop)
 
 
 def _stability_remedy(settings: ControlSettings) -> str:
@@ -494,7 +514,7 @@ def _stability_remedy(settings: ControlSettings) -> str:
 
 
 def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
-    """Return a loop's model in which the beam has almost no damping.
+    """Return the parameters of a closed loop, with almost no damping of the beam.
 
     Parameters
     ----------
@@ -510,12 +530,12 @@ def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
 
 
 def _damping_ratio(pole_rad_s: complex) -> float:
-    """Return the damping ratio of a pole."""
+    """Return the damping ratio of a pole in rad/s, as a fraction of critical damping."""
     return -pole_rad_s.real / abs(pole_rad_s)
 
 
 def _describe_pole(pole_rad_s: complex) -> str:
-    """Return frequency and damping ratio of a pole as text."""
+    """Return frequency in Hz and damping ratio of a pole, as text for a message."""
     frequency_hz = abs(pole_rad_s.imag) / (2.0 * pi)
     return f"a mode at {frequency_hz:.3g} Hz with damping ratio {_damping_ratio(pole_rad_s):.2g}"
 
@@ -528,85 +548,89 @@ class _DiscretePlant:
     """
 
     def __init__(self, model: LoopModel, realisation: Realisation | None) -> None:
-        coupled = couple(
+        coupled_plant = couple(
             realisation,
             motor_inertia_kg_m2=model.motor_inertia_kg_m2,
             viscous_nm_s_per_rad=model.viscous_nm_s_per_rad,
             tool_inertia_kg_m2=model.tool_inertia_kg_m2,
         )
         period_s = 1.0 / model.rate_hz
-        whole_periods, remainder = _split_delay(
+        whole_periods, period_fraction = _split_delay(
             model.actuation_delay_s, period_s, "actuation.delay_s"
         )
         angle_chain = _split_delay(model.angle_delay_s, period_s, "encoder.delay_s")
         torque_chain = _split_delay(model.torque_delay_s, period_s, "sensor.delay_s")
-        n = coupled.b.size
-        commands = whole_periods + 1
-        lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
-        size = n + commands + sum(lengths)
+        n = coupled_plant.b.size
+        command_count = whole_periods + 1
+        chain_lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
+        state_size = n + command_count + sum(chain_lengths)
 
         # Columns of the torque before and after the switch within a period. Without a whole period
         # of delay the command after it is the tick's own: the input column, last.
         column_before = n + whole_periods
-        column_after = column_before - 1 if whole_periods else size
-        switch_s = remainder * period_s
-        extended_matrix = np.zeros((size, size + 1))
+        column_after = column_before - 1 if whole_periods else state_size
+        switch_s = period_fraction * period_s
+        extended_matrix = np.zeros((state_size, state_size + 1))
 
         def state_map_after(duration_s: float) -> tuple[Real, int]:
-            """Return the linear map to the state at a time after a tick, shape (n, size + 1).
+            """Return the linear map to the state at a time after a tick, shape (n, state_size + 1).
 
             The second result is the column of the torque that acts at that time.
             """
-            state, column = np.eye(n, size + 1), column_before
-            for interval_s, acting in (
+            state_map, torque_column = np.eye(n, state_size + 1), column_before
+            for interval_s, acting_column in (
                 (min(duration_s, switch_s), column_before),
                 (duration_s - switch_s, column_after),
             ):
                 if interval_s > 0.0:
-                    transition, torque_effect = propagator(coupled, interval_s)
-                    state = transition @ state
-                    state[:, acting] += torque_effect
-                    column = acting
-            return state, column
+                    transition, torque_effect = propagator(coupled_plant, interval_s)
+                    state_map = transition @ state_map
+                    state_map[:, acting_column] += torque_effect
+                    torque_column = acting_column
+            return state_map, torque_column
 
-        def reading_row(row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
-            """Return the row vector of a sensor's reading at a time after a tick, (size + 1,)."""
-            state, column = state_map_after(since_tick_s)
-            reading: Real = row @ state
-            reading[column] += per_torque
-            return reading
+        def reading_row(quantity_row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
+            """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
+            state_map, torque_column = state_map_after(since_tick_s)
+            chain_reading: Real = quantity_row @ state_map
+            chain_reading[torque_column] += per_torque
+            return chain_reading
 
         extended_matrix[:n] = state_map_after(period_s)[0]
-        self.shaft_torque = np.append(propagator(coupled, period_s)[1], np.zeros(size - n))
-        extended_matrix[n, size] = 1.0
-        for command in range(1, commands):
-            extended_matrix[n + command, n + command - 1] = 1.0
+        self.shaft_torque = np.append(
+            propagator(coupled_plant, period_s)[1], np.zeros(state_size - n)
+        )
+        extended_matrix[n, state_size] = 1.0
+        for command_index in range(1, command_count):
+            extended_matrix[n + command_index, n + command_index - 1] = 1.0
 
-        angle = (coupled.angle, 0.0)
-        sensor_torque = (coupled.sensor_torque, coupled.sensor_torque_per_torque)
-        self.angle = reading_row(*angle)[:size]
-        self.velocity = reading_row(coupled.velocity, 0.0)[:size]
-        self.sensor_torque = reading_row(*sensor_torque)[:size]
+        angle_row = (coupled_plant.angle, 0.0)
+        sensor_torque_row = (coupled_plant.sensor_torque, coupled_plant.sensor_torque_per_torque)
+        self.angle = reading_row(*angle_row)[:state_size]
+        self.velocity = reading_row(coupled_plant.velocity, 0.0)[:state_size]
+        self.sensor_torque = reading_row(*sensor_torque_row)[:state_size]
 
         measured_rows = []
-        first = n + commands
-        for (_, fraction), length, quantity, undelayed_row in (
-            (angle_chain, lengths[0], angle, self.angle),
-            (torque_chain, lengths[1], sensor_torque, self.sensor_torque),
+        chain_begin = n + command_count
+        for (_, fraction), chain_length, reading_quantity, undelayed_row in (
+            (angle_chain, chain_lengths[0], angle_row, self.angle),
+            (torque_chain, chain_lengths[1], sensor_torque_row, self.sensor_torque),
         ):
-            if length == 0:
+            if chain_length == 0:
                 measured_rows.append(undelayed_row)
                 continue
             # The chain's first link: the reading of the last tick, or one from the period since.
             periods_since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
-            extended_matrix[first] = reading_row(*quantity, periods_since_tick * period_s)
-            for link in range(first + 1, first + length):
-                extended_matrix[link, link - 1] = 1.0
-            measured_rows.append(np.eye(size)[first + length - 1])
-            first += length
+            extended_matrix[chain_begin] = reading_row(
+                *reading_quantity, periods_since_tick * period_s
+            )
+            for chain_link in range(chain_begin + 1, chain_begin + chain_length):
+                extended_matrix[chain_link, chain_link - 1] = 1.0
+            measured_rows.append(np.eye(state_size)[chain_begin + chain_length - 1])
+            chain_begin += chain_length
         self.measured_angle, self.measured_torque = measured_rows
-        self.a = extended_matrix[:, :size]
-        self.b = extended_matrix[:, size]
+        self.a = extended_matrix[:, :state_size]
+        self.b = extended_matrix[:, state_size]
 
 
 def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
@@ -614,12 +638,12 @@ def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]
 
     `key` is the delay's name in the message of the `ControlDesignError` for too long a delay.
     """
-    periods = delay_s / period_s
-    if periods > MAX_DELAY_PERIODS:
+    delay_periods = delay_s / period_s
+    if delay_periods > MAX_DELAY_PERIODS:
         raise ControlDesignError(
-            f"{key} = {delay_s:g} s is {periods:.4g} periods; at most {MAX_DELAY_PERIODS} can be "
-            "controlled over."
+            f"{key} = {delay_s:g} s is {delay_periods:.4g} periods; at most {MAX_DELAY_PERIODS} "
+            "can be controlled over."
         )
-    whole_periods = floor(periods + 1e-9)
-    remainder = periods - whole_periods
-    return whole_periods, remainder if remainder > 1e-9 else 0.0
+    whole_periods = floor(delay_periods + 1e-9)
+    period_fraction = delay_periods - whole_periods
+    return whole_periods, period_fraction if period_fraction > 1e-9 else 0.0

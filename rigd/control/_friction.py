@@ -29,7 +29,10 @@ class Disturbances:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class DisturbedResponse:
-    """Response of the closed loop with friction and noise, at each tick in several random draws."""
+    """Response of the closed loop with friction and noise: angle and mode torques at each tick.
+
+    There is one response for each of several random draws of the noise.
+    """
 
     angle_rad: Real
     """Angle of the output shaft in rad, shape (n, draws)."""
@@ -39,7 +42,7 @@ class DisturbedResponse:
 
 
 def simulate_disturbed(
-    loop: ClosedLoop,
+    closed_loop: ClosedLoop,
     reference_rad: Real,
     disturbances: Disturbances,
     *,
@@ -51,7 +54,7 @@ def simulate_disturbed(
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop with a beam.
     reference_rad
         Reference angle at each tick relative to the angle at rest, shape (n,).
@@ -64,36 +67,46 @@ def simulate_disturbed(
     seed
         Seed of the random numbers.
     """
-    realisation, settings = loop.realisation, loop.model.settings
+    realisation, settings = closed_loop.realisation, closed_loop.model.settings
     assert realisation is not None
-    command, angle_cut, torque_cut = loop.cuts
+    command_cut, angle_cut, torque_cut = closed_loop.cuts
     n, step_rad = reference_rad.size, disturbances.encoder_step_rad
-    random = np.random.default_rng(seed)
-    offset_rad = step_rad * random.uniform(-0.5, 0.5, draws)
-    noise = random.normal(0.0, disturbances.torque_noise_nm, (n, draws))
-    actions = np.stack([loop.b, command.action, torque_cut.action, angle_cut.action], axis=1)
-    rows = np.stack([loop.c[0], angle_cut.reading, loop.c[3]])
-    velocity, shaft_effect = loop.c[1], loop.shaft_torque[:, None]
-    speed_per_torque = float(velocity @ loop.shaft_torque)
+    random_numbers = np.random.default_rng(seed)
+    offset_rad = step_rad * random_numbers.uniform(-0.5, 0.5, draws)
+    torque_noise_nm = random_numbers.normal(0.0, disturbances.torque_noise_nm, (n, draws))
+    input_columns = np.stack(
+        [closed_loop.b, command_cut.action, torque_cut.action, angle_cut.action], axis=1
+    )
+    output_rows = np.stack([closed_loop.c[0], angle_cut.reading, closed_loop.c[3]])
+    velocity_row, shaft_effect = closed_loop.c[1], closed_loop.shaft_torque[:, None]
+    speed_per_torque = float(velocity_row @ closed_loop.shaft_torque)
 
-    angle_rad, inputs = np.empty((n, draws)), np.zeros((4, draws))
+    angle_rad, loop_inputs = np.empty((n, draws)), np.zeros((4, draws))
     # The pairs of states of the modes follow angle and velocity.
-    pairs = slice(2, 2 + 2 * modes)
+    mode_pairs = slice(2, 2 + 2 * modes)
     mode_states = np.empty((n, 2 * modes, draws))
-    x = np.zeros((loop.b.size, draws))
-    for tick, reference in enumerate(reference_rad):
-        angle_rad[tick], reading, speed = rows @ x
-        mode_states[tick] = x[pairs]
-        inputs[0] = reference
-        speed = (speed + loop.d[3] * reference) / settings.friction_velocity_rad_s
-        inputs[1] = settings.friction_compensation_nm * np.tanh(speed)
-        inputs[2] = noise[tick]
+    x = np.zeros((closed_loop.b.size, draws))
+    for tick_number, tick_reference_rad in enumerate(reference_rad):
+        angle_rad[tick_number], angle_reading_rad, friction_speed_rad_s = output_rows @ x
+        mode_states[tick_number] = x[mode_pairs]
+        loop_inputs[0] = tick_reference_rad
+        friction_speed_rad_s = (
+            friction_speed_rad_s + closed_loop.d[3] * tick_reference_rad
+        ) / settings.friction_velocity_rad_s
+        loop_inputs[1] = settings.friction_compensation_nm * np.tanh(friction_speed_rad_s)
+        loop_inputs[2] = torque_noise_nm[tick_number]
         if step_rad:
-            inputs[3] = step_rad * np.rint((reading + offset_rad) / step_rad) - offset_rad - reading
-        x = loop.a @ x + actions @ inputs
-        friction = (velocity @ x) / speed_per_torque
-        x -= shaft_effect * friction.clip(-disturbances.coulomb_nm, disturbances.coulomb_nm)
-    weight = np.hypot(*realisation.c[: 2 * modes].reshape(-1, 2).T)[:, None]
+            loop_inputs[3] = (
+                step_rad * np.rint((angle_reading_rad + offset_rad) / step_rad)
+                - offset_rad
+                - angle_reading_rad
+            )
+        x = closed_loop.a @ x + input_columns @ loop_inputs
+        friction_error_nm = (velocity_row @ x) / speed_per_torque
+        x -= shaft_effect * friction_error_nm.clip(
+            -disturbances.coulomb_nm, disturbances.coulomb_nm
+        )
+    mode_weights = np.hypot(*realisation.c[: 2 * modes].reshape(-1, 2).T)[:, None]
     return DisturbedResponse(
-        angle_rad, weight * np.hypot(mode_states[:, ::2], mode_states[:, 1::2])
+        angle_rad, mode_weights * np.hypot(mode_states[:, ::2], mode_states[:, 1::2])
     )

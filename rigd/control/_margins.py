@@ -87,7 +87,7 @@ class Margins:
     """Frequency in Hz of the smallest distance."""
 
 
-def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
+def loop_margins(closed_loop: ClosedLoop) -> tuple[Margins, ...]:
     """Return the stability margins at each signal at which the loop can be opened.
 
     An additional delay counts as a phase shift. That is exact for whole periods, and otherwise to
@@ -95,7 +95,7 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
 
     Parameters
     ----------
-    loop
+    closed_loop
         Stable loop; the margins of an unstable loop are meaningless.
 
     References
@@ -112,17 +112,17 @@ def loop_margins(loop: ClosedLoop) -> tuple[Margins, ...]:
     angle reading: modulus margin 0.47
     torque reading: modulus margin 0.25
     """
-    return tuple(_margins_at_cut(loop, cut) for cut in loop.cuts)
+    return tuple(_margins_at_cut(closed_loop, cut) for cut in closed_loop.cuts)
 
 
-def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex:
+def open_loop_gain(closed_loop: ClosedLoop, cut_signal: CutSignal, phase_rad: Real) -> Complex:
     """Return the complex gain L of the loop opened at one signal, at some frequencies.
 
     The sensitivity of the closed loop is ``1/(1 + L)``.
 
     Parameters
     ----------
-    loop, cut
+    closed_loop, cut_signal
         Closed loop, and one of its cuts.
     phase_rad
         Angular frequencies times the period, shape (m,); π is half the sampling rate.
@@ -132,57 +132,69 @@ def open_loop_gain(loop: ClosedLoop, cut: CutSignal, phase_rad: Real) -> Complex
     ndarray
         Complex gain, shape (m,).
     """
-    n = cut.action.size
-    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
-    gain = np.empty(phase_rad.shape, complex)
-    for first in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
-        z = np.exp(1j * phase_rad[first : first + _FREQUENCIES_AT_ONCE])[:, np.newaxis, np.newaxis]
-        action = np.broadcast_to(cut.action[:, np.newaxis], (z.size, n, 1))
-        states = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action)
-        gain[first : first + _FREQUENCIES_AT_ONCE] = -(states[:, :, 0] @ cut.reading)
-    return gain
+    n = cut_signal.action.size
+    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
+    complex_gain = np.empty(phase_rad.shape, complex)
+    for first_index in range(0, phase_rad.size, _FREQUENCIES_AT_ONCE):
+        z = np.exp(1j * phase_rad[first_index : first_index + _FREQUENCIES_AT_ONCE])[
+            :, np.newaxis, np.newaxis
+        ]
+        action_column = np.broadcast_to(cut_signal.action[:, np.newaxis], (z.size, n, 1))
+        state_responses = np.linalg.solve(z * np.eye(n) - open_loop_matrix, action_column)
+        complex_gain[first_index : first_index + _FREQUENCIES_AT_ONCE] = -(
+            state_responses[:, :, 0] @ cut_signal.reading
+        )
+    return complex_gain
 
 
-def _margins_at_cut(loop: ClosedLoop, cut: CutSignal) -> Margins:
-    """Return the stability margins of a loop at one signal."""
+def _margins_at_cut(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Margins:
+    """Return the stability margins of a closed loop opened at one signal."""
 
     def curve(phase_rad: Real) -> Complex:
-        return open_loop_gain(loop, cut, phase_rad)
+        return open_loop_gain(closed_loop, cut_signal, phase_rad)
 
-    rate_hz = loop.model.rate_hz
-    frequencies = _examined_frequencies(loop, cut)
-    gain = curve(frequencies)
+    rate_hz = closed_loop.model.rate_hz
+    angular_frequencies = _examined_frequencies(closed_loop, cut_signal)
+    complex_gain = curve(angular_frequencies)
 
-    crossing_phase, real_gain = _negative_real_crossings(curve, frequencies, gain)
-    factor = -1.0 / real_gain
-    gain_up_at, gain_up = _smallest_with_frequency(
-        crossing_phase, np.where(factor > 1.0, factor, inf)
+    crossing_phase_rad, real_gain = _negative_real_crossings(
+        curve, angular_frequencies, complex_gain
     )
-    gain_down_at, gain_down = _smallest_with_frequency(
-        crossing_phase, np.where(factor <= 1.0, -factor, inf)
+    gain_factors = -1.0 / real_gain
+    gain_up_phase_rad, gain_up = _smallest_with_frequency(
+        crossing_phase_rad, np.where(gain_factors > 1.0, gain_factors, inf)
+    )
+    gain_down_phase_rad, gain_down = _smallest_with_frequency(
+        crossing_phase_rad, np.where(gain_factors <= 1.0, -gain_factors, inf)
     )
 
-    unity_at = _sign_changes(lambda value: np.abs(value) - 1.0, curve, frequencies, gain)
-    lag_rad = (np.angle(curve(unity_at)) + pi) % (2.0 * pi)
-    phase_at, phase_rad = _smallest_with_frequency(
-        unity_at, np.minimum(lag_rad, 2.0 * pi - lag_rad)
+    unity_phase_rad = _sign_changes(
+        lambda value: np.abs(value) - 1.0, curve, angular_frequencies, complex_gain
     )
-    delay_at, delay_s = _smallest_with_frequency(unity_at, lag_rad / unity_at / rate_hz)
+    lag_rad = (np.angle(curve(unity_phase_rad)) + pi) % (2.0 * pi)
+    phase_margin_at_rad, phase_rad = _smallest_with_frequency(
+        unity_phase_rad, np.minimum(lag_rad, 2.0 * pi - lag_rad)
+    )
+    delay_phase_rad, delay_s = _smallest_with_frequency(
+        unity_phase_rad, lag_rad / unity_phase_rad / rate_hz
+    )
 
-    modulus_at, modulus = _distance_to_critical_point(curve, frequencies, gain)
-    to_hz = rate_hz / (2.0 * pi)
+    modulus_phase_rad, modulus = _distance_to_critical_point(
+        curve, angular_frequencies, complex_gain
+    )
+    phase_rad_to_hz = rate_hz / (2.0 * pi)
     return Margins(
-        cut=cut.name,
+        cut=cut_signal.name,
         gain_up=gain_up,
-        gain_up_hz=gain_up_at * to_hz,
+        gain_up_hz=gain_up_phase_rad * phase_rad_to_hz,
         gain_down=0.0 if gain_down == inf else -gain_down,
-        gain_down_hz=gain_down_at * to_hz,
+        gain_down_hz=gain_down_phase_rad * phase_rad_to_hz,
         phase_rad=min(phase_rad, pi),
-        phase_hz=phase_at * to_hz,
+        phase_hz=phase_margin_at_rad * phase_rad_to_hz,
         delay_s=delay_s,
-        delay_hz=delay_at * to_hz,
+        delay_hz=delay_phase_rad * phase_rad_to_hz,
         modulus=modulus,
-        modulus_hz=modulus_at * to_hz,
+        modulus_hz=modulus_phase_rad * phase_rad_to_hz,
     )
 
 
@@ -190,73 +202,101 @@ Curve = Callable[[Real], Complex]
 """Function that returns the open loop's gain at angular frequencies times the period."""
 
 
-def _examined_frequencies(loop: ClosedLoop, cut: CutSignal) -> Real:
-    """Return the examined angular frequencies times the period, in increasing order.
+def _examined_frequencies(closed_loop: ClosedLoop, cut_signal: CutSignal) -> Real:
+    """Return the frequencies at which margins are searched, in rad per tick, increasing.
 
     They are dense around the resonances of the open and the closed loop.
     """
-    open_loop_matrix = loop.a - np.outer(cut.action, cut.reading)
-    poles = np.concatenate([np.linalg.eigvals(matrix) for matrix in (open_loop_matrix, loop.a)])
-    poles = np.log(poles[np.abs(poles) > _MAX_DELAY_EIGENVALUE].astype(complex))
-    poles = poles[(poles.imag > 0.0) & (poles.imag < pi)]
-    half_width = np.maximum(np.abs(poles.real), _MIN_HALF_WIDTH * poles.imag)
-    offsets = half_width[:, np.newaxis] * np.concatenate(
+    open_loop_matrix = closed_loop.a - np.outer(cut_signal.action, cut_signal.reading)
+    resonance_poles = np.concatenate(
+        [np.linalg.eigvals(state_matrix) for state_matrix in (open_loop_matrix, closed_loop.a)]
+    )
+    resonance_poles = np.log(
+        resonance_poles[np.abs(resonance_poles) > _MAX_DELAY_EIGENVALUE].astype(complex)
+    )
+    resonance_poles = resonance_poles[(resonance_poles.imag > 0.0) & (resonance_poles.imag < pi)]
+    half_widths = np.maximum(np.abs(resonance_poles.real), _MIN_HALF_WIDTH * resonance_poles.imag)
+    frequency_offsets = half_widths[:, np.newaxis] * np.concatenate(
         [-_RESONANCE_OFFSETS, [0.0], _RESONANCE_OFFSETS]
     )
-    lowest = 2.0 * pi * _LOWEST_FREQUENCY
-    decade_grid = np.geomspace(lowest, pi, round(_FREQUENCIES_PER_DECADE * np.log10(pi / lowest)))
-    frequencies = np.concatenate([decade_grid, (poles.imag[:, np.newaxis] + offsets).ravel()])
-    return np.unique(frequencies[(frequencies >= lowest) & (frequencies <= pi)])
+    lowest_phase_rad = 2.0 * pi * _LOWEST_FREQUENCY
+    decade_grid = np.geomspace(
+        lowest_phase_rad, pi, round(_FREQUENCIES_PER_DECADE * np.log10(pi / lowest_phase_rad))
+    )
+    angular_frequencies = np.concatenate(
+        [decade_grid, (resonance_poles.imag[:, np.newaxis] + frequency_offsets).ravel()]
+    )
+    return np.unique(
+        angular_frequencies[(angular_frequencies >= lowest_phase_rad) & (angular_frequencies <= pi)]
+    )
 
 
-def _negative_real_crossings(curve: Curve, frequencies: Real, gain: Complex) -> tuple[Real, Real]:
+def _negative_real_crossings(
+    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
+) -> tuple[Real, Real]:
     """Return the frequencies at which the open loop's gain is real and negative, and the gains."""
-    crossings = _sign_changes(np.imag, curve, frequencies, gain)
+    crossings = _sign_changes(np.imag, gain_curve, phase_per_tick_rad, curve_gain)
     # The curve ends at frequency 0 and half the sampling rate, where the gain is always real.
     end_indices = [
-        end for end in (0, -1) if abs(gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(gain[end].real)
+        end
+        for end in (0, -1)
+        if abs(curve_gain[end].imag) < _MAX_IMAGINARY_RATIO * abs(curve_gain[end].real)
     ]
-    at = np.concatenate([crossings, frequencies[end_indices]])
-    real_gains = np.concatenate([curve(crossings).real, gain[end_indices].real])
-    return at[real_gains < 0.0], real_gains[real_gains < 0.0]
+    crossing_frequencies = np.concatenate([crossings, phase_per_tick_rad[end_indices]])
+    real_gains = np.concatenate([gain_curve(crossings).real, curve_gain[end_indices].real])
+    return crossing_frequencies[real_gains < 0.0], real_gains[real_gains < 0.0]
 
 
 def _sign_changes(
-    function: Callable[[Complex], Real], curve: Curve, frequencies: Real, gain: Complex
+    real_function: Callable[[Complex], Real],
+    gain_curve: Curve,
+    phase_per_tick_rad: Real,
+    curve_gain: Complex,
 ) -> Real:
     """Return the frequencies at which a real function of the open loop's gain changes its sign."""
-    is_negative = np.signbit(function(gain))
-    first = np.flatnonzero(is_negative[:-1] != is_negative[1:])
-    low, high = frequencies[first], frequencies[first + 1]
+    is_negative = np.signbit(real_function(curve_gain))
+    interval_indices = np.flatnonzero(is_negative[:-1] != is_negative[1:])
+    lower_frequencies, upper_frequencies = (
+        phase_per_tick_rad[interval_indices],
+        phase_per_tick_rad[interval_indices + 1],
+    )
     for _ in range(_BISECTIONS):
-        middle = 0.5 * (low + high)
-        is_before_zero = np.signbit(function(curve(middle))) == is_negative[first]
-        low, high = np.where(is_before_zero, middle, low), np.where(is_before_zero, high, middle)
-    zeros: Real = 0.5 * (low + high)
-    return zeros
+        middle_frequencies = 0.5 * (lower_frequencies + upper_frequencies)
+        is_before_zero = (
+            np.signbit(real_function(gain_curve(middle_frequencies)))
+            == is_negative[interval_indices]
+        )
+        lower_frequencies, upper_frequencies = (
+            np.where(is_before_zero, middle_frequencies, lower_frequencies),
+            np.where(is_before_zero, upper_frequencies, middle_frequencies),
+        )
+    zero_frequencies: Real = 0.5 * (lower_frequencies + upper_frequencies)
+    return zero_frequencies
 
 
-def _smallest_with_frequency(at: Real, values: Real) -> tuple[float, float]:
+def _smallest_with_frequency(
+    value_frequencies: Real, candidate_values: Real
+) -> tuple[float, float]:
     """Return the frequency of the smallest value, and the value; NaN and infinity if all are inf.
 
-    `at` contains the frequency of each value.
+    `value_frequencies` contains the frequency of each value.
     """
-    if values.size == 0 or values.min() == inf:
+    if candidate_values.size == 0 or candidate_values.min() == inf:
         return nan, inf
-    index = int(values.argmin())
-    return float(at[index]), float(values[index])
+    smallest_index = int(candidate_values.argmin())
+    return float(value_frequencies[smallest_index]), float(candidate_values[smallest_index])
 
 
 def _distance_to_critical_point(
-    curve: Curve, frequencies: Real, gain: Complex
+    gain_curve: Curve, phase_per_tick_rad: Real, curve_gain: Complex
 ) -> tuple[float, float]:
     """Return the frequency at which the open loop's gain is closest to -1, and the distance."""
     for _ in range(_REFINEMENTS):
-        nearest = int(np.abs(1.0 + gain).argmin())
-        low, high = (
-            frequencies[max(nearest - 1, 0)],
-            frequencies[min(nearest + 1, frequencies.size - 1)],
+        nearest_index = int(np.abs(1.0 + curve_gain).argmin())
+        lower_frequency, upper_frequency = (
+            phase_per_tick_rad[max(nearest_index - 1, 0)],
+            phase_per_tick_rad[min(nearest_index + 1, phase_per_tick_rad.size - 1)],
         )
-        frequencies = np.linspace(low, high, 21)
-        gain = curve(frequencies)
-    return _smallest_with_frequency(frequencies, np.abs(1.0 + gain))
+        phase_per_tick_rad = np.linspace(lower_frequency, upper_frequency, 21)
+        curve_gain = gain_curve(phase_per_tick_rad)
+    return _smallest_with_frequency(phase_per_tick_rad, np.abs(1.0 + curve_gain))

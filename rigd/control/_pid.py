@@ -19,7 +19,7 @@ from rigd.errors import UserError
 
 
 class ControlDesignError(UserError, ValueError):
-    """Error of a controller that cannot be designed, or whose closed loop is unstable."""
+    """Error if the angle controller cannot be designed, or its closed loop is unstable."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -102,8 +102,8 @@ def design_pid(
     >>> print(f"{gains.kp_nm_per_rad:.2f} N·m/rad, {gains.tracking_s * 1e3:.1f} ms")
     12.18 N·m/rad, 46.8 ms
     """
-    gain = 1.0 / motor_inertia_kg_m2
-    g = viscous_nm_s_per_rad * gain
+    motor_gain = 1.0 / motor_inertia_kg_m2
+    g = viscous_nm_s_per_rad * motor_gain
     p = pole_rad_s
     if p <= 4.0 * g / 15.0:
         raise ControlDesignError(
@@ -111,11 +111,11 @@ def design_pid(
             f"{g:g} rad/s; choose more than {4.0 * g / 15.0:.4g} rad/s."
         )
     a3 = 4.0 * p - g
-    a2 = (6.0 * p**2 - 4.0 * p * g + g**2) / gain
-    a1 = 4.0 * p**3 / gain
-    a0 = p**4 / gain
-    b1 = 2.0 * p**3 / gain
-    b2 = p**2 / gain
+    a2 = (6.0 * p**2 - 4.0 * p * g + g**2) / motor_gain
+    a1 = 4.0 * p**3 / motor_gain
+    a0 = p**4 / motor_gain
+    b1 = 2.0 * p**3 / motor_gain
+    b2 = p**2 / motor_gain
     ki = a0 / a3
     kp = (a1 - ki) / a3
     kd = (a2 - kp) / a3
@@ -243,48 +243,50 @@ class PidController:
         coupling_torque_nm
             Measured coupling torque, which is fed forward.
         """
-        error = reference_rad - angle_rad
-        weighted_error = self._setpoint_weight_d * reference_rad - angle_rad
-        proportional = self._proportional_gain * (
+        error_rad = reference_rad - angle_rad
+        weighted_error_rad = self._setpoint_weight_d * reference_rad - angle_rad
+        proportional_nm = self._proportional_gain * (
             self._setpoint_weight_p * reference_rad - angle_rad
         )
-        integral = self.integral_nm + self._half_integral_gain * (error + self._last_error)
-        derivative = self._derivative_decay * self.derivative_nm + self._derivative_gain * (
-            weighted_error - self._last_weighted_error
+        integral_nm = self.integral_nm + self._half_integral_gain * (error_rad + self._last_error)
+        derivative_nm = self._derivative_decay * self.derivative_nm + self._derivative_gain * (
+            weighted_error_rad - self._last_weighted_error
         )
-        feedforward = self._feedforward_gain * coupling_torque_nm
+        feedforward_nm = self._feedforward_gain * coupling_torque_nm
 
-        decay, gain = self._lowpass_decay, self._lowpass_gain
-        filtered_once = decay * self._filtered_once_rad + gain * (
+        lowpass_decay, lowpass_gain = self._lowpass_decay, self._lowpass_gain
+        filtered_once_rad = lowpass_decay * self._filtered_once_rad + lowpass_gain * (
             reference_rad + self._last_reference_rad
         )
-        filtered_twice = decay * self._filtered_twice_rad + gain * (
-            filtered_once + self._filtered_once_rad
+        filtered_twice_rad = lowpass_decay * self._filtered_twice_rad + lowpass_gain * (
+            filtered_once_rad + self._filtered_once_rad
         )
-        friction = self._friction_compensation_nm * tanh(
-            self._pole_rad_s * (filtered_once - filtered_twice) * self._inverse_friction_velocity
+        friction_nm = self._friction_compensation_nm * tanh(
+            self._pole_rad_s
+            * (filtered_once_rad - filtered_twice_rad)
+            * self._inverse_friction_velocity
         )
 
-        unlimited = proportional + integral + derivative + feedforward + friction
-        torque = unlimited
-        if unlimited > self.torque_limit_nm:
-            torque = self.torque_limit_nm
-        elif unlimited < -self.torque_limit_nm:
-            torque = -self.torque_limit_nm
+        unlimited_nm = proportional_nm + integral_nm + derivative_nm + feedforward_nm + friction_nm
+        torque_nm = unlimited_nm
+        if unlimited_nm > self.torque_limit_nm:
+            torque_nm = self.torque_limit_nm
+        elif unlimited_nm < -self.torque_limit_nm:
+            torque_nm = -self.torque_limit_nm
 
-        self._last_error = error
-        self._last_weighted_error = weighted_error
+        self._last_error = error_rad
+        self._last_weighted_error = weighted_error_rad
         self._last_reference_rad = reference_rad
-        self._filtered_once_rad = filtered_once
-        self._filtered_twice_rad = filtered_twice
-        self.proportional_nm = proportional
-        self.integral_nm = integral + self._tracking_gain * (torque - unlimited)
-        self.derivative_nm = derivative
-        self.feedforward_nm = feedforward
-        self.friction_nm = friction
-        self.unlimited_torque_nm = unlimited
-        self.saturated = torque != unlimited
-        return torque
+        self._filtered_once_rad = filtered_once_rad
+        self._filtered_twice_rad = filtered_twice_rad
+        self.proportional_nm = proportional_nm
+        self.integral_nm = integral_nm + self._tracking_gain * (torque_nm - unlimited_nm)
+        self.derivative_nm = derivative_nm
+        self.feedforward_nm = feedforward_nm
+        self.friction_nm = friction_nm
+        self.unlimited_torque_nm = unlimited_nm
+        self.saturated = torque_nm != unlimited_nm
+        return torque_nm
 
 
 def derivative_coefficients(gains: PidGains, rate_hz: float) -> tuple[float, float]:
@@ -303,5 +305,7 @@ def lowpass_coefficients(settings: ControlSettings, rate_hz: float) -> tuple[flo
     The decay and the gain belong to ``x[k] = decay x[k-1] + gain (u[k] + u[k-1])``, which is
     ``1/(1 + s/p)`` by Tustin's rule.
     """
-    step = settings.pole_rad_s / rate_hz
-    return (2.0 - step) / (2.0 + step), step / (2.0 + step)
+    pole_times_period = settings.pole_rad_s / rate_hz
+    return (2.0 - pole_times_period) / (2.0 + pole_times_period), pole_times_period / (
+        2.0 + pole_times_period
+    )

@@ -33,7 +33,7 @@ _SLOW_CORNER_OVER_MODE = 0.25
 
 @dataclass(frozen=True, slots=True)
 class DamperSettings:
-    """Settings of the active damping for one rig."""
+    """Settings of the active damping of one rig's beam: gain, lead and corners of the filters."""
 
     yield_rad_per_nm_s: float
     """Speed of the reference per torque of the beam."""
@@ -46,7 +46,7 @@ class DamperSettings:
 
 
 class VibrationDamper:
-    """Active damper, which moves the reference angle so that the beam's vibration decays.
+    """Active damper: moves the reference angle of the motor so that the beam's vibration decays.
 
     Parameters
     ----------
@@ -95,28 +95,32 @@ class _DampingLaw:
         self._slow_coefficient = 1.0 - exp(-settings.slow_rad_s / rate_hz)
 
     def advance(
-        self, state: tuple[_Signal, _Signal, _Signal], torque: _Signal
+        self, law_state: tuple[_Signal, _Signal, _Signal], torque_value: _Signal
     ) -> tuple[tuple[_Signal, _Signal, _Signal], _Signal]:
         """Compute one tick: return the next state, and the displacement of the reference in rad.
 
         The state consists of both filters and the leaky integral.
         """
-        fast, slow, leaky_integral = state
-        fast = fast + self._fast_coefficient * (torque - fast)
-        slow = slow + self._slow_coefficient * (fast - slow)
-        filtered_torque = fast - slow
+        fast_filter, slow_filter, leaky_integral = law_state
+        fast_filter = fast_filter + self._fast_coefficient * (torque_value - fast_filter)
+        slow_filter = slow_filter + self._slow_coefficient * (fast_filter - slow_filter)
+        filtered_torque = fast_filter - slow_filter
         leaky_integral = (
             leaky_integral - self._slow_coefficient * leaky_integral + self._gain * filtered_torque
         )
-        return (fast, slow, leaky_integral), -leaky_integral - self._lead * filtered_torque
+        return (
+            fast_filter,
+            slow_filter,
+            leaky_integral,
+        ), -leaky_integral - self._lead * filtered_torque
 
 
-def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
+def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     """Return the settings of the active damping for a rig, or None if none is stable.
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop of the rig.
 
     Returns
@@ -134,23 +138,26 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     from rigd.beam import undamped_frequencies_rad_s
     from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
 
-    model = loop.model
-    if model.beam is None:
+    loop_model = closed_loop.model
+    if loop_model.beam is None:
         return None
-    first_rad_s = float(undamped_frequencies_rad_s(model.beam, 1)[0])
+    first_rad_s = float(undamped_frequencies_rad_s(loop_model.beam, 1)[0])
     settings = DamperSettings(
-        yield_rad_per_nm_s=_DAMPING_STRENGTH / (model.beam.inertia_kg_m2 * first_rad_s),
-        lead_s=2.0 / model.settings.pole_rad_s,
+        yield_rad_per_nm_s=_DAMPING_STRENGTH / (loop_model.beam.inertia_kg_m2 * first_rad_s),
+        lead_s=2.0 / loop_model.settings.pole_rad_s,
         slow_rad_s=_SLOW_CORNER_OVER_MODE * first_rad_s,
-        fast_rad_s=4.0 * model.settings.pole_rad_s,
+        fast_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
-    stiffness = model.beam.bending_stiffness_n_m2
+    bending_stiffness_n_m2 = loop_model.beam.bending_stiffness_n_m2
     beams = [
-        replace(model.beam, bending_stiffness_n_m2=ratio * stiffness) for ratio in _STIFFNESS_RATIOS
+        replace(loop_model.beam, bending_stiffness_n_m2=stiffness_ratio * bending_stiffness_n_m2)
+        for stiffness_ratio in _STIFFNESS_RATIOS
     ]
-    loops = [close_loop(lightly_damped_model(model, beam)) for beam in beams]
+    loops = [close_loop(lightly_damped_model(loop_model, beam)) for beam in beams]
     for _ in range(_MAX_HALVINGS):
-        growth_rates_per_s = [damped_poles(each, settings).real.max() for each in loops]
+        growth_rates_per_s = [
+            damped_poles(damped_loop, settings).real.max() for damped_loop in loops
+        ]
         # The same growth as without it is allowed, on beams with almost no damping of their own.
         if max(growth_rates_per_s) <= MAX_GROWTH_PER_S:
             return settings
@@ -158,26 +165,26 @@ def design_damper(loop: "ClosedLoop") -> DamperSettings | None:
     return None
 
 
-def damped_poles(loop: "ClosedLoop", settings: DamperSettings) -> Complex:
+def damped_poles(closed_loop: "ClosedLoop", settings: DamperSettings) -> Complex:
     """Return the poles of a closed loop with active damping, in rad/s.
 
     Parameters
     ----------
-    loop
+    closed_loop
         Closed loop without active damping.
     settings
         Settings of the active damping.
     """
     from rigd.control._closed_loop import continuous_poles
 
-    n, rate_hz = loop.b.size, loop.model.rate_hz
-    reading = next(cut.reading for cut in loop.cuts if cut.name == "torque reading")
-    fast, slow, leaky_integral = np.eye(3, n + 3, n)
-    states, displacement = _DampingLaw(settings, rate_hz).advance(
-        (fast, slow, leaky_integral), np.append(reading, np.zeros(3))
+    n, rate_hz = closed_loop.b.size, closed_loop.model.rate_hz
+    torque_reading = next(cut.reading for cut in closed_loop.cuts if cut.name == "torque reading")
+    fast_row, slow_row, leaky_integral = np.eye(3, n + 3, n)
+    next_states, displacement = _DampingLaw(settings, rate_hz).advance(
+        (fast_row, slow_row, leaky_integral), np.append(torque_reading, np.zeros(3))
     )
     a = np.zeros((n + 3, n + 3))
-    a[:n, :n] = loop.a
-    a[:n] += np.outer(loop.b, displacement)
-    a[n:] = states
+    a[:n, :n] = closed_loop.a
+    a[:n] += np.outer(closed_loop.b, displacement)
+    a[n:] = next_states
     return continuous_poles(a, rate_hz)

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class ProbeSequence(SessionSequence):
-    """Steps of one probing move on connected devices.
+    """Run of one probing move, which measures the motor and the encoder, on connected devices.
 
     The parameters are those of a `SessionSequence`.
     """
@@ -38,13 +38,13 @@ class ProbeSequence(SessionSequence):
         scheduler: TickScheduler,
         standstill: StandstillMonitor,
         channels: Channels,
-        display: ReadingPublisher,
+        reading_publisher: ReadingPublisher,
         parent: Parent,
-        stop: StopRequest,
+        stop_request: StopRequest,
     ) -> None:
         super().__init__(
-            profile, (0.0,), cycle, clock, scheduler, standstill, channels, display, parent, stop,
-            Ending(),
+            profile, (0.0,), cycle, clock, scheduler, standstill, channels,
+            reading_publisher, parent, stop_request, Ending(),
         )  # fmt: skip
         self._rig = probed_rig(profile)
         self._move: ProbingMove | None = None
@@ -68,19 +68,21 @@ class ProbeSequence(SessionSequence):
         self._standstill.reset()
         cycle = self._cycle
         start_rad = cycle.angle_rad
-        move = ProbingMove(self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm)
+        probing_move = ProbingMove(
+            self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm
+        )
         cycle.encoder_watch = None  # the move itself compares angle and torques
         cycle.start(self._rest_spread_nm)
-        cycle.controller = cast("PidController", move)  # the cycle only steps it
+        cycle.controller = cast("PidController", probing_move)  # the cycle only steps it
         self._run_tick(start_rad, excused=True)  # enabling takes its time
-        self._move, self._last_tick = move, self._scheduler.tick
-        while move.end is None:
+        self._move, self._last_tick = probing_move, self._scheduler.tick
+        while probing_move.end is None:
             self._run_tick(cycle.angle_rad)
         cycle.torque_off()
-        return {"end": move.end.name} | estimate_probe(self._rig, move).as_dict()
+        return {"end": probing_move.end.name} | estimate_probe(self._rig, probing_move).as_dict()
 
     def _control_tick(self, reference_rad: float) -> SessionEnd | None:
-        """Run one tick of the probing move, and report missed ticks to it."""
+        """Run one tick of the probing move, and pass it the number of ticks missed before."""
         if self._move is not None:
             self._move.missed = max(0, self._scheduler.tick - self._last_tick - 1)
             self._last_tick = self._scheduler.tick

@@ -5,7 +5,7 @@ from rigd.safety.probing_move import ProbedRig
 
 
 def probed_rig(profile: Profile) -> ProbedRig:
-    """Return the data of a rig that its probing move needs: beam, motor, delays and limits.
+    """Return the data of a profile that a probing move needs: beam, motor, delays and limits.
 
     Parameters
     ----------

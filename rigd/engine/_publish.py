@@ -15,7 +15,7 @@ from rigd.session.layout import Status, pack_control_into, pack_sample_into, pac
 
 
 class ReadingPublisher:
-    """Publisher of the control process's readings in the shared state, several times a second.
+    """Writer of the control process's last readings to the shared state, several times a second.
 
     Parameters
     ----------
@@ -41,7 +41,7 @@ class ReadingPublisher:
         self._last_bits: tuple[int, tuple[int, ...]] | None = None
 
     def publish(self, cycle: Cycle, now_ns: int) -> None:
-        """Publish the control process's heartbeat and last readings in the shared state.
+        """Write the control process's heartbeat and last readings to the shared state.
 
         Parameters
         ----------
@@ -52,40 +52,54 @@ class ReadingPublisher:
         """
         shared_state = self._shared_state
         shared_state.beat(StateField.CONTROL_BEAT)
-        for field, value in (
+        for field, field_value in (
             (StateField.ANGLE_NRAD, cycle.angle_rad),
             (StateField.COUPLING_TORQUE_NNM, cycle.coupling_torque_nm),
             (StateField.TORQUE_COMMAND_NNM, cycle.torque_command_nm),
         ):
-            if isfinite(value):
-                shared_state[field] = round(value * 1e9)
-        drive, sensor = self._devices.drive.health(), self._devices.sensor.health()
-        self.doubts = [line.doubt for line in (drive, sensor) if line.doubt]
-        self.doubt_counts = [line.doubt_count for line in (drive, sensor) if line.doubt_count]
-        error_counts = [line.errors for line in (drive, sensor) if line.errors is not None]
+            if isfinite(field_value):
+                shared_state[field] = round(field_value * 1e9)
+        drive_health, sensor_health = self._devices.drive.health(), self._devices.sensor.health()
+        self.doubts = [
+            line_health.doubt for line_health in (drive_health, sensor_health) if line_health.doubt
+        ]
+        self.doubt_counts = [
+            line_health.doubt_count
+            for line_health in (drive_health, sensor_health)
+            if line_health.doubt_count
+        ]
+        error_counts = [
+            line_health.errors
+            for line_health in (drive_health, sensor_health)
+            if line_health.errors is not None
+        ]
         shared_state[StateField.BUS_ERRORS] = sum(error_counts) if error_counts else UNKNOWN
-        shared_state[StateField.SENSOR_STATUS] = UNKNOWN if sensor.status is None else sensor.status
-        self._publish_load((drive, sensor), now_ns)
+        shared_state[StateField.SENSOR_STATUS] = (
+            UNKNOWN if sensor_health.status is None else sensor_health.status
+        )
+        self._publish_load((drive_health, sensor_health), now_ns)
 
-    def _publish_load(self, lines: tuple[LineHealth, ...], now_ns: int) -> None:
-        """Publish the load of the busiest bus or serial line since the last call."""
-        bits = tuple(line.bits or 0 for line in lines)
+    def _publish_load(self, line_healths: tuple[LineHealth, ...], now_ns: int) -> None:
+        """Publish the load of the busiest bus or serial line since the last call, in ppm."""
+        line_bits = tuple(line_health.bits or 0 for line_health in line_healths)
         if self._last_bits is None:
             self._shared_state[StateField.BUS_LOAD_PPM] = UNKNOWN
         else:
             previous_ns, previous_bits = self._last_bits
             if now_ns <= previous_ns:
                 return  # virtual time has not advanced
-            ppm_s = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
+            ppm_seconds = 1e-15 * (now_ns - previous_ns)  # 1e-9 s, 1e-6
             loads_ppm = [
-                (now - then) / (line.bit_rate_bit_s * ppm_s)
-                for line, now, then in zip(lines, bits, previous_bits, strict=True)
-                if line.bit_rate_bit_s
+                (now - last_bits) / (line_health.bit_rate_bit_s * ppm_seconds)
+                for line_health, now, last_bits in zip(
+                    line_healths, line_bits, previous_bits, strict=True
+                )
+                if line_health.bit_rate_bit_s
             ]
             self._shared_state[StateField.BUS_LOAD_PPM] = (
                 round(max(loads_ppm)) if loads_ppm else UNKNOWN
             )
-        self._last_bits = now_ns, bits
+        self._last_bits = now_ns, line_bits
 
 
 # Samples of a record
@@ -162,7 +176,9 @@ class SampleLog:
         self._late_ns = late_ns
         self.counts = Counts()
 
-    def write(self, tick: int, reference_rad: float, missed: int, *, wait: bool) -> None:
+    def write(
+        self, tick: int, reference_rad: float, missed_ticks: int, *, wait_for_slot: bool
+    ) -> None:
         """Write the sample of the tick that was just run to the ring for the recorder.
 
         Parameters
@@ -171,35 +187,37 @@ class SampleLog:
             Number of the tick in the record.
         reference_rad
             Reference angle.
-        missed
+        missed_ticks
             Number of ticks that were missed directly before this tick.
-        wait
+        wait_for_slot
             Whether to wait for free space in a full ring, because nothing moves or time is
             virtual. Otherwise the sample is lost.
         """
         cycle, scheduler, ring = self._cycle, self._scheduler, self._ring
         lateness_ns = scheduler.lateness_ns
-        flags = cycle.flags
-        if missed:
-            flags |= _AFTER_MISSED
+        status_flags = cycle.flags
+        if missed_ticks:
+            status_flags |= _AFTER_MISSED
         if self.counts.lost:
-            flags |= _AFTER_LOST
-        offset = ring.next_slot()
-        if offset < 0 and (not wait or (offset := self._wait_for_free_slot()) < 0):
+            status_flags |= _AFTER_LOST
+        slot_offset = ring.next_slot()
+        if slot_offset < 0 and (
+            not wait_for_slot or (slot_offset := self._wait_for_free_slot()) < 0
+        ):
             self.counts.lost += 1
             self._shared_state[StateField.LOST] = self.counts.lost
             return
         if lateness_ns > self._late_ns:
-            flags |= _LATE
+            status_flags |= _LATE
             self.counts.late += 1
             self._shared_state[StateField.LATE] = self.counts.late
-        if flags & _STALE_FLAGS:
-            self._count_stale(flags)
+        if status_flags & _STALE_FLAGS:
+            self._count_stale(status_flags)
         t_ns = scheduler.t_ns
         fx, fy, fz, tx, ty, tz = cycle.wrench
         pack_sample_into(
             self._buffer,
-            offset,
+            slot_offset,
             t_ns,
             tick,
             reference_rad,
@@ -212,7 +230,7 @@ class SampleLog:
             tx,
             ty,
             tz,
-            flags,
+            status_flags,
             lateness_ns,
             self._clock.now_ns() - scheduler.due_ns - lateness_ns,
         )
@@ -222,25 +240,25 @@ class SampleLog:
         if tick % _TERMS_PERIOD_TICKS == 0:
             self._write_terms(tick, t_ns)
 
-    def _count_stale(self, flags: int) -> None:
-        """Count a tick with a stale angle or wrench, and publish the counts."""
+    def _count_stale(self, status_flags: int) -> None:
+        """Count a tick with a stale angle or wrench, and write the counts to the shared state."""
         counts, shared_state = self.counts, self._shared_state
-        if flags & _ANGLE_STALE:
+        if status_flags & _ANGLE_STALE:
             counts.stale_angles += 1
             shared_state[StateField.STALE_ANGLES] = counts.stale_angles
-        if flags & _WRENCH_STALE:
+        if status_flags & _WRENCH_STALE:
             counts.stale_wrenches += 1
             shared_state[StateField.STALE_WRENCHES] = counts.stale_wrenches
 
     def _write_ages(self, ring: Ring, tick: int, t_ns: int) -> None:
-        """Write the ages of a tick's readings to a ring, or nothing if the ring is full."""
-        offset = ring.next_slot()
-        if offset < 0:
+        """Write the ages of a tick's angle and wrench to a ring, unless the ring is full."""
+        slot_offset = ring.next_slot()
+        if slot_offset < 0:
             return  # dropped, like the terms
         due_ns, devices = self._scheduler.due_ns, self._cycle.devices
         pack_timing_into(
             ring.buffer,
-            offset,
+            slot_offset,
             t_ns,
             tick,
             (due_ns - devices.drive.angle_time_ns) * 1e-9,
@@ -249,33 +267,33 @@ class SampleLog:
         ring.publish()
 
     def _write_terms(self, tick: int, t_ns: int) -> None:
-        """Write the controller's terms of a tick to their ring, or nothing if it is full."""
-        ring, terms = self._terms_ring, self._cycle.controller
-        offset = ring.next_slot()
-        if offset < 0:
+        """Write the torques of a tick's PID terms to their ring, unless the ring is full."""
+        terms_ring, controller = self._terms_ring, self._cycle.controller
+        slot_offset = terms_ring.next_slot()
+        if slot_offset < 0:
             return  # dropped: the terms explain a record, but no analysis needs them
         pack_control_into(
-            ring.buffer,
-            offset,
+            terms_ring.buffer,
+            slot_offset,
             t_ns,
             tick,
-            terms.proportional_nm,
-            terms.integral_nm,
-            terms.derivative_nm,
-            terms.feedforward_nm,
-            terms.friction_nm,
-            terms.unlimited_torque_nm,
+            controller.proportional_nm,
+            controller.integral_nm,
+            controller.derivative_nm,
+            controller.feedforward_nm,
+            controller.friction_nm,
+            controller.unlimited_torque_nm,
         )
-        ring.publish()
+        terms_ring.publish()
 
     def _wait_for_free_slot(self) -> int:
-        """Wait for free space in the ring of samples, and return the offset of the next sample.
+        """Wait for free space in the ring of samples; return the byte offset of the next sample.
 
         Return -1 if the recorder has stopped reading.
         """
-        ring, recorder = self._ring, Heartbeat()
-        while (offset := ring.next_slot()) < 0:
-            if recorder.stalled_for(ring.read, time.monotonic()) > _FREE_SLOT_TIMEOUT_S:
+        ring, recorder_heartbeat = self._ring, Heartbeat()
+        while (slot_offset := ring.next_slot()) < 0:
+            if recorder_heartbeat.stalled_for(ring.read, time.monotonic()) > _FREE_SLOT_TIMEOUT_S:
                 break
             time.sleep(_FREE_SLOT_POLL_S)
-        return offset
+        return slot_offset

@@ -27,7 +27,7 @@ _WRITTEN_COUNTER, _READ_COUNTER = 0, 1
 
 @dataclass(frozen=True, slots=True)
 class RingSpec:
-    """Descriptor and layout of a ring, with which a child process attaches to it."""
+    """File descriptor and layout of a ring buffer, with which a child process attaches to it."""
 
     fd: int
     """File descriptor of the shared memory, which the child inherits."""
@@ -57,7 +57,7 @@ class Ring:
 
     @classmethod
     def create(cls, record_size: int, capacity: int, fd: int) -> Self:
-        """Return a new empty ring in shared memory.
+        """Return a new empty ring buffer in the shared memory of descriptor `fd`.
 
         Parameters
         ----------
@@ -118,19 +118,21 @@ class Ring:
 
         Only records that are contiguous in memory are returned.
         """
-        first = self._counters[_READ_COUNTER]
-        count = min(
+        oldest_record = self._counters[_READ_COUNTER]
+        record_count = min(
             max_records,
-            self._counters[_WRITTEN_COUNTER] - first,
-            self.capacity - first % self.capacity,
+            self._counters[_WRITTEN_COUNTER] - oldest_record,
+            self.capacity - oldest_record % self.capacity,
         )
-        start = HEADER_SIZE + first % self.capacity * self.record_size
-        block = bytes(self.buffer[start : start + count * self.record_size])
-        self._counters[_READ_COUNTER] = first + count
-        return block
+        start_offset = HEADER_SIZE + oldest_record % self.capacity * self.record_size
+        record_bytes = bytes(
+            self.buffer[start_offset : start_offset + record_count * self.record_size]
+        )
+        self._counters[_READ_COUNTER] = oldest_record + record_count
+        return record_bytes
 
     def discard(self) -> None:
-        """Discard all records that are not read yet, for a consumer that starts again."""
+        """Mark all records of the ring as read, for a consumer that begins with new records."""
         self._counters[_READ_COUNTER] = self._counters[_WRITTEN_COUNTER]
 
     def close(self) -> None:
@@ -141,7 +143,7 @@ class Ring:
 
 
 class Observer:
-    """Reader of a ring that never delays the producer, and counts the records that it missed.
+    """Reader of a ring that never delays the producer, and counts records overwritten unread.
 
     Parameters
     ----------
@@ -173,20 +175,22 @@ class Observer:
         The oldest record comes first.
         """
         ring = self._ring
-        oldest = ring.oldest
-        if self._next_index < oldest:
-            self.dropped += oldest - self._next_index
-            self._next_index = oldest
-        index = self._next_index % ring.capacity
-        count = min(max_records, ring.written - self._next_index, ring.capacity - index)
-        start = HEADER_SIZE + index * ring.record_size
-        block = bytes(ring.buffer[start : start + count * ring.record_size])
-        self._next_index += count
-        if ring.written - (self._next_index - count) >= ring.capacity:
+        oldest_record = ring.oldest
+        if self._next_index < oldest_record:
+            self.dropped += oldest_record - self._next_index
+            self._next_index = oldest_record
+        ring_slot = self._next_index % ring.capacity
+        record_count = min(max_records, ring.written - self._next_index, ring.capacity - ring_slot)
+        start_offset = HEADER_SIZE + ring_slot * ring.record_size
+        record_bytes = bytes(
+            ring.buffer[start_offset : start_offset + record_count * ring.record_size]
+        )
+        self._next_index += record_count
+        if ring.written - (self._next_index - record_count) >= ring.capacity:
             # The producer overtook the copy: none of it is reliable.
-            self.dropped += count
+            self.dropped += record_count
             return b""
-        return block
+        return record_bytes
 
 
 # Memory
@@ -194,15 +198,15 @@ class Observer:
 
 def shared_memory_fd() -> int:
     """Return a file descriptor of new shared memory of size 0, which child processes inherit."""
-    folder = "/dev/shm" if Path("/dev/shm").is_dir() else None
-    with tempfile.TemporaryFile(dir=folder) as file:
-        fd = os.dup(file.fileno())
+    memory_folder = "/dev/shm" if Path("/dev/shm").is_dir() else None
+    with tempfile.TemporaryFile(dir=memory_folder) as temporary_file:
+        fd = os.dup(temporary_file.fileno())
     os.set_inheritable(fd, True)
     return fd
 
 
-def reserve(fd: int, size: int) -> None:
-    """Allocate `size` bytes of shared memory at the descriptor `fd`.
+def reserve(fd: int, byte_count: int) -> None:
+    """Allocate `byte_count` bytes of shared memory at the descriptor `fd`.
 
     Raises
     ------
@@ -211,6 +215,6 @@ def reserve(fd: int, size: int) -> None:
         bus error.
     """
     if hasattr(os, "posix_fallocate"):
-        os.posix_fallocate(fd, 0, size)
+        os.posix_fallocate(fd, 0, byte_count)
     else:
-        os.ftruncate(fd, size)
+        os.ftruncate(fd, byte_count)

@@ -100,7 +100,7 @@ class SessionEnd(Exception):
 
 
 class SessionSequence:
-    """Steps of one session on connected devices, from the tare to the check of the tare.
+    """Steps of one session on connected devices, from the tare to the final check of the zero.
 
     Parameters
     ----------
@@ -114,17 +114,17 @@ class SessionSequence:
         Check of the angles that are read without torque.
     channels
         Rings for samples, the controller's terms and events.
-    display
+    reading_publisher
         Publisher of the readings.
     parent
         Connection to the supervisor process.
-    stop
+    stop_request
         Stop signals that this process received itself.
     ending
         Steps after the record.
     touch
         Detector of touches, or None if the session does not search for an obstacle.
-    reader
+    reference_reader
         Reader of a reference that grows during the record, or None if the reference is complete.
     """
 
@@ -137,23 +137,23 @@ class SessionSequence:
         scheduler: TickScheduler,
         standstill: StandstillMonitor,
         channels: Channels,
-        display: ReadingPublisher,
+        reading_publisher: ReadingPublisher,
         parent: Parent,
-        stop: StopRequest,
+        stop_request: StopRequest,
         ending: Ending,
         touch: "TouchWatch | None" = None,
-        reader: ReferenceReader | None = None,
+        reference_reader: ReferenceReader | None = None,
     ) -> None:
         self._touch = touch
-        self._reader = reader
-        self._display = display
+        self._reader = reference_reader
+        self._display = reading_publisher
         self._profile = profile
         self._cycle = cycle
         self._clock = clock
         self._channels = channels
         self._shared_state = channels.shared_state
         self._parent = parent
-        self._stop = stop
+        self._stop = stop_request
         self._rate_hz = profile.rig.rate_hz
         self._scheduler = scheduler
         self._standstill = standstill
@@ -180,7 +180,7 @@ class SessionSequence:
         """Results for the metadata ``outcome`` of the file, in addition to the counts."""
 
     def tare(self) -> dict[str, str]:
-        """Measure the sensor's zero at rest before the drive is enabled, and return it as metadata.
+        """Measure the wrench at rest before the drive is enabled, and return it as file metadata.
 
         Returns
         -------
@@ -194,8 +194,8 @@ class SessionSequence:
             from its present angle.
         """
         self._cycle.watch.reset(0.0)  # the counts of the last session no longer apply
-        rest = self._wait_for_rest()
-        self._start_angle_rad = float(np.mean(rest.angles_rad))
+        rest_readings = self._wait_for_rest()
+        self._start_angle_rad = float(np.mean(rest_readings.angles_rad))
         limit_rad = self._profile.limits.angle_rad
         if abs(self._start_angle_rad) > limit_rad:
             raise SessionEnd(
@@ -215,17 +215,17 @@ class SessionSequence:
                 "back first (rigd run move 0; rigd start move 0 with a daemon), or lower the "
                 "amplitude.",
             )
-        failed = self._cycle.sensor_watch.finish_learning()
+        sensor_violation = self._cycle.sensor_watch.finish_learning()
         self._report_warnings()
-        if failed is not None:
-            raise SessionEnd("fault", str(failed))
-        self._rest_spread_nm = rest.torque_spread_nm
-        self._compare_with_tare_before(float(rest.torques_nm.mean()))
-        self._cycle.tare = rest.mean
-        return rest.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
+        if sensor_violation is not None:
+            raise SessionEnd("fault", str(sensor_violation))
+        self._rest_spread_nm = rest_readings.torque_spread_nm
+        self._compare_with_tare_before(float(rest_readings.torques_nm.mean()))
+        self._cycle.tare = rest_readings.mean
+        return rest_readings.as_metadata() | {"start_angle_rad": repr(self._start_angle_rad)}
 
     def _compare_with_tare_before(self, zero_nm: float) -> None:
-        """End the session if the torque's zero differs too much from that of the last tare."""
+        """Raise `SessionEnd` if the torque at rest, in N·m, differs too much from the last tare."""
         watch = self._cycle.watch
         if watch.tared_nm is not None:
             violation = watch.check_tare(zero_nm - watch.tared_nm)
@@ -241,38 +241,39 @@ class SessionSequence:
 
         Raise `SessionEnd` if the rig does not come to rest within ``session.rest_timeout_s``.
         """
-        settings = self._profile.session
+        session_settings = self._profile.session
         self._shared_state[StateField.PHASE] = Phase.TARING
-        remaining_s = settings.rest_timeout_s
+        remaining_s = session_settings.rest_timeout_s
         while True:
             self._cycle.sensor_watch.learn()
-            rest = self._read_rest(settings.tare_s)
-            motion = self._describe_motion(rest)
-            if not motion:
-                return rest
-            remaining_s -= rest.duration_s
+            rest_readings = self._read_rest(session_settings.tare_s)
+            motion_text = self._describe_motion(rest_readings)
+            if not motion_text:
+                return rest_readings
+            remaining_s -= rest_readings.duration_s
             if remaining_s <= 0.0:
                 raise SessionEnd(
                     "fault",
-                    f"{motion} It did not come to rest within session.rest_timeout_s = "
-                    f"{settings.rest_timeout_s:g} s; wait until it is at rest and start again.",
+                    f"{motion_text} It did not come to rest within session.rest_timeout_s = "
+                    f"{session_settings.rest_timeout_s:g} s; wait until it is at rest and "
+                    "start again.",
                 )
             if self._shared_state[StateField.PHASE] != Phase.WAITING:
                 self._shared_state[StateField.PHASE] = Phase.WAITING
-                self._log_event("info", f"Waiting until the rig is at rest. {motion}")
+                self._log_event("info", f"Waiting until the rig is at rest. {motion_text}")
 
-    def _describe_motion(self, rest: RestReadings) -> str:
+    def _describe_motion(self, rest_readings: RestReadings) -> str:
         """Return a sentence that says how motor or beam moves, or an empty text if both rest."""
         settings = self._profile.session
-        if rest.speed_rad_s > settings.rest_velocity_rad_s:
+        if rest_readings.speed_rad_s > settings.rest_velocity_rad_s:
             return (
-                f"The motor is not at rest: it moves by {rest.speed_rad_s:.2g} rad/s, more than "
-                f"session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s."
+                f"The motor is not at rest: it moves by {rest_readings.speed_rad_s:.2g} rad/s, "
+                f"more than session.rest_velocity_rad_s = {settings.rest_velocity_rad_s:g} rad/s."
             )
-        if rest.torque_spread_nm > settings.rest_torque_nm:
+        if rest_readings.torque_spread_nm > settings.rest_torque_nm:
             return (
                 f"The beam is not at rest: the coupling torque varies by "
-                f"{rest.torque_spread_nm:.2g} N·m, more than session.rest_torque_nm = "
+                f"{rest_readings.torque_spread_nm:.2g} N·m, more than session.rest_torque_nm = "
                 f"{settings.rest_torque_nm:g} N·m."
             )
         return ""
@@ -284,12 +285,12 @@ class SessionSequence:
         # The last reading, not the mean: the controller must start without a step.
         self._start_angle_rad = self._cycle.angle_rad
         self._cycle.start(self._rest_spread_nm)
-        for number in range(round(_SETTLING_S * self._rate_hz)):
+        for tick_number in range(round(_SETTLING_S * self._rate_hz)):
             # Enabling the drive before the first tick takes longer than a tick.
-            self._run_tick(self._start_angle_rad, excused=number == 0)
+            self._run_tick(self._start_angle_rad, excused=tick_number == 0)
 
     def wait_for_go(self) -> None:
-        """Hold the motor until the supervisor reports that the recorder is ready.
+        """Hold the motor until the supervisor requests the start of the record.
 
         Virtual time does not advance meanwhile.
 
@@ -299,9 +300,9 @@ class SessionSequence:
             If the supervisor does not report this within 10 s, although its process may exist.
         """
         self._shared_state[StateField.PHASE] = Phase.READY
-        deadline = time.monotonic() + _START_TIMEOUT_S
+        deadline_s = time.monotonic() + _START_TIMEOUT_S
         while not self._shared_state[StateField.GO]:
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline_s:
                 raise SessionEnd(
                     "fault",
                     f"The supervisor did not start the record within {_START_TIMEOUT_S:g} s. "
@@ -325,85 +326,93 @@ class SessionSequence:
             If the record ends early. The torque is off in the last sample, unless the record ends
             in missed or lost ticks.
         """
-        reference, start_rad = self._relative_reference, self._start_angle_rad
-        total_ticks = len(reference)
+        relative_reference_rad, start_rad = self._relative_reference, self._start_angle_rad
+        total_ticks = len(relative_reference_rad)
         scheduler, cycle, log, shared_state = (
             self._scheduler,
             self._cycle,
             self._sample_log,
             self._shared_state,
         )
-        counts, virtual, signals = self.counts, self._clock.virtual, self._stop
-        touch, reader = self._touch, self._reader
-        stop, scheduled = (
+        counts, is_virtual, stop_request = self.counts, self._clock.virtual, self._stop
+        touch_watch, reader = self._touch, self._reader
+        stop_field, scheduled_field = (
             shared_state.view(StateField.STOP),
             shared_state.view(StateField.SCHEDULED),
         )
         scheduler.restart()
         self._recording = True
         self._page_faults = page_faults()
-        wall_ns, before_ns = time.time_ns(), time.monotonic_ns()
+        start_utc_ns, start_monotonic_ns = time.time_ns(), time.monotonic_ns()
         # With the real clock tick 0 is still ahead, or up to one period in the past.
-        ahead_ns = 0 if virtual else scheduler.start_ns - before_ns
-        shared_state[StateField.START_UTC_NS] = wall_ns + ahead_ns
+        until_start_ns = 0 if is_virtual else scheduler.start_ns - start_monotonic_ns
+        shared_state[StateField.START_UTC_NS] = start_utc_ns + until_start_ns
         shared_state[StateField.PHASE] = Phase.RUNNING
         self._log_event("info", f"Record starts: {total_ticks} ticks at {self._rate_hz:g} Hz.")
-        last = -1
+        last_tick = -1
         first_ns = last_ns = 0
         reference_rad = start_rad
         end: SessionEnd | None = None
-        while end is None and last < total_ticks - 1:
+        while end is None and last_tick < total_ticks - 1:
             if reader is not None:
-                if virtual:
-                    self._await_segment(reader, last + 1)
-                if reader.is_after_end(last + 1):
+                if is_virtual:
+                    self._await_segment(reader, last_tick + 1)
+                if reader.is_after_end(last_tick + 1):
                     break
-            missed = scheduler.wait()
-            tick = scheduler.tick
-            if missed:
-                missed = min(tick, total_ticks) - last - 1
-                counts.missed += missed
+            missed_ticks = scheduler.wait()
+            tick_number = scheduler.tick
+            if missed_ticks:
+                missed_ticks = min(tick_number, total_ticks) - last_tick - 1
+                counts.missed += missed_ticks
                 shared_state[StateField.MISSED] = counts.missed
-                end = self._check_missed_ticks(missed, min(tick, total_ticks))
-                if tick >= total_ticks:
-                    last, reference_rad = total_ticks - 1, start_rad + reference[-1]
+                end = self._check_missed_ticks(missed_ticks, min(tick_number, total_ticks))
+                if tick_number >= total_ticks:
+                    last_tick, reference_rad = (
+                        total_ticks - 1,
+                        start_rad + relative_reference_rad[-1],
+                    )
                     break
             if end is None and cycle.stale:  # in the tick before
-                end = self._check_stale_readings(tick)
+                end = self._check_stale_readings(tick_number)
             if end is None and (
-                stop[0] or counts.lost or signals.requested or tick % SLOW_CHECK_TICKS == 0
+                stop_field[0]
+                or counts.lost
+                or stop_request.requested
+                or tick_number % SLOW_CHECK_TICKS == 0
             ):
                 end = self._poll()
             reference_rad = start_rad + (
-                reference[tick] if reader is None else reader.reference_at(tick)
+                relative_reference_rad[tick_number]
+                if reader is None
+                else reader.reference_at(tick_number)
             )
             if end is None:
                 end = self._control_tick(reference_rad)
-                if touch is not None and end is None:
-                    end = self._watch_touch(touch, tick, missed)
+                if touch_watch is not None and end is None:
+                    end = self._watch_touch(touch_watch, tick_number, missed_ticks)
             else:
                 self._switch_off_and_observe()
-            wait = virtual or end is not None
-            log.write(tick, reference_rad, missed, wait=wait)
-            scheduled[0] = tick + 1
+            wait_for_slot = is_virtual or end is not None
+            log.write(tick_number, reference_rad, missed_ticks, wait_for_slot=wait_for_slot)
+            scheduled_field[0] = tick_number + 1
             last_ns = scheduler.t_ns + scheduler.lateness_ns
-            if last < 0:
+            if last_tick < 0:
                 first_ns = last_ns
-            last = tick
+            last_tick = tick_number
         self._end_angle_rad = reference_rad
-        counts.scheduled = scheduled[0] = last + 1
+        counts.scheduled = scheduled_field[0] = last_tick + 1
         if counts.lost and end is None:
             end = self._stop_reason()
         if end is not None:
             cycle.torque_off()
         self._publish_readings()
-        for count in self._display.doubt_counts:
-            self._log_event("warning", count)
-        self._record_clock_results(wall_ns, before_ns, last_ns - first_ns)
+        for record_tick_count in self._display.doubt_counts:
+            self._log_event("warning", record_tick_count)
+        self._record_clock_results(start_utc_ns, start_monotonic_ns, last_ns - first_ns)
         if end is not None:
             raise end
 
-    def _await_segment(self, reader: ReferenceReader, tick: int) -> None:
+    def _await_segment(self, reference_reader: ReferenceReader, tick: int) -> None:
         """Stop virtual time until the fit process has planned the reference of a tick.
 
         With devices on a bus or serial line, return after 1 s: the tick then holds the last angle,
@@ -411,18 +420,20 @@ class SessionSequence:
         """
         uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
-        while reader.must_wait(tick) and self._stop_reason() is None:
+        while reference_reader.must_wait(tick) and self._stop_reason() is None:
             if uses_line and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
                 return
             self._display.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
 
-    def _watch_touch(self, touch: "TouchWatch", tick: int, missed: int) -> SessionEnd | None:
-        """Check the last tick for a touch, to which the touch watch reacts.
+    def _watch_touch(
+        self, touch_watch: "TouchWatch", tick: int, missed_ticks: int
+    ) -> SessionEnd | None:
+        """Check the last tick for a touch of an obstacle, and let the touch watch react to it.
 
         Return an error that ends the session if the touch requires that, otherwise None.
         """
-        contact = touch.step(tick, missed)
+        contact = touch_watch.step(tick, missed_ticks)
         if contact is None:
             return None
         if contact.detected:
@@ -446,16 +457,16 @@ class SessionSequence:
         min_displacement_rad = min(0.0, max(-_MAX_DAMPING_ANGLE_RAD, -limit_rad - end_rad))
         max_displacement_rad = max(0.0, min(_MAX_DAMPING_ANGLE_RAD, limit_rad - end_rad))
         torques_nm = np.zeros(round(_SPREAD_WINDOW_S * self._rate_hz))
-        for tick in range(round(_LONGEST_DAMPING_S * self._rate_hz)):
+        for tick_number in range(round(_LONGEST_DAMPING_S * self._rate_hz)):
             damping_angle_rad = damper.step(cycle.coupling_torque_nm)
             self._end_angle_rad = end_rad + min(
                 max(damping_angle_rad, min_displacement_rad), max_displacement_rad
             )
             self._run_tick(self._end_angle_rad)
-            torques_nm[tick % torques_nm.size] = cycle.coupling_torque_nm
+            torques_nm[tick_number % torques_nm.size] = cycle.coupling_torque_nm
             if (
-                tick % _SPREAD_CHECK_TICKS == 0
-                and tick >= torques_nm.size
+                tick_number % _SPREAD_CHECK_TICKS == 0
+                and tick_number >= torques_nm.size
                 and float(torques_nm.std()) <= _DAMPED_SPREAD_RATIO * self._rest_spread_nm
             ):
                 return
@@ -469,11 +480,11 @@ class SessionSequence:
         if self._ending.stays:
             goal_rad += self._relative_reference[-1]
         distance_rad = goal_rad - self._end_angle_rad
-        for fraction in self._return_path:
-            self._run_tick(self._end_angle_rad + distance_rad * fraction)
+        for path_fraction in self._return_path:
+            self._run_tick(self._end_angle_rad + distance_rad * path_fraction)
 
     def check_tare(self) -> None:
-        """Average the sensor again with the drive disabled, and check the drift of its zero.
+        """Measure the torque at rest after the record; raise `SessionEnd` if it drifted too much.
 
         Raises
         ------
@@ -481,14 +492,14 @@ class SessionSequence:
             If the zero of the coupling torque has drifted too much.
         """
         self._read_rest(_SETTLING_S)
-        rest = self._read_rest(self._profile.session.tare_s)
-        if rest.torque_spread_nm > _VIBRATING_SPREAD_RATIO * self._rest_spread_nm:
+        rest_readings = self._read_rest(self._profile.session.tare_s)
+        if rest_readings.torque_spread_nm > _VIBRATING_SPREAD_RATIO * self._rest_spread_nm:
             self._log_event(
                 "info", "The beam still vibrates: the zero of the coupling torque was not checked."
             )
             return
         zero_nm = np.dot(self._cycle.tare, self._profile.rig.sensor.projection)
-        drift_nm = float(rest.torques_nm.mean() - zero_nm)
+        drift_nm = float(rest_readings.torques_nm.mean() - zero_nm)
         self.results["tare_drift_nm"] = repr(drift_nm)
         violation = self._cycle.watch.check_tare(drift_nm)
         self._report_warnings()
@@ -500,12 +511,12 @@ class SessionSequence:
 
         Set `excused` for a tick that other work, such as enabling the drive, may delay.
         """
-        missed = self._scheduler.wait()
-        self._cycle.skip(missed)
-        if missed > self._profile.limits.missed_ticks_in_a_row and not excused:
+        missed_ticks = self._scheduler.wait()
+        self._cycle.skip(missed_ticks)
+        if missed_ticks > self._profile.limits.missed_ticks_in_a_row and not excused:
             raise SessionEnd(
                 "fault",
-                f"The loop stalled for {missed} ticks with the torque held, more than "
+                f"The loop stalled for {missed_ticks} ticks with the torque held, more than "
                 "limits.missed_ticks_in_a_row = "
                 f"{self._profile.limits.missed_ticks_in_a_row}. {OVERLOADED_ADVICE}",
             )
@@ -524,16 +535,16 @@ class SessionSequence:
         except (DeviceError, OSError) as error:
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
-            reason = f"{error} {self._cycle.watch.after_missed}".strip()
-            return SessionEnd("fault", reason, device_failed=True)
+            violation_text = f"{error} {self._cycle.watch.after_missed}".strip()
+            return SessionEnd("fault", violation_text, device_failed=True)
         if violation is None:
             return None
         if violation.channel in _WRONG_SIGN_CHANNELS and self._accelerates_against_torque():
             violation = replace(violation, remedy=_WRONG_SIGN_REMEDY)
         violation = self._cycle.with_reported_cause(violation)
         # The zero is then invalid, and with it the limits of all further sessions.
-        failed = violation.channel in _ENCODER_CHANNELS
-        return SessionEnd("fault", str(violation), device_failed=failed)
+        encoder_failed = violation.channel in _ENCODER_CHANNELS
+        return SessionEnd("fault", str(violation), device_failed=encoder_failed)
 
     def _accelerates_against_torque(self) -> bool:
         """Return whether the shaft has just accelerated against the torque on it."""
@@ -565,43 +576,45 @@ class SessionSequence:
         )
 
     def _check_reading(self) -> None:
-        """End the session if a reading at rest shows a failed encoder or sensor, or on a stop."""
+        """Raise `SessionEnd` if encoder or sensor have failed, or a stop is requested."""
         self._switch_off_if_stopped()
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
-        failed = self._cycle.check_stale() or self._cycle.check_sensor()
-        if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
+        reading_violation = self._cycle.check_stale() or self._cycle.check_sensor()
+        if reading_violation is not None:
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(reading_violation)))
 
-    def _check_missed_ticks(self, missed: int, tick: int) -> SessionEnd | None:
-        """Return an error that ends the session if too many ticks were missed, else None."""
-        if not missed:
+    def _check_missed_ticks(self, new_missed_ticks: int, tick: int) -> SessionEnd | None:
+        """Return an error that ends the session if more ticks were missed than allowed."""
+        if not new_missed_ticks:
             return None
-        self._cycle.skip_encoder(missed)
-        reason = self._cycle.watch.check_missed(missed, self.counts.missed, tick + 1)
-        return None if reason is None else SessionEnd("fault", str(reason))
+        self._cycle.skip_encoder(new_missed_ticks)
+        violation_text = self._cycle.watch.check_missed(
+            new_missed_ticks, self.counts.missed, tick + 1
+        )
+        return None if violation_text is None else SessionEnd("fault", str(violation_text))
 
     def stop_requested(self) -> bool:
         """Return whether the session must end; steps longer than a tick call this as they run."""
         return self._stop_reason() is not None
 
-    def _check_stale_readings(self, scheduled: int) -> SessionEnd | None:
-        """Return an error that ends the session if too many readings were stale, else None."""
-        counts = self.counts
-        reason = self._cycle.watch.check_stale_fraction(
-            counts.stale_angles, counts.stale_wrenches, scheduled
+    def _check_stale_readings(self, scheduled_ticks: int) -> SessionEnd | None:
+        """Return an error that ends the session if more readings were stale than allowed."""
+        tick_counts = self.counts
+        violation_text = self._cycle.watch.check_stale_fraction(
+            tick_counts.stale_angles, tick_counts.stale_wrenches, scheduled_ticks
         )
         return (
             None
-            if reason is None
-            else SessionEnd("fault", str(self._cycle.with_reported_cause(reason)))
+            if violation_text is None
+            else SessionEnd("fault", str(self._cycle.with_reported_cause(violation_text)))
         )
 
     def _stop_reason(self) -> SessionEnd | None:
         """Return an error that ends the session if a stop is requested or a process died."""
-        stop = self._shared_state[StateField.STOP]
-        if self._stop.requested or stop == Stop.OPERATOR:
+        stop_reason = self._shared_state[StateField.STOP]
+        if self._stop.requested or stop_reason == Stop.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
-        if stop == Stop.NO_RECORDER:
+        if stop_reason == Stop.NO_RECORDER:
             return SessionEnd("fault", "The recorder process ended during the session.")
         if self.counts.lost:
             # A record with a lost sample can never be complete.
@@ -611,7 +624,7 @@ class SessionSequence:
         return None
 
     def _poll(self) -> SessionEnd | None:
-        """Publish heartbeat and readings, and check slow limits, supervisor and stop requests.
+        """Publish heartbeat and readings, and check slow limits, suspend, supervisor and stop.
 
         Return an error that ends the session, or None. The supervisor requests a stop when the
         recorder has died (`rigd.runner`).
@@ -634,11 +647,11 @@ class SessionSequence:
                     f"The computer was suspended for {suspended_s:.1f} s and the motor was not "
                     "controlled; disable its power management.",
                 )
-            beat = self._shared_state[StateField.SUPERVISOR_BEAT]
+            supervisor_beat = self._shared_state[StateField.SUPERVISOR_BEAT]
             self._polls_without_heartbeat = (
-                self._polls_without_heartbeat + 1 if beat == self._supervisor_beat else 0
+                self._polls_without_heartbeat + 1 if supervisor_beat == self._supervisor_beat else 0
             )
-            self._supervisor_beat = beat
+            self._supervisor_beat = supervisor_beat
             if (
                 self._polls_without_heartbeat * SLOW_CHECK_TICKS
                 > _SUPERVISOR_TIMEOUT_S * self._rate_hz
@@ -652,30 +665,34 @@ class SessionSequence:
 
     def _switch_off_if_stopped(self) -> None:
         """Switch the torque off and raise `SessionEnd` if a stop is requested or a check fails."""
-        poll_due = self._scheduler.tick % SLOW_CHECK_TICKS == 0
-        end = self._poll() if poll_due else self._stop_reason()
+        is_poll_due = self._scheduler.tick % SLOW_CHECK_TICKS == 0
+        end = self._poll() if is_poll_due else self._stop_reason()
         if end is not None:
             self._cycle.torque_off()
             raise end
 
-    def _record_clock_results(self, wall_ns: int, before_ns: int, executed_ns: int) -> None:
-        """Store the drift of the wall clock against the monotonic clock, and the true tick rate.
+    def _record_clock_results(
+        self, start_utc_ns: int, start_monotonic_ns: int, executed_ns: int
+    ) -> None:
+        """Store wall clock drift, page faults and true tick rate of the record in `results`.
 
         The results go into the file's metadata.
         """
-        now_ns = time.time_ns()
-        self.results["end_utc_ns"] = str(now_ns)
+        end_utc_ns = time.time_ns()
+        self.results["end_utc_ns"] = str(end_utc_ns)
         if self._clock.virtual:
             return
         self.results["page_faults"] = str(page_faults() - self._page_faults)
-        elapsed_ns = time.monotonic_ns() - before_ns
-        self.results["wall_clock_drift_ppm"] = repr(((now_ns - wall_ns) / elapsed_ns - 1) * 1e6)
-        intervals = self.counts.scheduled - self.counts.missed - 1
+        elapsed_ns = time.monotonic_ns() - start_monotonic_ns
+        self.results["wall_clock_drift_ppm"] = repr(
+            ((end_utc_ns - start_utc_ns) / elapsed_ns - 1) * 1e6
+        )
+        interval_count = self.counts.scheduled - self.counts.missed - 1
         if executed_ns > 0:
-            self.results["true_rate_hz"] = repr(intervals / (executed_ns * 1e-9))
+            self.results["true_rate_hz"] = repr(interval_count / (executed_ns * 1e-9))
 
     def _publish_readings(self) -> None:
-        """Publish the readings for the operator, and log each doubt about their age once."""
+        """Write the readings to the shared state, and log each doubt about their age once."""
         self._display.publish(self._cycle, self._scheduler.due_ns)
         for doubt in self._display.doubts:
             if doubt not in self._doubts_reported:
@@ -685,14 +702,14 @@ class SessionSequence:
     def _report_warnings(self) -> None:
         """Log new warnings of the limit, sensor and encoder monitors."""
         cycle = self._cycle
-        for notice in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
-            self._log_event("warning", notice)
-        tests = 0 if cycle.encoder_watch is None else cycle.encoder_watch.tests
-        if tests > self._encoder_tests:
-            self.results["encoder_tests"] = str(tests)
+        for warning_text in cycle.watch.take_notices() + cycle.sensor_watch.take_notices():
+            self._log_event("warning", warning_text)
+        encoder_tests = 0 if cycle.encoder_watch is None else cycle.encoder_watch.tests
+        if encoder_tests > self._encoder_tests:
+            self.results["encoder_tests"] = str(encoder_tests)
             if not self._encoder_tests:
                 self._log_event("info", _ENCODER_TESTED_MESSAGE)
-            self._encoder_tests = tests
+            self._encoder_tests = encoder_tests
 
     def _log_event(self, level: Level, message: str) -> None:
         """Write a line of the session's log for the operator and the file."""
@@ -708,8 +725,8 @@ def _return_path(profile: Profile, ending: Ending) -> list[float]:
     """
     duration_s, rate_hz = profile.session.return_s, profile.rig.rate_hz
     if ending.poles_rad_s and duration_s <= _LONGEST_SHAPED_RETURN_S:
-        path = vibration_free_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
+        path_fractions = vibration_free_path(duration_s, rate_hz, np.array(ending.poles_rad_s))
     else:
-        path = quintic(duration_s, rate_hz)
-    fractions: list[float] = path.tolist()
-    return fractions
+        path_fractions = quintic(duration_s, rate_hz)
+    path_list: list[float] = path_fractions.tolist()
+    return path_list

@@ -18,7 +18,7 @@ disturbed reading."""
 
 @dataclass(frozen=True, slots=True)
 class DetectedContact:
-    """Contact of the beam with an obstacle, as the control loop has detected it."""
+    """Contact of the beam with an obstacle that the control loop has detected: message, outcome."""
 
     message: str
     """Sentence for the operator."""
@@ -61,18 +61,18 @@ class TouchWatch:
         self._arming_tick = self._pass.begins
         self._excessive_force_ticks = 0
 
-    def step(self, tick: int, missed: int) -> DetectedContact | None:
-        """Check the tick that was just run for a touch; return the contact, or None without one.
+    def step(self, tick: int, missed_ticks: int) -> DetectedContact | None:
+        """Check the last tick for a touch; return the contact, or None if nothing was touched.
 
         Parameters
         ----------
         tick
             Number of the tick in the record.
-        missed
+        missed_ticks
             Number of ticks that were missed directly before this tick.
         """
         cycle, detector = self._cycle, self._detector
-        flags = cycle.flags
+        status_flags = cycle.flags
         shear_n = 0.0
         if self._projection is not None:
             px, py, pz, qx, qy, qz = self._projection
@@ -84,16 +84,16 @@ class TouchWatch:
         if self._arming_tick <= tick:
             self._arming_tick = len(self._reference_rad)
             detector.arm()
-        touched = detector.step(
+        is_touched = detector.step(
             cycle.angle_rad,
             cycle.coupling_torque_nm,
             shear_n,
-            missed=missed,
-            angle_stale=bool(flags & _ANGLE_STALE),
-            wrench_stale=bool(flags & _WRENCH_STALE),
+            missed=missed_ticks,
+            angle_stale=bool(status_flags & _ANGLE_STALE),
+            wrench_stale=bool(status_flags & _WRENCH_STALE),
         )
         forceful_contact = self._check_force_limit(shear_n)
-        if forceful_contact is not None or not touched:
+        if forceful_contact is not None or not is_touched:
             return forceful_contact
         cycle.flags |= _TOUCHED
         if tick >= self._pass.returns:

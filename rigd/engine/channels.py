@@ -26,7 +26,7 @@ _EVENTS = 256
 
 @dataclass(frozen=True, slots=True)
 class Topic:
-    """Kind of record that the control process publishes, and the processes that read it."""
+    """Kind of record that the control process writes to a ring, and the processes that read it."""
 
     name: str
     """Name of the topic's channel in the session file."""
@@ -40,7 +40,7 @@ class Topic:
     """Whether the live publisher reads the records, and drops those it cannot show in time."""
 
     def capacity(self, rate_hz: float, buffered_s: float = RECORDER_BUFFER_S) -> int:
-        """Return the number of records that a topic's ring must hold.
+        """Return the number of records for which the ring buffer of a topic needs space.
 
         Parameters
         ----------
@@ -134,7 +134,7 @@ class Channels:
 
 
 def create_channels(
-    rate_hz: float, fds: Sequence[int], buffered_s: float = RECORDER_BUFFER_S
+    rate_hz: float, descriptors: Sequence[int], buffered_s: float = RECORDER_BUFFER_S
 ) -> Channels:
     """Create the rings and the shared state of a rig's processes in shared memory.
 
@@ -142,27 +142,29 @@ def create_channels(
     ----------
     rate_hz
         Ticks a second.
-    fds
+    descriptors
         Descriptors, as many as `DESCRIPTORS`: for the rings, the shared state and the reference.
     buffered_s
         Time in s whose records the rings hold.
     """
-    *for_rings, for_shared_state, for_reference = fds
+    *ring_fds, shared_state_fd, reference_fd = descriptors
     rings = [
         Ring.create(topic.record_size, topic.capacity(rate_hz, buffered_s), fd)
-        for topic, fd in zip(TOPICS, for_rings, strict=True)
+        for topic, fd in zip(TOPICS, ring_fds, strict=True)
     ]
-    return _make_channels(rings, SharedState.create(for_shared_state), for_reference)
+    return _make_channels(rings, SharedState.create(shared_state_fd), reference_fd)
 
 
 def attach_channels(specs: ChannelSpecs) -> Channels:
     """Attach a child process to the channels that the supervisor created, and return them."""
-    return _make_channels([Ring(spec) for spec in specs.rings], SharedState(specs.shared_state_fd))
+    return _make_channels(
+        [Ring(ring_spec) for ring_spec in specs.rings], SharedState(specs.shared_state_fd)
+    )
 
 
 def _make_channels(
-    rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
+    topic_rings: Sequence[Ring], shared_state: SharedState, reference_fd: int = -1
 ) -> Channels:
     """Return channels from rings in the order of `TOPICS`, and the shared state."""
-    events, controls, timings, samples = rings
+    events, controls, timings, samples = topic_rings
     return Channels(events, controls, timings, samples, shared_state, reference_fd)

@@ -63,23 +63,25 @@ _STANDSTILL_TICKS = 2
 
 def main() -> None:
     """Run the control process, started as ``python -m rigd.engine.control_process``."""
-    stop = StopRequest()
-    stop.catch()
+    stop_request = StopRequest()
+    stop_request.catch()
     parent = Parent()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
-    realtime = job.profile.realtime
+    realtime_settings = job.profile.realtime
     if job.fast:
-        granted = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+        realtime_results = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
     else:
-        granted = {"clock": "real"} | apply_realtime(priority=realtime.priority, cpu=realtime.cpu)
+        realtime_results = {"clock": "real"} | apply_realtime(
+            priority=realtime_settings.priority, cpu=realtime_settings.cpu
+        )
     try:
         devices = open_devices(job.profile.rig, job.moving)
     except DeviceError as error:
         parent.send(Ended(str(error)))
         return
-    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime.spin_us * 1000))
-    run_control(job.profile, devices, clock, channels, parent, stop, granted)
+    clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
+    run_control(job.profile, devices, clock, channels, parent, stop_request, realtime_results)
 
 
 def run_control(
@@ -88,8 +90,8 @@ def run_control(
     clock: Clock,
     channels: Channels,
     parent: Parent,
-    stop: StopRequest,
-    granted: dict[str, str],
+    stop_request: StopRequest,
+    realtime_results: dict[str, str],
 ) -> None:
     """Connect the devices, execute the supervisor's orders, and close the devices in any case.
 
@@ -99,19 +101,21 @@ def run_control(
         Profile of the rig.
     devices
         Devices, not yet connected.
-    clock, channels, parent, stop
+    clock, channels, parent, stop_request
         As for :class:`rigd.engine._session_sequence.SessionSequence`.
-    granted
+    realtime_results
         Real-time settings that were granted, for the file.
     """
-    failure = ""
+    failure_text = ""
     name_this_process(CONNECTING_NAME)
     try:
         # The drive last: an operational drive expects a SYNC every period.
         devices.sensor.connect()
         drive = devices.drive
         drive.connect()
-        server = _ControlServer(profile, devices, clock, channels, parent, stop, granted)
+        server = _ControlServer(
+            profile, devices, clock, channels, parent, stop_request, realtime_results
+        )
         channels.shared_state[StateField.PHASE] = Phase.OFF
         server.observe_standstill()
         name_this_process(IDLE_NAME)
@@ -119,23 +123,23 @@ def run_control(
             Connected(
                 calibration=devices.sensor.calibration(),
                 drive=drive.statement() if isinstance(drive, StatedDrive) else {},
-                realtime=granted,
+                realtime=realtime_results,
                 simulated=devices.simulated,
             )
         )
         server.serve()
     except (DeviceError, OSError) as error:
-        failure = str(error)
+        failure_text = str(error)
     finally:
         devices.drive.disable()
         channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(Ended(f"{failure} {devices.drive.off_doubt}".strip()))
+    parent.send(Ended(f"{failure_text} {devices.drive.off_doubt}".strip()))
 
 
 class _ControlServer:
-    """Executor of the supervisor's orders on connected devices."""
+    """Executor of the supervisor's orders, such as to run a session, on connected devices."""
 
     def __init__(
         self,
@@ -144,8 +148,8 @@ class _ControlServer:
         clock: Clock,
         channels: Channels,
         parent: Parent,
-        stop: StopRequest,
-        granted: dict[str, str],
+        stop_request: StopRequest,
+        realtime_results: dict[str, str],
     ) -> None:
         self._profile = profile
         self._devices = devices
@@ -154,8 +158,8 @@ class _ControlServer:
         self._channels = channels
         self._shared_state = channels.shared_state
         self._parent = parent
-        self._stop = stop
-        self._granted = granted
+        self._stop = stop_request
+        self._granted = realtime_results
         self._zero_rad = 0.0
         self._silent_ticks = 0
         self._on_lines = devices.uses_line
@@ -174,7 +178,7 @@ class _ControlServer:
             store_motor_heat(self._profile, self._watch.heat_nm2)
 
     def observe_standstill(self) -> None:
-        """Read the devices until the motor's angle and speed at rest are known, and publish them.
+        """Read the devices with the torque off until the motor's angle and speed are known.
 
         Virtual time stops after this.
 
@@ -197,11 +201,11 @@ class _ControlServer:
         DeviceError, OSError
             If a device failed.
         """
-        while (order := self._await_order()) is not None:
-            match order:
+        while (supervisor_order := self._await_order()) is not None:
+            match supervisor_order:
                 case SessionJob():
                     try:
-                        self._run_session(order)
+                        self._run_session(supervisor_order)
                     finally:
                         self.store_heat()
                     self.observe_standstill()
@@ -211,7 +215,7 @@ class _ControlServer:
                 case Zero():
                     self._send_measurement(self._set_zero)
                 case Probe():
-                    self._run_probe(order.profile)
+                    self._run_probe(supervisor_order.profile)
                     self.observe_standstill()
 
     def _await_order(self) -> object | None:
@@ -224,11 +228,13 @@ class _ControlServer:
         while not self._stop.requested:
             self._publish_readings()
             try:
-                message = self._parent.poll(_STANDSTILL_POLL_S if self._clock.virtual else 0.0)
+                supervisor_message = self._parent.poll(
+                    _STANDSTILL_POLL_S if self._clock.virtual else 0.0
+                )
             except EOFError:
                 return None
-            if message is not None:
-                return message
+            if supervisor_message is not None:
+                return supervisor_message
             if not self._clock.virtual:
                 self._read_idle_devices()
             elif self._on_lines and time.monotonic() - last_tick_s > SIGN_OF_LIFE_S:
@@ -255,7 +261,7 @@ class _ControlServer:
         self._cycle.observe(self._scheduler.due_ns)
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
-    def _run_session(self, job: SessionJob) -> None:
+    def _run_session(self, session_job: SessionJob) -> None:
         """Run one session, disable the drive in any case, and send `Finished` to the supervisor.
 
         Raises
@@ -264,7 +270,7 @@ class _ControlServer:
             If a device failed. `Finished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
-        for field in (
+        for state_field in (
             StateField.START_UTC_NS,
             StateField.SCHEDULED,
             StateField.MISSED,
@@ -277,22 +283,26 @@ class _ControlServer:
             StateField.HELD_BEFORE,
             StateField.BEGUN,
         ):
-            shared_state[field] = 0
-        self._warn_of_refusals(job)
-        self._log_accepted(job)
-        cycle = self._cycle = self._make_cycle(job.profile)
-        reference = map_reference(job.reference)
-        touch = None
-        if job.touch is not None:
+            shared_state[state_field] = 0
+        self._warn_of_refusals(session_job)
+        self._log_accepted(session_job)
+        cycle = self._cycle = self._make_cycle(session_job.profile)
+        reference_rad = map_reference(session_job.reference)
+        touch_watch = None
+        if session_job.touch is not None:
             from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
 
-            touch = TouchWatch(job.touch, cycle, reference, job.profile.rig.rate_hz)
-        reader = None
-        if job.reference.planned is not None:
-            reader = ReferenceReader(reference, job.reference.planned, shared_state)
-        sequence = SessionSequence(
-            job.profile,
-            reference,
+            touch_watch = TouchWatch(
+                session_job.touch, cycle, reference_rad, session_job.profile.rig.rate_hz
+            )
+        reference_reader = None
+        if session_job.reference.planned is not None:
+            reference_reader = ReferenceReader(
+                reference_rad, session_job.reference.planned, shared_state
+            )
+        session_sequence = SessionSequence(
+            session_job.profile,
+            reference_rad,
             cycle,
             self._clock,
             self._scheduler,
@@ -301,58 +311,62 @@ class _ControlServer:
             self._display,
             self._parent,
             self._stop,
-            job.ending,
-            touch,
-            reader,
+            session_job.ending,
+            touch_watch,
+            reference_reader,
         )
-        outcome, reason = "complete", ""
-        recorded = device_failed = False
+        session_outcome, end_reason = "complete", ""
+        was_recorded = device_failed = False
         name_this_process(SESSION_NAME)
         try:
-            seed = self._restart_noise(job)
-            tare = sequence.tare()
-            devices.drive.enable(sequence.stop_requested)
-            sequence.hold()
-            self._parent.send(Ready(tare | seed))
-            sequence.wait_for_go()
-            sequence.record()
-            recorded = True
-            sequence.damp()
-            sequence.return_to_start()
+            seed_metadata = self._restart_noise(session_job)
+            tare_metadata = session_sequence.tare()
+            devices.drive.enable(session_sequence.stop_requested)
+            session_sequence.hold()
+            self._parent.send(Ready(tare_metadata | seed_metadata))
+            session_sequence.wait_for_go()
+            session_sequence.record()
+            was_recorded = True
+            session_sequence.damp()
+            session_sequence.return_to_start()
             cycle.torque_off()
-            sequence.check_tare()
+            session_sequence.check_tare()
         except SessionEnd as end:
-            outcome, reason, device_failed = end.outcome, end.reason, end.device_failed
+            session_outcome, end_reason, device_failed = end.outcome, end.reason, end.device_failed
         except (DeviceError, OSError) as error:
-            outcome, reason, device_failed = "fault", str(error), True
+            session_outcome, end_reason, device_failed = "fault", str(error), True
         finally:
             devices.drive.disable()
             cycle.torque_off()
             shared_state[StateField.PHASE] = Phase.OFF
             self._publish_readings()
-        doubt = devices.drive.off_doubt
-        if doubt:
-            outcome, reason, device_failed = "fault", f"{reason} {doubt}".strip(), True
+        off_doubt = devices.drive.off_doubt
+        if off_doubt:
+            session_outcome, end_reason, device_failed = (
+                "fault",
+                f"{end_reason} {off_doubt}".strip(),
+                True,
+            )
         else:
             name_this_process(IDLE_NAME)
-        failure, fault = reason, outcome == "fault"
-        if recorded and reason:
+        failure_text, is_fault = end_reason, session_outcome == "fault"
+        if was_recorded and end_reason:
             # Events after the last tick do not make the record incomplete.
-            outcome, reason = "complete", f"After the record: {reason}"
+            session_outcome, end_reason = "complete", f"After the record: {end_reason}"
         self._parent.send(
             Finished(
-                outcome=outcome,
-                reason=reason,
-                fault=fault,
-                counts=asdict(sequence.counts),
-                results=sequence.results,
+                outcome=session_outcome,
+                reason=end_reason,
+                fault=is_fault,
+                counts=asdict(session_sequence.counts),
+                results=session_sequence.results,
                 device_failed=device_failed,
             )
         )
         if device_failed:
-            raise DeviceError(failure)
+            raise DeviceError(failure_text)
 
-    def _restart_noise(self, job: SessionJob) -> dict[str, str]:
+    def _restart_noise(self, session_job: SessionJob) -> dict[str, str]:
         """Restart the noise of a simulated rig and return its seed as metadata; {} for a real rig.
 
         Raises
@@ -360,11 +374,13 @@ class _ControlServer:
         DeviceError
             If the simulated rig does not answer.
         """
-        restart_noise = self._devices.renew_noise
-        return {} if restart_noise is None else {"simulation_seed": str(restart_noise(job.seed))}
+        renew_noise = self._devices.renew_noise
+        return (
+            {} if renew_noise is None else {"simulation_seed": str(renew_noise(session_job.seed))}
+        )
 
     def _run_probe(self, profile: Profile) -> None:
-        """Run the probing move of a profile, disable the drive, and send the result.
+        """Run the probing move of a profile, disable the drive, send the result to the supervisor.
 
         Raises
         ------
@@ -374,7 +390,7 @@ class _ControlServer:
         from rigd.engine._probe_sequence import ProbeSequence  # late: few connections need it
 
         cycle = self._cycle = self._make_cycle(profile)
-        sequence = ProbeSequence(
+        probe_sequence = ProbeSequence(
             profile,
             cycle,
             self._clock,
@@ -385,31 +401,31 @@ class _ControlServer:
             self._parent,
             self._stop,
         )
-        answer: Measured | Refused
-        failure = ""
+        reply_message: Measured | Refused
+        failure_text = ""
         name_this_process(SESSION_NAME)
         try:
-            sequence.tare()
-            self._devices.drive.enable(sequence.stop_requested)
-            answer = Measured(sequence.move())
+            probe_sequence.tare()
+            self._devices.drive.enable(probe_sequence.stop_requested)
+            reply_message = Measured(probe_sequence.move())
         except SessionEnd as end:
-            answer = Refused(end.reason)
-            failure = end.reason if end.device_failed else ""
+            reply_message = Refused(end.reason)
+            failure_text = end.reason if end.device_failed else ""
         finally:
             self._devices.drive.disable()
             cycle.torque_off()
             self._shared_state[StateField.PHASE] = Phase.OFF
             self._publish_readings()
-        failure = f"{failure} {self._devices.drive.off_doubt}".strip()
-        if failure:
-            raise DeviceError(failure)
+        failure_text = f"{failure_text} {self._devices.drive.off_doubt}".strip()
+        if failure_text:
+            raise DeviceError(failure_text)
         name_this_process(IDLE_NAME)
-        self._parent.send(answer)
+        self._parent.send(reply_message)
 
-    def _send_measurement(self, measure: Callable[[], dict[str, object]]) -> None:
-        """Run a measurement at rest and send its result, or the reason why it was refused."""
+    def _send_measurement(self, measure_at_rest: Callable[[], dict[str, object]]) -> None:
+        """Run a measurement at rest; send its result, or `Refused` with the reason of a failure."""
         try:
-            self._parent.send(Measured(measure()))
+            self._parent.send(Measured(measure_at_rest()))
         except SessionEnd as end:
             self._parent.send(Refused(end.reason))
 
@@ -419,16 +435,16 @@ class _ControlServer:
         The values are for display, because each session measures the zero itself.
         """
         self._cycle.sensor_watch.learn()
-        rest = self._read_rest(self._profile.session.tare_s)
-        failed = self._cycle.sensor_watch.finish_learning()
-        if failed is not None:
-            raise SessionEnd("fault", str(failed))
-        self._cycle.tare = rest.mean
-        self._watch.tared_nm = float(rest.torques_nm.mean())
+        rest_readings = self._read_rest(self._profile.session.tare_s)
+        sensor_violation = self._cycle.sensor_watch.finish_learning()
+        if sensor_violation is not None:
+            raise SessionEnd("fault", str(sensor_violation))
+        self._cycle.tare = rest_readings.mean
+        self._watch.tared_nm = float(rest_readings.torques_nm.mean())
         return {
-            "mean": dict(zip(WRENCH_FIELDS, rest.mean, strict=True)),
-            "std": dict(zip(WRENCH_FIELDS, rest.spread, strict=True)),
-            "torque_std_nm": rest.torque_spread_nm,
+            "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean, strict=True)),
+            "std": dict(zip(WRENCH_FIELDS, rest_readings.spread, strict=True)),
+            "torque_std_nm": rest_readings.torque_spread_nm,
         }
 
     def _set_zero(self) -> dict[str, object]:
@@ -441,12 +457,12 @@ class _ControlServer:
         SessionEnd
             If the motor moves.
         """
-        rest = self._read_rest(_ZERO_READING_S)
+        rest_readings = self._read_rest(_ZERO_READING_S)
         limit_rad_s = self._profile.session.rest_velocity_rad_s
-        if rest.speed_rad_s > limit_rad_s:
+        if rest_readings.speed_rad_s > limit_rad_s:
             raise SessionEnd(
                 "fault",
-                f"The motor moves by {rest.speed_rad_s:.2g} rad/s, more than "
+                f"The motor moves by {rest_readings.speed_rad_s:.2g} rad/s, more than "
                 f"session.rest_velocity_rad_s = {limit_rad_s:g} rad/s; wait until it is at rest.",
             )
         moved_rad = self._cycle.angle_rad
@@ -457,7 +473,7 @@ class _ControlServer:
         return {"moved_rad": moved_rad}
 
     def _publish_readings(self) -> None:
-        """Publish the last readings in the shared state."""
+        """Write the last readings of angle and torque to the shared state."""
         self._display.publish(self._cycle, self._scheduler.due_ns)
 
     def _read_rest(self, duration_s: float) -> RestReadings:
@@ -473,15 +489,15 @@ class _ControlServer:
         )
 
     def _check_reading(self) -> None:
-        """End a measurement if encoder or sensor failed, or the supervisor wants to end."""
+        """Raise an error if encoder or sensor failed, or a stop is requested."""
         if self._scheduler.tick % SLOW_CHECK_TICKS == 0:
             self._publish_readings()
         if self._stop.requested or not self._parent.alive():
             raise SessionEnd("stopped", "The rig is being shut down.")
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
-        failed = self._cycle.check_stale() or self._cycle.check_sensor()
-        if failed is not None:
-            raise SessionEnd("fault", str(self._cycle.with_reported_cause(failed)))
+        reading_violation = self._cycle.check_stale() or self._cycle.check_sensor()
+        if reading_violation is not None:
+            raise SessionEnd("fault", str(self._cycle.with_reported_cause(reading_violation)))
 
     def _make_cycle(self, profile: Profile) -> Cycle:
         """Return a new cycle with the controller and monitors of a profile."""
@@ -496,29 +512,37 @@ class _ControlServer:
         cycle.zero_rad = self._zero_rad
         return cycle
 
-    def _warn_of_refusals(self, job: SessionJob) -> None:
+    def _warn_of_refusals(self, session_job: SessionJob) -> None:
         """Log the real-time settings that the system did not grant, as warnings."""
         own_refusals = {
-            name: text for name, text in self._granted.items() if text.startswith(REFUSED)
+            setting_name: refusal_text
+            for setting_name, refusal_text in self._granted.items()
+            if refusal_text.startswith(REFUSED)
         }
-        for refused, consequence in (
+        for refused_settings, consequence_text in (
             (own_refusals, "more ticks will be late"),
-            (job.refused, "a computer that is busy with other programs may end the session"),
+            (
+                session_job.refused,
+                "a computer that is busy with other programs may end the session",
+            ),
         ):
-            if refused:
-                names = ", ".join(f"{name} ({text})" for name, text in refused.items())
-                message = f"The system did not grant {names}: {consequence}."
-                write_event(self._channels.events, LogEvent(0, "warning", message))
+            if refused_settings:
+                setting_names = ", ".join(
+                    f"{setting_name} ({refusal_text})"
+                    for setting_name, refusal_text in refused_settings.items()
+                )
+                warning_message = f"The system did not grant {setting_names}: {consequence_text}."
+                write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
-    def _log_accepted(self, job: SessionJob) -> None:
-        """Log the failed rows of ``rigd check`` that the operator accepted, as warnings."""
-        for text in job.accepted:
-            message = f"Accepted by the operator, though rigd check fails: {text}"
-            write_event(self._channels.events, LogEvent(0, "warning", message))
+    def _log_accepted(self, session_job: SessionJob) -> None:
+        """Log the failed checks of ``rigd check`` that the operator accepted, as warnings."""
+        for check_row in session_job.accepted:
+            warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
+            write_event(self._channels.events, LogEvent(0, "warning", warning_message))
 
 
 def _make_controller(profile: Profile) -> PidController:
-    """Return the angle controller with the gains of a profile's pole placement."""
+    """Return the PID controller of the motor's angle, designed for the motor of a profile."""
     motor = profile.control_motor
     gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
     return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)

@@ -66,7 +66,7 @@ sign. The range allows for friction and for an inertia that is only assumed."""
 
 
 class StandstillMonitor:
-    """Check that the motor's angle does not jump while the torque is off.
+    """Monitor that checks that the motor's angle does not jump while the torque is off.
 
     Each angle is compared with the angles before it. From one tick to the next the speed may change
     as much as ``limits.acceleration_rad_s2`` allows, as in the loop. Over ticks that were missed
@@ -95,7 +95,7 @@ class StandstillMonitor:
 
     @property
     def has_speed(self) -> bool:
-        """Whether angle and speed are known, with which the next angle can be compared."""
+        """Whether the last angle and speed are known, so that the next angle can be checked."""
         return self._last_movements_rad is not None
 
     def check(self, angle_rad: float, due_ns: int) -> None:
@@ -113,28 +113,37 @@ class StandstillMonitor:
         DeviceError
             If the angle has jumped further than the motor can turn in that time.
         """
-        before_rad, ticks = self._angle_rad, round((due_ns - self._due_ns) / self._period_ns)
+        last_angle_rad, elapsed_ticks = (
+            self._angle_rad,
+            round((due_ns - self._due_ns) / self._period_ns),
+        )
         self._angle_rad, self._due_ns = angle_rad, due_ns
-        if before_rad is None:
+        if last_angle_rad is None:
             return
-        moved_rad = angle_rad - before_rad
-        movements_rad, self._last_movements_rad = self._last_movements_rad, None
-        if ticks > 1:
-            possible_rad = self._per_tick_rad * ticks + self._resolution_rad
-            jump_rad, key = moved_rad, "limits.velocity_rad_s"
+        movement_rad = angle_rad - last_angle_rad
+        last_movements_rad, self._last_movements_rad = self._last_movements_rad, None
+        if elapsed_ticks > 1:
+            possible_rad = self._per_tick_rad * elapsed_ticks + self._resolution_rad
+            jump_rad, key = movement_rad, "limits.velocity_rad_s"
         else:
             # The movement before the first is unknown.
-            last_rad, before_that_rad = movements_rad or (0.0, self._per_tick_rad)
+            last_movement_rad, earlier_movement_rad = last_movements_rad or (
+                0.0,
+                self._per_tick_rad,
+            )
             # One latch may be late by most of a period, and the next one punctual.
             possible_rad = (
-                self._per_tick2_rad + self._resolution_rad + abs(last_rad) + abs(before_that_rad)
+                self._per_tick2_rad
+                + self._resolution_rad
+                + abs(last_movement_rad)
+                + abs(earlier_movement_rad)
             )
-            jump_rad, key = moved_rad - last_rad, "limits.acceleration_rad_s2"
-            self._last_movements_rad = moved_rad, last_rad
+            jump_rad, key = movement_rad - last_movement_rad, "limits.acceleration_rad_s2"
+            self._last_movements_rad = movement_rad, last_movement_rad
         if not abs(jump_rad) <= possible_rad:
-            ticks_taken = f"{ticks} ticks" if ticks > 1 else "one tick"
+            elapsed_text = f"{elapsed_ticks} ticks" if elapsed_ticks > 1 else "one tick"
             raise DeviceError(
-                f"The encoder jumped by {jump_rad:.4g} rad within {ticks_taken} while the torque "
+                f"The encoder jumped by {jump_rad:.4g} rad within {elapsed_text} while the torque "
                 f"was off; at most {possible_rad:.2g} rad is possible ({key}). {ENCODER_REMEDY}"
             )
 
@@ -151,7 +160,7 @@ class Cycle:
         Connected drive and sensor.
     projection
         Coupling torque about the motor's axis = projection · wrench.
-    controller, watch
+    controller, limit_watch
         Controller and limit monitor. The monitor checks every reading before the controller
         uses it.
     reading_monitors
@@ -179,7 +188,7 @@ class Cycle:
         devices: Devices,
         projection: Wrench,
         controller: PidController,
-        watch: LimitWatch,
+        limit_watch: LimitWatch,
         reading_monitors: "ReadingMonitors",
     ) -> None:
         self.devices = devices
@@ -187,7 +196,7 @@ class Cycle:
         self._sensor = devices.sensor
         self._projection = projection
         self.controller = controller
-        self.watch = watch
+        self.watch = limit_watch
         self.encoder_watch: EncoderWatch | None = reading_monitors.encoder
         self.sensor_watch = reading_monitors.sensor
         self._gauges = devices.sensor if isinstance(devices.sensor, GaugeSensor) else None
@@ -216,16 +225,16 @@ class Cycle:
         self.wrench = (fx := fx - bx, fy := fy - by, fz := fz - bz,
                        tx := tx - ox, ty := ty - oy, tz := tz - oz)  # fmt: skip
         self.coupling_torque_nm = px * fx + py * fy + pz * fz + qx * tx + qy * ty + qz * tz
-        flags = 0
+        status_flags = 0
         if drive.angle_stale:
-            flags |= _ANGLE_STALE
+            status_flags |= _ANGLE_STALE
         if sensor.wrench_stale:
-            flags |= _WRENCH_STALE
+            status_flags |= _WRENCH_STALE
         if sensor.wrench_saturated:
-            flags |= _WRENCH_SATURATED
+            status_flags |= _WRENCH_SATURATED
         if self.torque_command_nm == 0.0:
-            flags |= _TORQUE_OFF
-        self.flags = flags
+            status_flags |= _TORQUE_OFF
+        self.flags = status_flags
 
     def step(self, due_ns: int, reference_rad: float) -> Violation | None:
         """Run one tick of the loop, and return the violated limit or None.
@@ -240,47 +249,47 @@ class Cycle:
             Reference angle of this tick, from the rig's zero.
         """
         self.observe(due_ns)
-        flags = self.flags & ~_TORQUE_OFF
-        watch = self.watch
-        violation = watch.check(
+        status_flags = self.flags & ~_TORQUE_OFF
+        limit_watch = self.watch
+        violation = limit_watch.check(
             reference_rad,
             self.angle_rad,
             self.raw_wrench,
-            angle_stale=bool(flags & _ANGLE_STALE),
+            angle_stale=bool(status_flags & _ANGLE_STALE),
         )
         violation = violation or self.check_stale() or self.check_sensor()
-        encoder = self.encoder_watch
-        if encoder is not None and violation is None:
-            violation = encoder.step(
+        encoder_watch = self.encoder_watch
+        if encoder_watch is not None and violation is None:
+            violation = encoder_watch.step(
                 self.angle_rad,
                 self.coupling_torque_nm,
                 self.torque_command_nm,
-                fresh=not flags & _UNUSABLE_FLAGS,
+                fresh=not status_flags & _UNUSABLE_FLAGS,
             )
         if violation is not None:
             self._recent_ticks.append((self.angle_rad, 0.0, 0.0))
             self.torque_off()
             self.flags |= _LIMIT_WARNING
             return violation
-        if watch.warning:
-            flags |= _LIMIT_WARNING
+        if limit_watch.warning:
+            status_flags |= _LIMIT_WARNING
         controller = self.controller
         torque_nm = controller.step(reference_rad, self.angle_rad, self.coupling_torque_nm)
         if controller.saturated:  # a torque that is not a number counts as saturated
-            violation = watch.check_torque(controller.unlimited_torque_nm)
+            violation = limit_watch.check_torque(controller.unlimited_torque_nm)
             if violation is not None:
                 self.torque_off()
                 self.flags |= _LIMIT_WARNING | _TORQUE_SATURATED
                 return violation
-            flags |= _TORQUE_SATURATED | _LIMIT_WARNING
-        if encoder is not None and encoder.test_nm:
+            status_flags |= _TORQUE_SATURATED | _LIMIT_WARNING
+        if encoder_watch is not None and encoder_watch.test_nm:
             limit_nm = controller.torque_limit_nm
-            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder.test_nm))
+            torque_nm = max(-limit_nm, min(limit_nm, torque_nm + encoder_watch.test_nm))
         self._commanding = True
         sent_nm = self.torque_command_nm = self._drive.command(torque_nm)
         self._torque_squares_nm2 += sent_nm * sent_nm
         self._recent_ticks.append((self.angle_rad, self.coupling_torque_nm, sent_nm))
-        self.flags = flags
+        self.flags = status_flags
         return None
 
     def start(self, noise_nm: float) -> None:
@@ -297,16 +306,16 @@ class Cycle:
             self.encoder_watch.reset(self.angle_rad, noise_nm)
         self._recent_ticks.clear()
 
-    def skip(self, missed: int) -> None:
-        """Pass the number of missed ticks to limit and encoder monitors; the torque was held."""
-        if missed:
-            self.watch.skip(missed)
-            self.skip_encoder(missed)
+    def skip(self, missed_ticks: int) -> None:
+        """Report ticks missed while the torque was held to the limit and encoder monitors."""
+        if missed_ticks:
+            self.watch.skip(missed_ticks)
+            self.skip_encoder(missed_ticks)
 
-    def skip_encoder(self, missed: int) -> None:
-        """Pass the number of missed ticks to the encoder monitor only."""
+    def skip_encoder(self, missed_ticks: int) -> None:
+        """Report missed ticks to the encoder monitor only."""
         if self.encoder_watch is not None:
-            self.encoder_watch.skip(missed, self.angle_rad)
+            self.encoder_watch.skip(missed_ticks, self.angle_rad)
 
     def accelerates_against_torque(
         self, inertia_kg_m2: float, rate_hz: float, resolution_rad: float
@@ -327,19 +336,19 @@ class Cycle:
         resolution_rad
             Resolution of the encoder.
         """
-        recent = self._recent_ticks
-        if len(recent) < _RECENT_TICKS:
+        recent_ticks = self._recent_ticks
+        if len(recent_ticks) < _RECENT_TICKS:
             return False
-        angles_rad = [angle_rad for angle_rad, _, _ in recent]
-        before_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
-        now_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
-        speed_change_rad = now_rad - before_rad
-        if abs(now_rad) < _MIN_SPEED_STEPS * resolution_rad or abs(
+        angles_rad = [angle_rad for angle_rad, _, _ in recent_ticks]
+        earlier_movement_rad = angles_rad[_SPEED_TICKS] - angles_rad[0]
+        last_movement_rad = angles_rad[-1] - angles_rad[-1 - _SPEED_TICKS]
+        speed_change_rad = last_movement_rad - earlier_movement_rad
+        if abs(last_movement_rad) < _MIN_SPEED_STEPS * resolution_rad or abs(
             speed_change_rad
-        ) < _MIN_SPEED_CHANGE * abs(now_rad):
+        ) < _MIN_SPEED_CHANGE * abs(last_movement_rad):
             return False
         half_window = _SPEED_TICKS // 2
-        torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent]
+        torques_nm = [sent_nm - coupling_nm for _, coupling_nm, sent_nm in recent_ticks]
         impulse_nm_s = sum(torques_nm[half_window : -1 - half_window]) / rate_hz
         expected_rad = impulse_nm_s / inertia_kg_m2 * _SPEED_TICKS / rate_hz
         min_ratio, max_ratio = _OPPOSITE_ACCELERATION_RATIOS
@@ -351,14 +360,16 @@ class Cycle:
 
     @property
     def stale(self) -> bool:
-        """Whether a reading of the last tick is stale."""
+        """Whether angle or wrench of the last tick is older than the tick."""
         return bool(self.flags & (_ANGLE_STALE | _WRENCH_STALE))
 
     @property
     def stale_names(self) -> str:
-        """Names of the stale readings of the last tick."""
-        names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
-        return " and ".join(name for flag, name in names if self.flags & flag).capitalize()
+        """Names of the last tick's stale readings, as text for a message."""
+        flag_names = ((_ANGLE_STALE, "a new angle"), (_WRENCH_STALE, "a new wrench"))
+        return " and ".join(
+            reading_name for stale_flag, reading_name in flag_names if self.flags & stale_flag
+        ).capitalize()
 
     def check_encoder(self, standstill: StandstillMonitor, due_ns: int) -> None:
         """Raise `DeviceError` if the angle just read has jumped, while the torque is off.
@@ -385,19 +396,21 @@ class Cycle:
         """
         if self.flags & _UNUSABLE_FLAGS & ~_ANGLE_STALE:
             return None
-        gauges = self._gauges
-        return self.sensor_watch.step(self.raw_wrench if gauges is None else gauges.gauges)
+        gauge_sensor = self._gauges
+        return self.sensor_watch.step(
+            self.raw_wrench if gauge_sensor is None else gauge_sensor.gauges
+        )
 
     def check_stale(self) -> Violation | None:
         """Return a violation if a device has sent no usable reading for too long, else None."""
-        flags = self.flags
-        if not (flags & _UNUSABLE_FLAGS or self._last_unusable):
+        status_flags = self.flags
+        if not (status_flags & _UNUSABLE_FLAGS or self._last_unusable):
             return None
-        self._last_unusable = bool(flags & _UNUSABLE_FLAGS)
+        self._last_unusable = bool(status_flags & _UNUSABLE_FLAGS)
         return self.watch.check_stale(
-            bool(flags & _ANGLE_STALE),
-            bool(flags & _WRENCH_STALE),
-            bool(flags & _WRENCH_SATURATED),
+            bool(status_flags & _ANGLE_STALE),
+            bool(status_flags & _WRENCH_STALE),
+            bool(status_flags & _WRENCH_SATURATED),
         )
 
     def with_reported_cause(self, violation: Violation) -> Violation:
@@ -410,18 +423,18 @@ class Cycle:
         violation
             Any violation; devices report causes of stale readings only.
         """
-        for device, names in (
+        for device, channel_names in (
             (self._drive, _STALE_ANGLE_CHANNELS),
             (self._sensor, _STALE_WRENCH_CHANNELS),
         ):
-            if violation.channel in names and (cause := device.health().cause):
+            if violation.channel in channel_names and (cause := device.health().cause):
                 return replace(violation, remedy=cause)
         return violation
 
     def check_slow_limits(
         self, due_ns: int, recorder_lag_s: float = 0.0, disk_free_mb: float = inf
     ) -> Violation | None:
-        """Check motor heat, recorder lag and free disk space, every `SLOW_CHECK_TICKS` ticks.
+        """Check motor heat, recorder lag and free disk space; return the violated limit or None.
 
         Parameters
         ----------
@@ -494,21 +507,21 @@ class RestReadings:
     @property
     def mean(self) -> Wrench:
         """Mean of the raw wrench at rest on each axis, in N and N·m."""
-        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.mean(axis=0))
+        fx, fy, fz, tx, ty, tz = (float(axis_mean) for axis_mean in self.wrenches.mean(axis=0))
         return fx, fy, fz, tx, ty, tz
 
     @property
     def spread(self) -> Wrench:
         """Standard deviation of the raw wrench at rest on each axis, in N and N·m."""
-        fx, fy, fz, tx, ty, tz = (float(value) for value in self.wrenches.std(axis=0, ddof=1))
+        fx, fy, fz, tx, ty, tz = (float(axis_std) for axis_std in self.wrenches.std(axis=0, ddof=1))
         return fx, fy, fz, tx, ty, tz
 
     def as_metadata(self) -> dict[str, str]:
-        """Return duration, mean and standard deviation as metadata of the session file."""
+        """Return duration in s, and mean and standard deviation of each axis, as file metadata."""
         return {"tare_s": repr(self.duration_s)} | {
-            f"tare_{statistic}_{axis}": repr(value)
-            for statistic, values in (("mean", self.mean), ("std", self.spread))
-            for axis, value in zip(WRENCH_FIELDS, values, strict=True)
+            f"tare_{statistic}_{axis}": repr(axis_value)
+            for statistic, axis_values in (("mean", self.mean), ("std", self.spread))
+            for axis, axis_value in zip(WRENCH_FIELDS, axis_values, strict=True)
         }
 
 
@@ -535,15 +548,17 @@ def observe_rest(
         Function that is called after each reading and ends the readings by raising.
     """
     wrenches: list[Wrench] = []
-    angles: list[float] = []
+    angles_rad: list[float] = []
     for _ in range(round(duration_s * rate_hz)):
         scheduler.wait()
         cycle.observe(scheduler.due_ns)
         check()
         wrenches.append(cycle.raw_wrench)
-        angles.append(cycle.angle_rad)
-    readings = np.array(wrenches)
-    return RestReadings(duration_s, readings, np.array(angles), readings @ np.array(projection))
+        angles_rad.append(cycle.angle_rad)
+    wrench_array = np.array(wrenches)
+    return RestReadings(
+        duration_s, wrench_array, np.array(angles_rad), wrench_array @ np.array(projection)
+    )
 
 
 # The limits' watch, and the motor's heat
@@ -560,7 +575,7 @@ def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
         Heat of the motor: mean square of its torque over its thermal time constant, (N·m)².
     """
     rig = profile.rig
-    watch = LimitWatch(
+    limit_watch = LimitWatch(
         profile.limits,
         rig.sensor.range,
         rig.rate_hz,
@@ -570,8 +585,8 @@ def make_limit_monitor(profile: Profile, heat_nm2: float = 0.0) -> LimitWatch:
         thermal_time_constant_s=rig.motor.thermal_time_constant_s,
         tare_warning_nm=profile.session.tare_drift_nm,
     )
-    watch.heat_nm2 = heat_nm2
-    return watch
+    limit_watch.heat_nm2 = heat_nm2
+    return limit_watch
 
 
 @dataclass(frozen=True, slots=True)
@@ -595,9 +610,9 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
         Devices that are read.
     """
     rig = profile.rig
-    prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
-    encoder = EncoderWatch(
-        prediction,
+    beam_prediction = BeamPrediction(rig.beam, rig.damping, rig.rate_hz)
+    encoder_watch = EncoderWatch(
+        beam_prediction,
         rig.rate_hz,
         resolution_rad=rig.encoder.resolution_rad,
         inertia_kg_m2=rig.motor.inertia_kg_m2,
@@ -609,11 +624,14 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
     is_noisy = [True] * 6
     if simulation is not None:
         is_noisy = [simulation.force_noise_n > 0.0] * 3 + [simulation.torque_noise_nm > 0.0] * 3
-    channels: Sequence[str] = WRENCH_FIELDS
+    channel_names: Sequence[str] = WRENCH_FIELDS
     if isinstance(devices.sensor, GaugeSensor):
         # Each gauge shows the noise of all axes.
-        channels, is_noisy = [f"gauge {number}" for number in range(6)], [all(is_noisy)] * 6
-    return ReadingMonitors(encoder, SensorWatch(channels, is_noisy, rig.rate_hz))
+        channel_names, is_noisy = (
+            [f"gauge {gauge_number}" for gauge_number in range(6)],
+            [all(is_noisy)] * 6,
+        )
+    return ReadingMonitors(encoder_watch, SensorWatch(channel_names, is_noisy, rig.rate_hz))
 
 
 def store_motor_heat(profile: Profile, heat_nm2: float) -> None:
@@ -628,13 +646,13 @@ def store_motor_heat(profile: Profile, heat_nm2: float) -> None:
     heat_nm2
         Heat of the motor, from the limit monitor.
     """
-    document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
+    heat_document = {"heat_nm2": heat_nm2, "boot_s": time.clock_gettime(time.CLOCK_BOOTTIME)}
     with suppress(OSError, UnsafeFolderError):
-        path = _heat_file(profile)
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        temporary_path = path.with_suffix(".new")
-        temporary_path.write_text(json.dumps(document), encoding="utf-8")
-        temporary_path.replace(path)
+        heat_path = _heat_file(profile)
+        heat_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        temporary_path = heat_path.with_suffix(".new")
+        temporary_path.write_text(json.dumps(heat_document), encoding="utf-8")
+        temporary_path.replace(heat_path)
 
 
 def stored_motor_heat_nm2(profile: Profile) -> float:
@@ -643,8 +661,8 @@ def stored_motor_heat_nm2(profile: Profile) -> float:
     The motor cools with its thermal time constant.
     """
     try:
-        document = json.loads(_heat_file(profile).read_text("utf-8"))
-        heat_nm2, boot_s = float(document["heat_nm2"]), float(document["boot_s"])
+        heat_document = json.loads(_heat_file(profile).read_text("utf-8"))
+        heat_nm2, boot_s = float(heat_document["heat_nm2"]), float(heat_document["boot_s"])
     except (OSError, UnsafeFolderError, ValueError, TypeError, KeyError):
         return 0.0
     elapsed_s = time.clock_gettime(time.CLOCK_BOOTTIME) - boot_s
@@ -657,5 +675,5 @@ def stored_motor_heat_nm2(profile: Profile) -> float:
 
 def _heat_file(profile: Profile) -> Path:
     """Return the path of the file that stores the heat of a rig's motor."""
-    file_name_part = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
-    return runtime_folder() / f"heat-{file_name_part}.json"
+    rig_file_name = "".join(c if c.isalnum() else "-" for c in profile.name).strip("-")
+    return runtime_folder() / f"heat-{rig_file_name}.json"

@@ -49,7 +49,7 @@ else, such as text."""
 
 @dataclass(frozen=True, slots=True)
 class ControlJob:
-    """Job of the control process: the rig to connect and control."""
+    """First message to the control process: the profile of the rig to connect and control."""
 
     profile: "Profile"
     """Profile whose devices are connected."""
@@ -63,7 +63,7 @@ class ControlJob:
 
 @dataclass(frozen=True, slots=True)
 class Ending:
-    """Plan of the steps that follow a record while the motor is still held."""
+    """Plan of the steps after a session's record: how to damp the beam and return the motor."""
 
     stays: bool = False
     """Whether the motor stays at the end of the reference instead of returning to the start."""
@@ -75,7 +75,7 @@ class Ending:
 
 @dataclass(frozen=True, slots=True)
 class TouchOrder:
-    """Order to search for an obstacle in a session."""
+    """Settings of a session that moves the beam until it touches an obstacle."""
 
     beam: "WatchedBeam"
     """Model of the beam for the touch detector."""
@@ -167,7 +167,7 @@ class Finished:
 
 @dataclass(frozen=True, slots=True)
 class Measured:
-    """Message with the result of a measurement between sessions."""
+    """Message with the result of a tare, a new zero or a probing move between sessions."""
 
     values: dict[str, Any]
     """Results by name, as the methods `tare`, `zero` and `probe` of `rigd.runner.Rig` return."""
@@ -175,7 +175,7 @@ class Measured:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Message that a measurement was not possible."""
+    """Message that a tare, a new zero or a probing move failed, with the reason."""
 
     reason: str
     """Reason, such as a moving motor, as a sentence for the operator."""
@@ -194,7 +194,7 @@ class Ended:
 
 @dataclass(frozen=True, slots=True)
 class RecorderJob:
-    """Job of the recorder process: the session file to write."""
+    """First message to the recorder process: the path of the session file to write."""
 
     path: Path
     """Path of the session file; an existing file is not overwritten."""
@@ -230,7 +230,7 @@ class Close:
 
 @dataclass(frozen=True, slots=True)
 class Opened:
-    """Message that the session file exists."""
+    """Message of the recorder that it has created the session file."""
 
     realtime: Mapping[str, str]
     """Real-time scheduling that the system granted to the recorder."""
@@ -243,7 +243,7 @@ class Armed:
 
 @dataclass(frozen=True, slots=True)
 class Closed:
-    """Message that the session file is complete."""
+    """Message of the recorder that it has completed and closed the session file."""
 
     path: Path | None = None
     """Path of the file; None: no record had begun, and there is no file."""
@@ -272,7 +272,7 @@ class Failed:
 
 @dataclass(frozen=True, slots=True)
 class TouchJob:
-    """Job of the touch process: estimate the touches of a session."""
+    """First message to the touch process, which estimates the touches of a session."""
 
     channels: "ChannelSpecs"
     """Shared memory of the rig's processes."""
@@ -296,7 +296,7 @@ class TouchReady:
 
 @dataclass(frozen=True, slots=True)
 class TouchReport:
-    """Message with the estimate of a touch."""
+    """Message of the touch process with the estimated position and force of a touch."""
 
     number: int
     """Number of the touch in its session, from 1 on."""
@@ -380,8 +380,8 @@ class SearchEnded:
 
 def encode(message: object) -> bytes:
     """Return a message as bytes for a pipe: its length and the pickled object."""
-    data = pickle.dumps(message)
-    return _LENGTH_HEADER.pack(len(data)) + data
+    pickled_message = pickle.dumps(message)
+    return _LENGTH_HEADER.pack(len(pickled_message)) + pickled_message
 
 
 class MessageReader:
@@ -415,20 +415,20 @@ class MessageReader:
         while (message := self._take_complete_message()) is None:
             if not is_ready(self._fd, select.POLLIN, timeout_s):
                 return None
-            data = os.read(self._fd, 65_536)
-            if not data:
+            received_bytes = os.read(self._fd, 65_536)
+            if not received_bytes:
                 raise EOFError
-            self._pending += data
+            self._pending += received_bytes
         return message
 
     def _take_complete_message(self) -> object | None:
         """Remove and return the first complete message of the data read so far, or None."""
         if len(self._pending) < _LENGTH_HEADER.size:
             return None
-        (length,) = _LENGTH_HEADER.unpack_from(self._pending)
-        if length > _MAX_MESSAGE_BYTES:
+        (message_bytes,) = _LENGTH_HEADER.unpack_from(self._pending)
+        if message_bytes > _MAX_MESSAGE_BYTES:
             raise ValueError(f"no message, but {bytes(self._pending[:80])!r}")
-        end = _LENGTH_HEADER.size + length
+        end = _LENGTH_HEADER.size + message_bytes
         if len(self._pending) < end:
             return None
         message: object = pickle.loads(self._pending[_LENGTH_HEADER.size : end])
@@ -436,18 +436,18 @@ class MessageReader:
         return message
 
 
-def is_ready(fd: int, event: int, timeout_s: float | None) -> bool:
-    """Wait until a descriptor can be read or written, and return whether it can.
+def is_ready(fd: int, poll_event: int, timeout_s: float | None) -> bool:
+    """Wait until a descriptor can be read or written; return False after the timeout.
 
     Parameters
     ----------
     fd
         File descriptor. Unlike `select`, `poll` accepts numbers beyond 1023.
-    event
+    poll_event
         ``select.POLLIN`` to read or ``select.POLLOUT`` to write.
     timeout_s
         Longest time to wait in s; None: wait forever.
     """
     poller = select.poll()
-    poller.register(fd, event)
+    poller.register(fd, poll_event)
     return bool(poller.poll(None if timeout_s is None else 1000 * max(timeout_s, 0.0)))

@@ -50,7 +50,7 @@ class Child:
     module
         Module that is run as ``python -m module``. It starts its imports at once and waits for its
         job.
-    fds
+    descriptors
         Descriptors that the child inherits.
     cores
         Cores that the child may use; empty: those of this process.
@@ -62,7 +62,7 @@ class Child:
     """
 
     def __init__(
-        self, name: str, module: str, fds: Sequence[int], cores: Collection[int] = ()
+        self, name: str, module: str, descriptors: Sequence[int], cores: Collection[int] = ()
     ) -> None:
         self.name = name
         try:
@@ -72,7 +72,7 @@ class Child:
                     bufsize=0,
                     stdin=subprocess.PIPE,
                     stdout=subprocess.PIPE,
-                    pass_fds=fds,
+                    pass_fds=descriptors,
                     env=os.environ | SINGLE_THREADED,
                 )
         except OSError as error:
@@ -123,11 +123,13 @@ class Child:
         try:
             return self._messages.next(timeout_s)
         except EOFError:
-            code = self._process.wait()
-            how_it_ended = (
-                f"killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
+            exit_code = self._process.wait()
+            end_text = (
+                f"killed by signal {-exit_code}"
+                if exit_code < 0
+                else f"ended with exit code {exit_code}"
             )
-            raise ChildError(f"The {self.name} process was {how_it_ended}.") from None
+            raise ChildError(f"The {self.name} process was {end_text}.") from None
         except ValueError as error:
             raise ChildError(f"The {self.name} process sent {error}.") from None
 
@@ -162,12 +164,12 @@ class Child:
             with contextlib.suppress(BrokenPipeError):  # it had ended already
                 self._process.stdin.close()
         self.wake()
-        for end_process in (self._process.terminate, self._process.kill):
+        for terminate_or_kill in (self._process.terminate, self._process.kill):
             try:
                 self._process.wait(_EXIT_GRACE_S if self._wait_for_output_end(grace_s) else 0.0)
                 break
             except subprocess.TimeoutExpired:
-                end_process()
+                terminate_or_kill()
         with contextlib.suppress(
             subprocess.TimeoutExpired
         ):  # stuck in a call, on a disk that hangs
@@ -176,8 +178,8 @@ class Child:
 
     def _wait_for_output_end(self, patience_s: float) -> bool:
         """Wait until the child's output ends, and return whether it ends within `patience_s`."""
-        deadline = time.monotonic() + patience_s
-        while (remaining_s := deadline - time.monotonic()) > 0:
+        deadline_s = time.monotonic() + patience_s
+        while (remaining_s := deadline_s - time.monotonic()) > 0:
             if is_ready(self._stdout_fd, select.POLLIN, remaining_s) and not os.read(
                 self._stdout_fd, 65536
             ):
@@ -196,16 +198,16 @@ class Child:
         assert self._process.stdin is not None
         return self._process.stdin.fileno()
 
-    def _write(self, data: bytes) -> None:
+    def _write(self, message_bytes: bytes) -> None:
         """Write bytes to the child's input; raise `ChildError` if it does not read them in time."""
-        unsent = memoryview(data)
-        deadline = time.monotonic() + _WRITE_PATIENCE_S
-        while unsent:
-            patience_s = max(0.0, deadline - time.monotonic())
+        unsent_bytes = memoryview(message_bytes)
+        deadline_s = time.monotonic() + _WRITE_PATIENCE_S
+        while unsent_bytes:
+            patience_s = max(0.0, deadline_s - time.monotonic())
             if not is_ready(self._stdin_fd, select.POLLOUT, patience_s):
                 raise ChildError(f"The {self.name} process does not listen.")
             try:
-                unsent = unsent[os.write(self._stdin_fd, unsent) :]
+                unsent_bytes = unsent_bytes[os.write(self._stdin_fd, unsent_bytes) :]
             except BrokenPipeError:
                 return  # poll() reports how it ended
 
@@ -262,7 +264,7 @@ class Parent:
 
 @dataclass(frozen=True, slots=True)
 class Process:
-    """How one of the rig's processes is started, watched and ended."""
+    """Description of one process of a rig: how it is started, watched and ended."""
 
     name: str
     """Name of the process in messages to the operator."""
@@ -358,17 +360,17 @@ class Heartbeat:
         self._polled_s = 0.0
         self.still_s = 0.0
 
-    def stalled_for(self, beat: int, now_s: float) -> float:
+    def stalled_for(self, beat_count: int, now_s: float) -> float:
         """Return the time in s for which a process's heartbeat count has not changed.
 
         Parameters
         ----------
-        beat
+        beat_count
             Present count, which the process increments while it runs.
         now_s
             Time of a monotonic clock.
         """
         passed_s = min(now_s - self._polled_s, self._MAX_STEP_S)
-        self.still_s = self.still_s + passed_s if beat == self._beat else 0.0
-        self._beat, self._polled_s = beat, now_s
+        self.still_s = self.still_s + passed_s if beat_count == self._beat else 0.0
+        self._beat, self._polled_s = beat_count, now_s
         return self.still_s

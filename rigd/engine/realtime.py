@@ -47,7 +47,7 @@ def collect_no_garbage() -> str:
     return "off"
 
 
-def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[str, str]:
+def apply_realtime(*, priority: int, cpu: int, root_folder: Path = Path("/")) -> dict[str, str]:
     """Apply the real-time settings of a 1 kHz loop, and return the result of each setting.
 
     Parameters
@@ -57,7 +57,7 @@ def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[s
     cpu
         Core to run on; -1: the last isolated core or, if none is isolated, the last core that this
         process may use.
-    root
+    root_folder
         Root of the file system.
 
     Returns
@@ -66,16 +66,19 @@ def apply_realtime(*, priority: int, cpu: int, root: Path = Path("/")) -> dict[s
         One entry per setting: the granted value, or "refused: " and the reason.
     """
     libc = ctypes.CDLL(None, use_errno=True)
-    settings: dict[str, Callable[[], str]] = {
+    setting_functions: dict[str, Callable[[], str]] = {
         "memory": lambda: lock_memory(libc),
         "timer_slack": lambda: _set_timer_slack(libc),
         "garbage_collector": collect_no_garbage,
-        "cpu": lambda: _pin_to_loop_core(cpu, root),
-        "idle_states": lambda: _limit_idle_states(root),
+        "cpu": lambda: _pin_to_loop_core(cpu, root_folder),
+        "idle_states": lambda: _limit_idle_states(root_folder),
     }
     if priority > 0:
-        settings["scheduling"] = lambda: _set_fifo_priority(priority)
-    return {name: _try_setting(setting) for name, setting in settings.items()}
+        setting_functions["scheduling"] = lambda: _set_fifo_priority(priority)
+    return {
+        setting_name: _try_setting(apply_setting)
+        for setting_name, apply_setting in setting_functions.items()
+    }
 
 
 def pin_off_loop_core(loop_cpu: int) -> None:
@@ -104,11 +107,11 @@ class Precedence:
 
     Parameters
     ----------
-    priority
+    realtime_priority
         Priority under SCHED_RR; 0 leaves the scheduling policy as it is.
     loop_cpu
         Core of the loop, as in ``realtime.cpu``.
-    root
+    root_folder
         Root of the file system.
 
     Attributes
@@ -117,15 +120,17 @@ class Precedence:
         Cores that this process could use before it left the loop's core.
     """
 
-    def __init__(self, priority: int, loop_cpu: int, *, root: Path = Path("/")) -> None:
-        self._priority = priority
+    def __init__(
+        self, realtime_priority: int, loop_cpu: int, *, root_folder: Path = Path("/")
+    ) -> None:
+        self._priority = realtime_priority
         self.cores_before = frozenset(os.sched_getaffinity(0))
-        core, _ = _core_of_loop(loop_cpu, root)
+        core, _ = _core_of_loop(loop_cpu, root_folder)
         self._other_cores = self.cores_before - {core}
         self._apply: Callable[[int], None] | None = None
 
     def take(self) -> dict[str, str]:
-        """Request the raised priority, and return which scheduling and cores were granted.
+        """Request the raised priority, and return the results by setting: scheduling and cores.
 
         Returns
         -------
@@ -135,19 +140,19 @@ class Precedence:
         """
         if self._priority == 0:
             return {}
-        granted = _try_setting(self._raise_to_realtime)
-        if not granted.startswith(REFUSED):
+        scheduling_result = _try_setting(self._raise_to_realtime)
+        if not scheduling_result.startswith(REFUSED):
             return {
-                "scheduling": granted,
+                "scheduling": scheduling_result,
                 "cores": _format_cores(self._other_cores or self.cores_before),
             }
-        granted_niceness = _try_setting(self._raise_by_niceness)
-        if not granted_niceness.startswith(REFUSED):
-            return {"scheduling": f"{granted_niceness} (SCHED_RR {granted})"}
-        return {"scheduling": granted}
+        niceness_result = _try_setting(self._raise_by_niceness)
+        if not niceness_result.startswith(REFUSED):
+            return {"scheduling": f"{niceness_result} (SCHED_RR {scheduling_result})"}
+        return {"scheduling": scheduling_result}
 
     def cover(self) -> None:
-        """Extend the raised priority to new threads, which hold the same interpreter lock."""
+        """Raise the priority of the threads started since, too; one interpreter lock serves all."""
         if self._apply is None:
             return
         for thread in Path("/proc/self/task").iterdir():
@@ -176,42 +181,44 @@ class Precedence:
         self.cover()
         return f"nice {SUPERVISION_NICENESS}"
 
-    def _set_realtime(self, thread: int) -> None:
+    def _set_realtime(self, thread_id: int) -> None:
         """Set the real-time priority of a thread, and keep it off the loop's core."""
         # Forked processes and new threads start with the ordinary policy.
         policy = os.SCHED_RR | os.SCHED_RESET_ON_FORK
-        os.sched_setscheduler(thread, policy, os.sched_param(self._priority))
+        os.sched_setscheduler(thread_id, policy, os.sched_param(self._priority))
         if not self._other_cores:
             return
         try:
-            os.sched_setaffinity(thread, self._other_cores)
+            os.sched_setaffinity(thread_id, self._other_cores)
         except OSError:  # the set of usable cores has changed meanwhile
-            _set_ordinary(thread)
+            _set_ordinary(thread_id)
             raise
 
-    def _set_nice(self, thread: int) -> None:
-        """Set the niceness of a thread under the ordinary scheduling policy."""
-        os.setpriority(os.PRIO_PROCESS, thread, SUPERVISION_NICENESS)
-        _set_ordinary(thread)
+    def _set_nice(self, thread_id: int) -> None:
+        """Set the niceness `SUPERVISION_NICENESS` and the ordinary policy of a thread."""
+        os.setpriority(os.PRIO_PROCESS, thread_id, SUPERVISION_NICENESS)
+        _set_ordinary(thread_id)
 
-    def _restore(self, thread: int) -> None:
+    def _restore(self, thread_id: int) -> None:
         """Set ordinary priority and the original cores of a thread."""
-        _set_ordinary(thread)
-        os.setpriority(os.PRIO_PROCESS, thread, max(0, os.getpriority(os.PRIO_PROCESS, thread)))
-        os.sched_setaffinity(thread, self.cores_before)
+        _set_ordinary(thread_id)
+        os.setpriority(
+            os.PRIO_PROCESS, thread_id, max(0, os.getpriority(os.PRIO_PROCESS, thread_id))
+        )
+        os.sched_setaffinity(thread_id, self.cores_before)
 
 
-def _set_ordinary(thread: int) -> None:
+def _set_ordinary(thread_id: int) -> None:
     """Set the ordinary scheduling policy of a thread."""
     # The flag stays: removing it needs a privilege, and it is harmless.
     policy = os.SCHED_OTHER | os.SCHED_RESET_ON_FORK
-    os.sched_setscheduler(thread, policy, os.sched_param(0))
+    os.sched_setscheduler(thread_id, policy, os.sched_param(0))
 
 
-def isolated_cores(root: Path = Path("/")) -> frozenset[int]:
+def isolated_cores(root_folder: Path = Path("/")) -> frozenset[int]:
     """Return the processor cores that the kernel isolates (``isolcpus``); empty if unknown."""
     try:
-        return parse_core_list((root / _ISOLATED_CORES_FILE).read_text())
+        return parse_core_list((root_folder / _ISOLATED_CORES_FILE).read_text())
     except (OSError, ValueError):
         return frozenset()
 
@@ -224,11 +231,11 @@ def parse_core_list(text: str) -> frozenset[int]:
     ValueError
         If the text is no such list.
     """
-    cores: set[int] = set()
+    core_numbers: set[int] = set()
     for core_range in filter(None, text.strip().split(",")):
-        first, _, last = core_range.partition("-")
-        cores.update(range(int(first), int(last or first) + 1))
-    return frozenset(cores)
+        first_core, _, last_core = core_range.partition("-")
+        core_numbers.update(range(int(first_core), int(last_core or first_core) + 1))
+    return frozenset(core_numbers)
 
 
 def page_faults() -> int:
@@ -237,10 +244,10 @@ def page_faults() -> int:
     return usage.ru_minflt + usage.ru_majflt
 
 
-def _try_setting(setting: Callable[[], str]) -> str:
+def _try_setting(apply_setting: Callable[[], str]) -> str:
     """Apply a setting and return its result, or "refused: " and the reason of the failure."""
     try:
-        return setting()
+        return apply_setting()
     except (OSError, AttributeError, ValueError) as error:
         return f"{REFUSED}{error}"
 
@@ -250,13 +257,13 @@ def lock_memory(libc: ctypes.CDLL) -> str:
 
     `libc` is the C library, whose ``mlockall`` is called.
     """
-    limit, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
-    if limit == resource.RLIM_INFINITY or os.geteuid() == 0:
+    limit_bytes, _ = resource.getrlimit(resource.RLIMIT_MEMLOCK)
+    if limit_bytes == resource.RLIM_INFINITY or os.geteuid() == 0:
         _check_return_code(libc.mlockall(_MCL_CURRENT | _MCL_FUTURE))
         return MEMORY_LOCKED
     # With MCL_FUTURE, an allocation beyond the limit would fail in mid-session.
     _check_return_code(libc.mlockall(_MCL_CURRENT))
-    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit / 1e6:.0f} MB)"
+    return f"{MEMORY_LOCKED}, but for what is allocated later (limit of {limit_bytes / 1e6:.0f} MB)"
 
 
 def _set_timer_slack(libc: ctypes.CDLL) -> str:
@@ -265,18 +272,18 @@ def _set_timer_slack(libc: ctypes.CDLL) -> str:
     return "1 ns"
 
 
-def _core_of_loop(cpu: int, root: Path) -> tuple[int, bool]:
+def _core_of_loop(loop_cpu: int, root_folder: Path) -> tuple[int, bool]:
     """Return the core on which the control process runs, and whether the kernel isolates it."""
-    if cpu >= 0:  # chosen whether it may be used or not
-        return cpu, False
-    isolated = isolated_cores(root)
-    if isolated:
+    if loop_cpu >= 0:  # chosen whether it may be used or not
+        return loop_cpu, False
+    isolated_numbers = isolated_cores(root_folder)
+    if isolated_numbers:
         # Isolated cores are not in a process's affinity until it requests one: try it.
-        before = os.sched_getaffinity(0)
+        allowed_cores = os.sched_getaffinity(0)
         with contextlib.suppress(OSError):
-            os.sched_setaffinity(0, {max(isolated)})
-            os.sched_setaffinity(0, before)
-            return max(isolated), True
+            os.sched_setaffinity(0, {max(isolated_numbers)})
+            os.sched_setaffinity(0, allowed_cores)
+            return max(isolated_numbers), True
     return max(os.sched_getaffinity(0)), False
 
 
@@ -285,32 +292,34 @@ def _format_cores(cores: frozenset[int]) -> str:
     return ",".join(map(str, sorted(cores)))
 
 
-def _pin_to_loop_core(cpu: int, root: Path) -> str:
+def _pin_to_loop_core(loop_cpu: int, root_folder: Path) -> str:
     """Restrict this process to the core of the loop, and return its number as text."""
-    core, isolated = _core_of_loop(cpu, root)
+    core, isolated = _core_of_loop(loop_cpu, root_folder)
     os.sched_setaffinity(0, {core})
     return f"{core}, isolated" if isolated else str(core)
 
 
-def _limit_idle_states(root: Path) -> str:
+def _limit_idle_states(root_folder: Path) -> str:
     """Disable idle states that a core leaves slowly, until this process ends; return a text."""
-    states = (root / _IDLE_STATES_FOLDER).glob("cpu[0-9]*/cpuidle/state[0-9]*/latency")
-    if all(int(state.read_text()) <= MAX_WAKE_UP_US for state in states):
+    latency_files = (root_folder / _IDLE_STATES_FOLDER).glob(
+        "cpu[0-9]*/cpuidle/state[0-9]*/latency"
+    )
+    if all(int(latency_file.read_text()) <= MAX_WAKE_UP_US for latency_file in latency_files):
         return f"none slower than {MAX_WAKE_UP_US} µs"
-    fd = os.open(root / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
+    fd = os.open(root_folder / _IDLE_LATENCY_DEVICE, os.O_WRONLY | os.O_CLOEXEC)
     # The bound holds while the descriptor is open, until this process ends.
     os.write(fd, struct.pack("=i", MAX_WAKE_UP_US))
     return f"those that are left within {MAX_WAKE_UP_US} µs"
 
 
-def _set_fifo_priority(priority: int) -> str:
+def _set_fifo_priority(realtime_priority: int) -> str:
     """Set the real-time policy SCHED_FIFO for this process, and return it as text."""
-    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(priority))
-    return f"SCHED_FIFO {priority}"
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(realtime_priority))
+    return f"SCHED_FIFO {realtime_priority}"
 
 
-def _check_return_code(result: int) -> None:
-    """Raise the C library's last error if `result`, the return value of a call, is not 0."""
-    if result != 0:
+def _check_return_code(return_code: int) -> None:
+    """Raise the C library's last error if `return_code`, the return value of a call, is not 0."""
+    if return_code != 0:
         error_number = ctypes.get_errno()
         raise OSError(error_number, os.strerror(error_number))

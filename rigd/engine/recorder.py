@@ -49,21 +49,21 @@ def main() -> None:
     parent = Parent()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
-    granted = {}
+    realtime_results = {}
     if job.realtime is not None:
-        granted = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
+        realtime_results = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
         parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
     _publish_free_space(channels.shared_state, job.path.parent)
-    parent.send(Opened(granted))
+    parent.send(Opened(realtime_results))
     try:
         _record_until_closed(parent, channels, writer, job.path.parent)
     except SessionError as error:
-        text, saved_path = _abandon_recording(writer)
-        parent.send(Failed(f"{error}{text}", saved_path=saved_path))
+        failure_text, saved_path = _abandon_recording(writer)
+        parent.send(Failed(f"{error}{failure_text}", saved_path=saved_path))
         raise SystemExit(1) from None
 
 
@@ -88,18 +88,18 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
 
 
 def _record_until_closed(
-    parent: Parent, channels: Channels, writer: SessionWriter, folder: Path
+    parent: Parent, channels: Channels, writer: SessionWriter, disk_folder: Path
 ) -> None:
     """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
     polled_s = time.monotonic()
     while True:
-        transferred = recorder.transfer()
+        has_transferred = recorder.transfer()
         if time.monotonic() - polled_s > _DISK_POLL_S:
             polled_s = time.monotonic()
-            _publish_free_space(channels.shared_state, folder)
+            _publish_free_space(channels.shared_state, disk_folder)
         try:
-            message = parent.poll(0.0 if transferred else _IDLE_PAUSE_S)
+            message = parent.poll(0.0 if has_transferred else _IDLE_PAUSE_S)
         except EOFError:
             recorder.close_without_supervisor()
             return
@@ -118,10 +118,12 @@ def _record_until_closed(
                 return
 
 
-def _publish_free_space(shared_state: SharedState, folder: Path) -> None:
+def _publish_free_space(shared_state: SharedState, disk_folder: Path) -> None:
     """Publish the free space on the disk of a folder, in MB, in the shared state."""
     with contextlib.suppress(OSError):
-        shared_state[StateField.DISK_FREE_MB] = max(1, ceil(shutil.disk_usage(folder).free / 1e6))
+        shared_state[StateField.DISK_FREE_MB] = max(
+            1, ceil(shutil.disk_usage(disk_folder).free / 1e6)
+        )
 
 
 class Recorder:
@@ -143,14 +145,14 @@ class Recorder:
     def __init__(self, channels: Channels, writer: SessionWriter) -> None:
         self._channels = channels
         self._writer = writer
-        writers: dict[Topic, Callable[[bytes], None]] = {
+        topic_writers: dict[Topic, Callable[[bytes], None]] = {
             EVENT: self._write_events,
             CONTROL: writer.write_controls,
             TIMING: writer.write_timings,
             SAMPLE: self._write_samples,
         }
         self._ring_writers = [
-            (ring, writers[topic])
+            (ring, topic_writers[topic])
             for topic, ring in zip(TOPICS, channels.rings, strict=True)
             if topic.logged
         ]
@@ -159,11 +161,14 @@ class Recorder:
         """Header of the session; None until the supervisor has sent it."""
         self.begun = False
 
-    def _begin(self, header: FileHeader) -> None:
+    def _begin(self, file_header: FileHeader) -> None:
         """Write metadata, segments and attachments at the start of the file."""
-        attachments = {name: text.encode() for name, text in header.attachments.items()}
+        attachments = {
+            attachment_name: attachment_text.encode()
+            for attachment_name, attachment_text in file_header.attachments.items()
+        }
         start_utc_ns = self._channels.shared_state[StateField.START_UTC_NS]
-        self._writer.begin(start_utc_ns, header.metadata, header.segments, attachments)
+        self._writer.begin(start_utc_ns, file_header.metadata, file_header.segments, attachments)
         self.begun = True
 
     def transfer(self) -> bool:
@@ -173,23 +178,23 @@ class Recorder:
             if self.header is None or not self._channels.shared_state[StateField.START_UTC_NS]:
                 return False
             self._begin(self.header)
-        transferred = False
-        for ring, write in self._ring_writers:
-            block = ring.take(_MAX_BLOCK_RECORDS)
-            if block:
-                write(block)
-                transferred = True
-        return transferred
+        has_transferred = False
+        for ring, write_block in self._ring_writers:
+            record_bytes = ring.take(_MAX_BLOCK_RECORDS)
+            if record_bytes:
+                write_block(record_bytes)
+                has_transferred = True
+        return has_transferred
 
-    def _write_events(self, block: bytes) -> None:
+    def _write_events(self, record_bytes: bytes) -> None:
         """Write a block of log events to the file."""
-        for event in read_events(block):
+        for event in read_events(record_bytes):
             self._writer.log(event.t_ns, event.level, event.message)
 
-    def _write_samples(self, block: bytes) -> None:
+    def _write_samples(self, record_bytes: bytes) -> None:
         """Write a block of samples to the file and count them."""
-        self._writer.write_samples(block)
-        self._recorded += len(block) // SAMPLE_SIZE
+        self._writer.write_samples(record_bytes)
+        self._recorded += len(record_bytes) // SAMPLE_SIZE
 
     def close(
         self,
@@ -209,51 +214,54 @@ class Recorder:
             pass
         accounted_ticks = self._recorded + int(outcome["missed"])
         # A killed control process may not have counted its last sample.
-        scheduled = max(int(outcome["scheduled"]), accounted_ticks)
-        counts = {
-            "scheduled": scheduled,
+        scheduled_ticks = max(int(outcome["scheduled"]), accounted_ticks)
+        tick_counts = {
+            "scheduled": scheduled_ticks,
             "recorded": self._recorded,
-            "lost": scheduled - accounted_ticks,
+            "lost": scheduled_ticks - accounted_ticks,
         }
-        if counts["lost"] and outcome["outcome"] == "complete":
+        if tick_counts["lost"] and outcome["outcome"] == "complete":
             outcome = {
                 **outcome,
                 "outcome": "fault",
                 "reason": "Samples were lost before the recorder.",
             }
-        outcome_with_counts = {**outcome, **{name: str(count) for name, count in counts.items()}}
+        outcome_with_counts = {
+            **outcome,
+            **{count_name: str(tick_count) for count_name, tick_count in tick_counts.items()},
+        }
         shared_state = self._channels.shared_state
         if self.header is not None and (
             shared_state[StateField.PLANNED] or shared_state[StateField.LAST_SEGMENT]
         ):
             # Segments of a growing reference end with the record.
-            segments = segments_until({**self.header.segments, **segments}, scheduled)
-        path = self._writer.close(outcome_with_counts, segments)
-        return Closed(path, counts, outcome["outcome"], outcome["reason"])
+            segments = segments_until({**self.header.segments, **segments}, scheduled_ticks)
+        closed_path = self._writer.close(outcome_with_counts, segments)
+        return Closed(closed_path, tick_counts, outcome["outcome"], outcome["reason"])
 
     def close_without_supervisor(self) -> None:
         """Wait until the loop has stopped, and close the file without the supervisor's order."""
         shared_state = self._channels.shared_state
         self.transfer()  # all of the record may still be in the rings
-        deadline = time.monotonic() + _ORPHAN_PATIENCE_S
-        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < deadline:
+        deadline_s = time.monotonic() + _ORPHAN_PATIENCE_S
+        while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < deadline_s:
             if self.transfer():
-                deadline = time.monotonic() + _ORPHAN_PATIENCE_S
+                deadline_s = time.monotonic() + _ORPHAN_PATIENCE_S
             time.sleep(_IDLE_PAUSE_S)
         if self.header is None or not self.begun:
             self._writer.discard()
             return
-        scheduled = shared_state[StateField.SCHEDULED]
-        complete = is_whole(
-            shared_state, scheduled, max(end for _, end in self.header.segments.values())
+        scheduled_ticks = shared_state[StateField.SCHEDULED]
+        is_complete = is_whole(
+            shared_state, scheduled_ticks, max(end for _, end in self.header.segments.values())
         )
         self.close(
             {
-                "outcome": "complete" if complete else "fault",
+                "outcome": "complete" if is_complete else "fault",
                 "reason": "After the record: The supervising process ended."
-                if complete
+                if is_complete
                 else "The supervising process ended during the session.",
-                "scheduled": str(scheduled),
+                "scheduled": str(scheduled_ticks),
                 "missed": str(shared_state[StateField.MISSED]),
                 "late": str(shared_state[StateField.LATE]),
                 "stale_angles": str(shared_state[StateField.STALE_ANGLES]),

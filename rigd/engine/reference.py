@@ -28,7 +28,7 @@ _MAX_ANGLE_RAD = 6.3
 
 @dataclass(frozen=True, slots=True)
 class ReferenceSpec:
-    """Descriptor and length of a reference in shared memory, for processes that attach to it."""
+    """Descriptor and length of the reference angles in shared memory, to attach to them."""
 
     fd: int
     """File descriptor of the shared memory, which child processes inherit."""
@@ -39,9 +39,9 @@ class ReferenceSpec:
 
 
 def write_reference(
-    fd: int, reference_rad: "NDArray[np.float64]", planned: int | None = None
+    fd: int, reference_rad: "NDArray[np.float64]", planned_ticks: int | None = None
 ) -> ReferenceSpec:
-    """Write a reference to shared memory, and return the description with which others attach.
+    """Write reference angles to shared memory; return what other processes need to attach.
 
     Parameters
     ----------
@@ -49,7 +49,7 @@ def write_reference(
         Descriptor of the memory.
     reference_rad
         Angles from the rig's zero, one per tick; shape (n,).
-    planned
+    planned_ticks
         Number of ticks that are planned; None: all.
 
     Raises
@@ -57,11 +57,11 @@ def write_reference(
     OSError
         If there is not enough shared memory.
     """
-    size = _DOUBLE_BYTES * reference_rad.size
-    reserve(fd, size)
-    with mmap.mmap(fd, size) as memory:
-        memory[:] = reference_rad.astype("float64").tobytes()
-    return ReferenceSpec(fd, reference_rad.size, planned)
+    reference_bytes = _DOUBLE_BYTES * reference_rad.size
+    reserve(fd, reference_bytes)
+    with mmap.mmap(fd, reference_bytes) as shared_memory:
+        shared_memory[:] = reference_rad.astype("float64").tobytes()
+    return ReferenceSpec(fd, reference_rad.size, planned_ticks)
 
 
 def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
@@ -69,28 +69,28 @@ def map_reference(spec: ReferenceSpec) -> "memoryview[float]":
 
     Changes of a complete reference are visible in this process only.
     """
-    access = mmap.ACCESS_COPY if spec.planned is None else mmap.ACCESS_READ
-    memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks, access=access)
-    return memoryview(memory).cast("d")
+    access_mode = mmap.ACCESS_COPY if spec.planned is None else mmap.ACCESS_READ
+    shared_memory = mmap.mmap(spec.fd, _DOUBLE_BYTES * spec.ticks, access=access_mode)
+    return memoryview(shared_memory).cast("d")
 
 
-def is_whole(shared_state: SharedState, scheduled: int, ticks: int) -> bool:
-    """Return whether a record extends to the end of its reference.
+def is_whole(shared_state: SharedState, scheduled_ticks: int, reference_ticks: int) -> bool:
+    """Return whether the ticks of a record extend to the end of its reference angles.
 
     Parameters
     ----------
     shared_state
         State of the session.
-    scheduled
+    scheduled_ticks
         Number of ticks of the record.
-    ticks
+    reference_ticks
         Number of ticks of the reference; for a growing reference, its capacity.
     """
-    if scheduled == ticks:
+    if scheduled_ticks == reference_ticks:
         return True
     return (
         bool(shared_state[StateField.LAST_SEGMENT])
-        and scheduled >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD] > 0
+        and scheduled_ticks >= shared_state[StateField.PLANNED] + shared_state[StateField.HELD] > 0
     )
 
 
@@ -128,19 +128,19 @@ class ReferenceWriter:
         ValueError
             If the capacity is exceeded, or the segment does not begin and end at the start angle.
         """
-        size = int(reference_rad.size)
+        segment_ticks = int(reference_rad.size)
         ends_rad = abs(reference_rad[0]), abs(reference_rad[-1])
         # Also refuse NaN: the loop follows every angle in this memory.
         if not (max(ends_rad) <= _AT_REST_RAD and abs(reference_rad).max() < _MAX_ANGLE_RAD):
             raise ValueError(f"a segment from {reference_rad[0]} rad to {reference_rad[-1]} rad")
-        if size > self.room:
-            raise ValueError(f"a segment of {size} ticks; there is room for {self.room}")
-        start = _DOUBLE_BYTES * self.ticks
-        self._memory[start : start + _DOUBLE_BYTES * size] = reference_rad.astype(
-            "float64"
-        ).tobytes()
-        self.ticks += size
-        self.room -= size
+        if segment_ticks > self.room:
+            raise ValueError(f"a segment of {segment_ticks} ticks; there is room for {self.room}")
+        start_offset = _DOUBLE_BYTES * self.ticks
+        self._memory[start_offset : start_offset + _DOUBLE_BYTES * segment_ticks] = (
+            reference_rad.astype("float64").tobytes()
+        )
+        self.ticks += segment_ticks
+        self.room -= segment_ticks
         self._shared_state[StateField.PLANNED] = self.ticks
 
 
@@ -154,7 +154,7 @@ class ReferenceReader:
     ----------
     reference_rad
         Memory of the reference.
-    planned
+    planned_ticks
         Number of ticks that are planned at the start.
     shared_state
         `StateField.PLANNED` announces the planned ticks, and `StateField.LAST_SEGMENT` the last
@@ -164,10 +164,10 @@ class ReferenceReader:
     """
 
     def __init__(
-        self, reference_rad: "memoryview[float]", planned: int, shared_state: SharedState
+        self, reference_rad: "memoryview[float]", planned_ticks: int, shared_state: SharedState
     ) -> None:
         self._reference_rad = reference_rad
-        self._planned = planned
+        self._planned = planned_ticks
         self._announced = shared_state.view(StateField.PLANNED)
         self._last_segment = shared_state.view(StateField.LAST_SEGMENT)
         self._held_ticks = shared_state.view(StateField.HELD)
@@ -177,24 +177,28 @@ class ReferenceReader:
 
     def reference_at(self, tick: int) -> float:
         """Return the reference angle of a tick in rad; ticks must increase from call to call."""
-        index = tick - self._held
-        if index >= self._planned:
-            announced = self._announced[0]
-            if self._planned < announced <= len(self._reference_rad) - self._held:
-                self._planned = announced
+        reference_tick = tick - self._held
+        if reference_tick >= self._planned:
+            announced_ticks = self._announced[0]
+            if self._planned < announced_ticks <= len(self._reference_rad) - self._held:
+                self._planned = announced_ticks
                 self._held_before[0] = self._held
-                self._begun_ticks[0] = announced
-            if index >= self._planned:
+                self._begun_ticks[0] = announced_ticks
+            if reference_tick >= self._planned:
                 # The next segment starts at its first angle, however long the wait.
-                self._held += index + 1 - self._planned
+                self._held += reference_tick + 1 - self._planned
                 self._held_ticks[0] = self._held
                 return self._reference_rad[self._planned - 1]
-        return self._reference_rad[index]
+        return self._reference_rad[reference_tick]
 
     def must_wait(self, tick: int) -> bool:
         """Return whether the reference of a tick is not planned yet but may still be appended."""
-        index = tick - self._held
-        return index >= self._planned and index >= self._announced[0] and not self._last_segment[0]
+        reference_tick = tick - self._held
+        return (
+            reference_tick >= self._planned
+            and reference_tick >= self._announced[0]
+            and not self._last_segment[0]
+        )
 
     def is_after_end(self, tick: int) -> bool:
         """Return whether a tick is after the last segment, so that the record ends."""

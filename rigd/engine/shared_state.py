@@ -26,7 +26,7 @@ from rigd.engine._ring import Ring, reserve
 
 
 class Phase(IntEnum):
-    """Phase of the control process."""
+    """Phase of the control process, such as taring or recording, as a number."""
 
     PREPARING = 0
     """Connecting the devices."""
@@ -49,7 +49,7 @@ class Phase(IntEnum):
 
     @property
     def words(self) -> str:
-        """Name of the phase for the operator."""
+        """Name of the phase as text for the operator, such as "recording"."""
         return _OPERATOR_NAMES.get(self, self.name.lower())
 
 
@@ -63,7 +63,7 @@ _OPERATOR_NAMES = {
 
 
 class Activity(StrEnum):
-    """Stage of a session for the operator, with the same name in every view."""
+    """Stage of a session for the operator, the same in terminal, page and socket documents."""
 
     PREPARING = "preparing"
     """The record has not begun."""
@@ -195,8 +195,8 @@ class SharedState:
         self._fields[field] = value
 
     def known(self, field: StateField) -> int | None:
-        """Return the value of a field, or None if the value is `UNKNOWN`."""
-        return None if (value := self._fields[field]) == UNKNOWN else value
+        """Return the value of a field of the shared state, or None if it is `UNKNOWN`."""
+        return None if (field_value := self._fields[field]) == UNKNOWN else field_value
 
     def view(self, field: StateField) -> "memoryview[int]":
         """Return a memory view of one field, whose value ``view[0]`` reads and writes quickly."""
@@ -242,34 +242,36 @@ class LogEvent:
     """Whether the operator sees the line at once, whatever its level; not stored in the file."""
 
 
-def write_event(ring: Ring, event: LogEvent) -> None:
+def write_event(ring: Ring, log_event: LogEvent) -> None:
     """Append a log event to a ring, or drop the event if the ring is full.
 
     Parameters
     ----------
     ring
         Ring of events.
-    event
+    log_event
         Event; its text is cut to the size of a record.
     """
-    offset = ring.next_slot()
-    if offset < 0:
+    slot_offset = ring.next_slot()
+    if slot_offset < 0:
         return
-    text = event.message.encode()[:_TEXT_SIZE]
-    _HEADER.pack_into(ring.buffer, offset, event.t_ns, LEVELS.index(event.level), len(text))
-    start = offset + _HEADER.size
-    ring.buffer[start : start + len(text)] = text
+    message_bytes = log_event.message.encode()[:_TEXT_SIZE]
+    _HEADER.pack_into(
+        ring.buffer, slot_offset, log_event.t_ns, LEVELS.index(log_event.level), len(message_bytes)
+    )
+    text_offset = slot_offset + _HEADER.size
+    ring.buffer[text_offset : text_offset + len(message_bytes)] = message_bytes
     ring.publish()
 
 
-def read_events(block: bytes) -> list[LogEvent]:
+def read_events(event_bytes: bytes) -> list[LogEvent]:
     """Decode the log events in a block of bytes that :meth:`Ring.take` returned."""
     events = []
-    for offset in range(0, len(block), EVENT_SIZE):
-        t_ns, level, size = _HEADER.unpack_from(block, offset)
-        start = offset + _HEADER.size
-        text = block[start : start + size].decode(errors="replace")
-        events.append(LogEvent(t_ns, LEVELS[level], text))
+    for event_offset in range(0, len(event_bytes), EVENT_SIZE):
+        t_ns, level, text_bytes = _HEADER.unpack_from(event_bytes, event_offset)
+        text_offset = event_offset + _HEADER.size
+        message_text = event_bytes[text_offset : text_offset + text_bytes].decode(errors="replace")
+        events.append(LogEvent(t_ns, LEVELS[level], message_text))
     return events
 
 

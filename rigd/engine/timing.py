@@ -183,10 +183,10 @@ class TickScheduler:
         t_ns = round(tick * self._period_ns)
         due_ns = self._start_ns + t_ns
         late_ns = self._clock.wait_until(due_ns)
-        missed = 0
+        missed_ticks = 0
         if late_ns >= self._period_ns:
-            missed = int(late_ns / self._period_ns)
-            tick += missed
+            missed_ticks = int(late_ns / self._period_ns)
+            tick += missed_ticks
             t_ns = round(tick * self._period_ns)
             late_ns = max(0, late_ns + due_ns - self._start_ns - t_ns)
             due_ns = self._start_ns + t_ns
@@ -194,4 +194,4 @@ class TickScheduler:
         self.t_ns = t_ns
         self.due_ns = due_ns
         self.lateness_ns = late_ns
-        return missed
+        return missed_ticks

@@ -47,19 +47,19 @@ def main() -> None:
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
     channels = attach_channels(job.channels)
-    reader = Observer(channels.samples, job.first)
+    sample_reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
-    touches = TouchFollower(estimator, job)
+    touch_follower = TouchFollower(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
-        block = reader.take(_MAX_BLOCK_SAMPLES)
-        if block:
-            touches.take(decode_samples(block))
+        sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
+        if sample_bytes:
+            touch_follower.take(decode_samples(sample_bytes))
         else:
-            time.sleep(_IDLE_PAUSE_S if touches.idle else _PENDING_PAUSE_S)
-        for report in touches.reports():
-            parent.send(report)
+            time.sleep(_IDLE_PAUSE_S if touch_follower.idle else _PENDING_PAUSE_S)
+        for touch_report in touch_follower.reports():
+            parent.send(touch_report)
         try:
             if parent.poll(0.0) is not None:
                 return
@@ -86,7 +86,7 @@ class _PendingTouch:
 
 
 class TouchFollower:
-    """Estimates each detected touch of a record as soon as there are enough samples.
+    """Estimator of all detected touches of a record, each as soon as it has enough samples.
 
     Parameters
     ----------
@@ -106,8 +106,8 @@ class TouchFollower:
             self._final_ticks,
             self._contact_ticks,
         ) = (
-            round(seconds * job.rate_hz)
-            for seconds in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
+            round(duration_s * job.rate_hz)
+            for duration_s in (HISTORY_S, PREVIEW_S, FIRST_S, FINAL_S, CONTACT_S)
         )
         self._samples: NDArray[np.void] | None = None
         self._pending_touches: deque[_PendingTouch] = deque()
@@ -117,23 +117,25 @@ class TouchFollower:
 
     @property
     def idle(self) -> bool:
-        """Whether no touch waits for an estimate."""
+        """Whether all detected touches have their final estimate."""
         return not self._pending_touches
 
-    def take(self, samples: NDArray[np.void]) -> None:
+    def take(self, new_samples: NDArray[np.void]) -> None:
         """Add the next samples of the record, shape (n,), and register the touches in them."""
         earlier_samples = self._samples
         self._samples = (
-            samples if earlier_samples is None else np.concatenate([earlier_samples, samples])
+            new_samples
+            if earlier_samples is None
+            else np.concatenate([earlier_samples, new_samples])
         )
-        for tick in samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist():
+        for tick in new_samples["tick"][(new_samples["status"] & Status.TOUCHED) != 0].tolist():
             self._count += 1
             estimate = self._estimator.follow()
             self._pending_touches.append(
                 _PendingTouch(self._count, tick, self._free_from, estimate)
             )
             self._free_from = tick + self._contact_ticks
-        self._record_ended |= bool(samples["status"][-1] & Status.TORQUE_OFF)
+        self._record_ended |= bool(new_samples["status"][-1] & Status.TORQUE_OFF)
         if not self._pending_touches:
             self._samples = self._samples[-self._history_ticks :]
 
@@ -144,31 +146,33 @@ class TouchFollower:
         """
         if self._samples is None or not self._pending_touches:
             return []
-        touch = self._pending_touches[0]
-        available_ticks = int(self._samples["tick"][-1]) - touch.tick + 1
+        pending_touch = self._pending_touches[0]
+        available_ticks = int(self._samples["tick"][-1]) - pending_touch.tick + 1
         is_final = self._record_ended or available_ticks >= self._final_ticks
         # In real time the operator waits for the first estimate, even if the record is complete.
         is_first = self._job.realtime is not None or not is_final
-        if available_ticks >= self._first_ticks and is_first and not touch.reported:
-            touch.reported = True
-            return [self._estimate(touch, self._first_ticks, is_final=False)]
+        if available_ticks >= self._first_ticks and is_first and not pending_touch.reported:
+            pending_touch.reported = True
+            return [self._estimate(pending_touch, self._first_ticks, is_final=False)]
         if is_final:
             self._pending_touches.popleft()
-            return [self._estimate(touch, self._final_ticks, is_final=True)]
-        if available_ticks >= self._preview_ticks and not touch.previewed:
-            touch.previewed = True
-            record, _ = self._record(touch, self._preview_ticks)
-            touch.estimate.preview(record)
+            return [self._estimate(pending_touch, self._final_ticks, is_final=True)]
+        if available_ticks >= self._preview_ticks and not pending_touch.previewed:
+            pending_touch.previewed = True
+            record, _ = self._record(pending_touch, self._preview_ticks)
+            pending_touch.estimate.preview(record)
         return []
 
-    def _estimate(self, touch: _PendingTouch, after_ticks: int, *, is_final: bool) -> TouchReport:
+    def _estimate(
+        self, pending_touch: _PendingTouch, after_ticks: int, *, is_final: bool
+    ) -> TouchReport:
         """Return the estimate of a touch from the record until `after_ticks` past its detection."""
-        record, start_s = self._record(touch, after_ticks)
-        touch_estimate = touch.estimate.update(record, scan=False, first=not is_final)
+        record, start_s = self._record(pending_touch, after_ticks)
+        touch_estimate = pending_touch.estimate.update(record, scan=False, first=not is_final)
         document = touch_estimate.as_dict(start_s)
-        return TouchReport(touch.number, touch.tick, is_final, document)
+        return TouchReport(pending_touch.number, pending_touch.tick, is_final, document)
 
-    def _record(self, touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
+    def _record(self, pending_touch: _PendingTouch, after_ticks: int) -> tuple[TouchRecord, float]:
         """Return the record around a touch until `after_ticks` past its detection, and its start.
 
         The start is the time in s since the start of the session's record.
@@ -176,9 +180,9 @@ class TouchFollower:
         assert self._samples is not None
         job = self._job
         # Soon after another touch the beam may not have been free: the estimate is then unknown.
-        free_from = min(touch.free_from, touch.tick)
-        samples = around_touch(self._samples, touch.tick, job.rate_hz, free_from)
-        record = touch_record(samples, touch.tick, job.rate_hz, job.shear_projection)
+        free_from = min(pending_touch.free_from, pending_touch.tick)
+        samples = around_touch(self._samples, pending_touch.tick, job.rate_hz, free_from)
+        record = touch_record(samples, pending_touch.tick, job.rate_hz, job.shear_projection)
         return record.until(record.detected + after_ticks), int(samples["tick"][0]) / job.rate_hz
 
 

@@ -70,7 +70,7 @@ _BACKGROUND_TERMS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class BeamEstimate:
-    """Estimated beam and damping, with the noise of the measured torque."""
+    """Estimated parameters of beam and damping, with the noise spectrum of the measured torque."""
 
     beam: Beam
     """Beam with the given length, and the estimated density and stiffness."""
@@ -97,7 +97,7 @@ class BeamEstimate:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> "BeamEstimate":
-        """Return the estimate of a beam that a JSON document contains.
+        """Return the beam parameters, damping and noise spectrum that a JSON document contains.
 
         Parameters
         ----------
@@ -113,7 +113,7 @@ class BeamEstimate:
             If a key is missing or its value is invalid.
         """
         try:
-            damping, noise = document["damping"], document["noise"]
+            damping, noise_document = document["damping"], document["noise"]
             estimate = cls(
                 beam=Beam(
                     **{
@@ -127,9 +127,13 @@ class BeamEstimate:
                         for key in ("zeta", "alpha", "gamma", "lambda_")
                     }
                 ),
-                names=tuple(name for name in document["names"] if name in PARAMETERS),
-                noise_frequency_hz=np.array(noise["frequency_hz"], dtype=np.float64),
-                noise_nm2_per_hz=np.array(noise["nm2_per_hz"], dtype=np.float64),
+                names=tuple(
+                    parameter_name
+                    for parameter_name in document["names"]
+                    if parameter_name in PARAMETERS
+                ),
+                noise_frequency_hz=np.array(noise_document["frequency_hz"], dtype=np.float64),
+                noise_nm2_per_hz=np.array(noise_document["nm2_per_hz"], dtype=np.float64),
                 **{key: float(document.get(key, 0.0)) for key in _ADDITIONAL_PARAMETERS},
                 stiffness_offsets=tuple(map(float, document.get("stiffness_offsets", ()))),
             )
@@ -144,7 +148,7 @@ class BeamEstimate:
     def stated(
         cls, beam: Beam, damping: Damping, noise_nm2_per_hz: float, tip_mass_kg: float = 0.0
     ) -> "BeamEstimate":
-        """Return the estimate of a beam that is known beforehand, with all its parameters free.
+        """Return an estimate with given beam and damping, whose parameters are all to be fitted.
 
         Parameters
         ----------
@@ -155,21 +159,25 @@ class BeamEstimate:
         tip_mass_kg
             Point mass at the tip, which is not a free parameter.
         """
-        absent = {
+        absent_parameters = {
             *(() if damping.zeta else ("zeta", "alpha")),
             *(() if damping.gamma else ("gamma", "lambda")),
         }
         return cls(
             beam,
             damping,
-            tuple(name for name in UNIFORM_BEAM_PARAMETERS if name not in absent),
+            tuple(
+                parameter_name
+                for parameter_name in UNIFORM_BEAM_PARAMETERS
+                if parameter_name not in absent_parameters
+            ),
             np.array([1.0]),
             np.array([noise_nm2_per_hz]),
             tip_mass_kg=tip_mass_kg,
         )
 
     def check(self) -> None:
-        """Raise `ExcitationError` if the estimate cannot predict a record.
+        """Raise `ExcitationError` if a parameter or the noise spectrum is invalid.
 
         Raises
         ------
@@ -177,7 +185,7 @@ class BeamEstimate:
             If a value is not finite or out of range, or no parameter is free.
         """
         beam, damping = self.beam, self.damping
-        for key, value, least, upper_bound in (
+        for key, checked_value, lower_bound, upper_bound in (
             ("beam.length_m", beam.length_m, 1e-6, np.inf),
             ("beam.density_kg_per_m", beam.density_kg_per_m, 1e-12, np.inf),
             ("beam.bending_stiffness_n_m2", beam.bending_stiffness_n_m2, 1e-12, np.inf),
@@ -186,17 +194,20 @@ class BeamEstimate:
             ("damping.gamma", damping.gamma, 0.0, np.inf),
             ("damping.lambda", damping.lambda_, 0.0, 2.0),
             *((key, getattr(self, key), -np.inf, np.inf) for key in _ADDITIONAL_PARAMETERS),
-            *(("stiffness_offsets", each, -0.9, 10.0) for each in self.stiffness_offsets),
+            *(
+                ("stiffness_offsets", estimate_entry, -0.9, 10.0)
+                for estimate_entry in self.stiffness_offsets
+            ),
         ):
-            if not (isfinite(value) and least <= value < upper_bound):
-                raise ExcitationError(f"The estimate of the beam has {key} = {value}.")
-        frequency_hz, density = self.noise_frequency_hz, self.noise_nm2_per_hz
+            if not (isfinite(checked_value) and lower_bound <= checked_value < upper_bound):
+                raise ExcitationError(f"The estimate of the beam has {key} = {checked_value}.")
+        frequency_hz, noise_density = self.noise_frequency_hz, self.noise_nm2_per_hz
         if not (
             frequency_hz.ndim == 1
             and frequency_hz.size > 0
-            and density.shape == frequency_hz.shape
+            and noise_density.shape == frequency_hz.shape
             and bool(np.all(np.diff(frequency_hz) > 0.0))
-            and bool(np.all(np.isfinite(density) & (density > 0.0)))
+            and bool(np.all(np.isfinite(noise_density) & (noise_density > 0.0)))
         ):
             raise ExcitationError(
                 "The estimate of the beam needs noise.frequency_hz, increasing, and as many "
@@ -218,22 +229,42 @@ class BeamEstimate:
         """
         if not uniformity:
             return self
-        orders = [name for name in ("alpha", "lambda") if name not in self.names]
-        present = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
-        modes = [mode.number for mode in self.modes()]
-        deviations = [f"{name}_{number}" for number in modes for name in TOLERATED_DEVIATIONS]
-        free = (*self.names, *(name for name in orders if present[name]), *deviations)
-        return replace(self, names=free, uniformity=uniformity)
+        order_names = [
+            parameter_name
+            for parameter_name in ("alpha", "lambda")
+            if parameter_name not in self.names
+        ]
+        coefficients_by_order = {"alpha": self.damping.zeta, "lambda": self.damping.gamma}
+        mode_numbers = [beam_mode.number for beam_mode in self.modes()]
+        deviation_names = [
+            f"{parameter_name}_{mode_number}"
+            for mode_number in mode_numbers
+            for parameter_name in TOLERATED_DEVIATIONS
+        ]
+        free_names = (
+            *self.names,
+            *(
+                parameter_name
+                for parameter_name in order_names
+                if coefficients_by_order[parameter_name]
+            ),
+            *deviation_names,
+        )
+        return replace(self, names=free_names, uniformity=uniformity)
 
     def modal(self) -> "BeamEstimate":
-        """Return the estimate with the free parameters of a modal model.
+        """Return the estimate with the constants of a modal model as its free parameters.
 
         They are the constants of each mode, and those of a background.
         """
-        modes = [mode.number for mode in self.modes()]
-        constants = [f"{name}_{number}" for number in modes for name in MODAL_CONSTANTS]
-        background = [f"background_{power}" for power in range(_BACKGROUND_TERMS)]
-        return replace(self, names=(*constants, *background), uniformity=1.0)
+        mode_numbers = [beam_mode.number for beam_mode in self.modes()]
+        constant_names = [
+            f"{constant_name}_{mode_number}"
+            for mode_number in mode_numbers
+            for constant_name in MODAL_CONSTANTS
+        ]
+        background_names = [f"background_{term_power}" for term_power in range(_BACKGROUND_TERMS)]
+        return replace(self, names=(*constant_names, *background_names), uniformity=1.0)
 
     @property
     def values(self) -> dict[str, float]:
@@ -253,7 +284,7 @@ class BeamEstimate:
 
     @property
     def loaded(self) -> LoadedBeam | None:
-        """Beam with tip mass, root compliance and offsets of the modes' stiffness.
+        """Beam model with tip mass, root compliance and offsets of the modes' stiffness.
 
         It is None if all of these are 0 and not free, so that the beam is uniform.
         """
@@ -266,7 +297,7 @@ class BeamEstimate:
 
     @property
     def loaded_beam(self) -> LoadedBeam:
-        """Beam with tip mass, root compliance and stiffness offsets, which may all be 0."""
+        """Beam model with tip mass, root compliance and stiffness offsets, which may all be 0."""
         return LoadedBeam(
             self.beam,
             self.damping,
@@ -283,47 +314,62 @@ class BeamEstimate:
         highest_hz
             Highest frequency of a mode.
         """
-        count = 2
+        mode_count = 2
         while True:
-            z = clamped_free_eigenvalues(count)
+            z = clamped_free_eigenvalues(mode_count)
             is_above_band = (z / self.beam.length_m) ** 2 > 2 * pi * highest_hz * np.sqrt(
                 self.beam.density_over_stiffness
             )
             if is_above_band[-1]:
                 break
-            count *= 2
-        loaded = self.loaded
-        pairs = (
-            poles_for_eigenvalues(z, self.beam, self.damping) if loaded is None else loaded.poles(z)
+            mode_count *= 2
+        nonuniform_beam = self.loaded
+        pole_pairs = (
+            poles_for_eigenvalues(z, self.beam, self.damping)
+            if nonuniform_beam is None
+            else nonuniform_beam.poles(z)
         )
-        parameters = [name for name in self.names if name in PARAMETERS]
-        names = [DERIVATIVE_NAMES.get(name, name) for name in parameters]
+        parameter_names = [
+            parameter_name for parameter_name in self.names if parameter_name in PARAMETERS
+        ]
+        derivative_names = [
+            DERIVATIVE_NAMES.get(parameter_name, parameter_name)
+            for parameter_name in parameter_names
+        ]
         poles_in_band = {
-            number: pole
-            for number, pole in enumerate(pairs[:, 0].tolist(), start=1)
-            if np.isfinite(pole) and 0.0 < pole.imag < 2 * pi * highest_hz
+            mode_number: mode_pole
+            for mode_number, mode_pole in enumerate(pole_pairs[:, 0].tolist(), start=1)
+            if np.isfinite(mode_pole) and 0.0 < mode_pole.imag < 2 * pi * highest_hz
         }
-        if loaded is None:
-            stiffness = (z / self.beam.length_m) ** 4
+        if nonuniform_beam is None:
+            stiffness_by_mode = (z / self.beam.length_m) ** 4
             pole_gradients_by_mode: Iterable[Complex] = (
-                pole_gradient(pole, float(stiffness[number - 1]), self.beam, self.damping, names)
-                for number, pole in poles_in_band.items()
+                pole_gradient(
+                    mode_pole,
+                    float(stiffness_by_mode[mode_number - 1]),
+                    self.beam,
+                    self.damping,
+                    derivative_names,
+                )
+                for mode_number, mode_pole in poles_in_band.items()
             )
         else:
-            pole_gradients_by_mode = loaded.pole_gradients(
-                np.array([*poles_in_band.values()], dtype=np.complex128), names
+            pole_gradients_by_mode = nonuniform_beam.pole_gradients(
+                np.array([*poles_in_band.values()], dtype=np.complex128), derivative_names
             )
-        scales = parameter_scales(self)
+        parameter_factors = parameter_scales(self)
         estimated_modes = []
-        for (number, pole), row in zip(poles_in_band.items(), pole_gradients_by_mode, strict=True):
-            gradient = np.zeros(len(self.names), dtype=np.complex128)
-            gradient[: len(parameters)] = row * scales
-            for index, name in enumerate(self.names):
-                if name.endswith(f"_{number}"):
-                    gradient[index] = POLE_AND_RESIDUE_DERIVATIVES[name.rpartition("_")[0]](
-                        pole, 0j
-                    )[0]
-            estimated_modes.append(EstimatedMode(number, pole, gradient))
+        for (mode_number, mode_pole), row in zip(
+            poles_in_band.items(), pole_gradients_by_mode, strict=True
+        ):
+            mode_gradient = np.zeros(len(self.names), dtype=np.complex128)
+            mode_gradient[: len(parameter_names)] = row * parameter_factors
+            for parameter_index, parameter_name in enumerate(self.names):
+                if parameter_name.endswith(f"_{mode_number}"):
+                    mode_gradient[parameter_index] = POLE_AND_RESIDUE_DERIVATIVES[
+                        parameter_name.rpartition("_")[0]
+                    ](mode_pole, 0j)[0]
+            estimated_modes.append(EstimatedMode(mode_number, mode_pole, mode_gradient))
         return tuple(estimated_modes)
 
 
@@ -342,7 +388,7 @@ pole and residue."""
 
 @dataclass(frozen=True, slots=True)
 class EstimatedMode:
-    """Mode of the estimated beam with locked hub."""
+    """Vibration mode of the estimated beam with its hub held still."""
 
     number: int
     """Number of the mode, from 1."""
@@ -369,10 +415,13 @@ class EstimatedMode:
     @property
     def damping_gradient(self) -> Real:
         """Derivatives of the mode's damping ratio by the free parameters, shape (k,)."""
-        p, size = self.pole_rad_s, abs(self.pole_rad_s)
-        size_gradient = (p.conjugate() * self.gradient).real / size
-        slope = -self.gradient.real / size - self.damping_ratio * size_gradient / size
-        return np.asarray(slope, dtype=np.float64)
+        p, pole_magnitude = self.pole_rad_s, abs(self.pole_rad_s)
+        magnitude_gradient = (p.conjugate() * self.gradient).real / pole_magnitude
+        damping_derivatives = (
+            -self.gradient.real / pole_magnitude
+            - self.damping_ratio * magnitude_gradient / pole_magnitude
+        )
+        return np.asarray(damping_derivatives, dtype=np.float64)
 
 
 def parameter_scales(estimate: BeamEstimate) -> Real:
@@ -381,6 +430,13 @@ def parameter_scales(estimate: BeamEstimate) -> Real:
     The fit uses the logarithms of zeta and gamma, so their factors are zeta and gamma. The other
     factors are 1.
     """
-    values = estimate.values
-    names = [name for name in estimate.names if name in PARAMETERS]
-    return np.array([values[name] if name in ("zeta", "gamma") else 1.0 for name in names])
+    parameter_values = estimate.values
+    parameter_names = [
+        parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
+    ]
+    return np.array(
+        [
+            parameter_values[parameter_name] if parameter_name in ("zeta", "gamma") else 1.0
+            for parameter_name in parameter_names
+        ]
+    )

@@ -85,8 +85,8 @@ class TorqueModel:
     """Responses from angle to torque in N·m/rad and to the slope of the tip, shape (2, K)."""
 
     @classmethod
-    def for_records(cls, estimate: BeamEstimate, rate_hz: float, ticks: int) -> "TorqueModel":
-        """Return the torque model of a beam for records of at least a given number of ticks.
+    def for_records(cls, estimate: BeamEstimate, rate_hz: float, tick_count: int) -> "TorqueModel":
+        """Return the torque model of a beam for records of at least `tick_count` ticks.
 
         Parameters
         ----------
@@ -94,24 +94,30 @@ class TorqueModel:
             Beam, damping and noise.
         rate_hz
             Rate of the angle.
-        ticks
+        tick_count
             Smallest length of the records in ticks.
         """
-        factor = ticks_per_sample(rate_hz)
+        ticks_per_point = ticks_per_sample(rate_hz)
         # Twice the length, and one of which a transform is quick.
-        half_samples = -(-ticks // factor)
+        half_samples = -(-tick_count // ticks_per_point)
         half_samples = _fast_transform_length(half_samples)
-        ticks = half_samples * factor
-        samples = 2 * half_samples
-        sample_hz = rate_hz / factor
-        sigma = _WRAP_AROUND_DECAY * sample_hz / samples
-        frequency_hz = np.fft.rfftfreq(samples, 1.0 / sample_hz)
+        tick_count = half_samples * ticks_per_point
+        sample_count = 2 * half_samples
+        sample_hz = rate_hz / ticks_per_point
+        sigma_per_s = _WRAP_AROUND_DECAY * sample_hz / sample_count
+        frequency_hz = np.fft.rfftfreq(sample_count, 1.0 / sample_hz)
         # Higher frequencies belong neither to the band nor to a visible mode.
         frequency_hz = frequency_hz[frequency_hz <= _FADED_OVER_BAND * BAND_HZ]
-        s = sigma + 2j * pi * frequency_hz
+        s = sigma_per_s + 2j * pi * frequency_hz
         kernels = whitened_kernels(estimate, s, sample_hz)
         return cls(
-            estimate, rate_hz, ticks, factor, sigma, kernels, np.stack(responses(estimate, s)[1:])
+            estimate,
+            rate_hz,
+            tick_count,
+            ticks_per_point,
+            sigma_per_s,
+            kernels,
+            np.stack(responses(estimate, s)[1:]),
         )
 
     @property
@@ -129,28 +135,30 @@ class TorqueModel:
         spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
         return spectrum
 
-    def whitened_derivatives(self, spectrum: Complex) -> Real:
-        """Return whitened derivatives of the torque by the parameters at each sample.
+    def whitened_derivatives(self, angle_transform: Complex) -> Real:
+        """Return derivatives of the torque by the free parameters over the noise, at each sample.
 
-        `spectrum` is the transform of the angle. The shape is (k, ticks / factor).
+        `angle_transform` is the transform of the angle. The shape is (k, ticks / factor).
         """
         return self._inverse_transform(
-            self.kernels * (spectrum / self.factor), self.ticks // self.factor, 1
+            self.kernels * (angle_transform / self.factor), self.ticks // self.factor, 1
         )
 
-    def torque_and_slope(self, spectrum: Complex) -> Real:
+    def torque_and_slope(self, angle_transform: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
-        `spectrum` is the transform of the angle.
+        `angle_transform` is the transform of the angle.
         """
-        return self._inverse_transform(self.channels * spectrum, self.ticks, self.factor)
+        return self._inverse_transform(self.channels * angle_transform, self.ticks, self.factor)
 
-    def _inverse_transform(self, spectra: Complex, samples: int, values_per_sample: int) -> Real:
-        """Return functions of time, with some values per sample, from their Laplace transforms."""
-        time_s = np.arange(samples) * (self.factor / values_per_sample / self.rate_hz)
-        values = np.fft.irfft(spectra, 2 * samples)[:, :samples]
-        values *= np.exp(self.sigma_per_s * time_s)
-        return values
+    def _inverse_transform(
+        self, laplace_spectra: Complex, sample_count: int, values_per_sample: int
+    ) -> Real:
+        """Return functions of time, with some values per sample, from Laplace transforms."""
+        time_s = np.arange(sample_count) * (self.factor / values_per_sample / self.rate_hz)
+        time_values = np.fft.irfft(laplace_spectra, 2 * sample_count)[:, :sample_count]
+        time_values *= np.exp(self.sigma_per_s * time_s)
+        return time_values
 
 
 def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
@@ -169,15 +177,15 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
         Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and delay;
         slope of the tip relative to the root, per angle.
     """
-    loaded = estimate.loaded
-    if loaded is None:
+    loaded_beam = estimate.loaded
+    if loaded_beam is None:
         g = transfer(s, estimate.beam, estimate.damping)
-        slope = tip_response(estimate.beam, estimate.damping, s)[1] - 1.0
+        slope_response = tip_response(estimate.beam, estimate.damping, s)[1] - 1.0
     else:
         at = s.astype(np.complex128)
-        g, slope = loaded.transfer(at), loaded.tip_slope(at)
-    measured = (g + estimate.tool_inertia_kg_m2 * s * s) * np.exp(-s * estimate.delay_s)
-    return g, measured, slope
+        g, slope_response = loaded_beam.transfer(at), loaded_beam.tip_slope(at)
+    measured_response = (g + estimate.tool_inertia_kg_m2 * s * s) * np.exp(-s * estimate.delay_s)
+    return g, measured_response, slope_response
 
 
 def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Complex:
@@ -194,31 +202,35 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     sample_hz
         Rate of the samples.
     """
-    names = [name for name in estimate.names if name in PARAMETERS]
-    derivative_names = [
-        DERIVATIVE_NAMES.get(n, n) for n in names if n not in ("delay_s", "tool_inertia_kg_m2")
+    parameter_names = [
+        parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
     ]
-    loaded = estimate.loaded
+    derivative_names = [
+        DERIVATIVE_NAMES.get(n, n)
+        for n in parameter_names
+        if n not in ("delay_s", "tool_inertia_kg_m2")
+    ]
+    loaded_beam = estimate.loaded
     g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)
-    if names:
+    if parameter_names:
         g, beam_gradient = (
             transfer_and_gradient(s, estimate.beam, estimate.damping, derivative_names)
-            if loaded is None
-            else loaded.transfer_and_gradient(s.astype(np.complex128), derivative_names)
+            if loaded_beam is None
+            else loaded_beam.transfer_and_gradient(s.astype(np.complex128), derivative_names)
         )
     delay_factor = np.exp(-s * estimate.delay_s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(names) :] = _derivatives_by_constants(estimate, s) * delay_factor
-    rows = iter(beam_gradient)
-    for out, name, scale in zip(
-        kernels[: len(names)], names, parameter_scales(estimate), strict=True
+    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * delay_factor
+    gradient_rows = iter(beam_gradient)
+    for out, parameter_name, parameter_scale in zip(
+        kernels[: len(parameter_names)], parameter_names, parameter_scales(estimate), strict=True
     ):
-        if name == "delay_s":
+        if parameter_name == "delay_s":
             out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * delay_factor
-        elif name == "tool_inertia_kg_m2":
+        elif parameter_name == "tool_inertia_kg_m2":
             out[:] = s * s * delay_factor
         else:
-            out[:] = scale * next(rows) * delay_factor
+            out[:] = parameter_scale * next(gradient_rows) * delay_factor
     kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
 
@@ -228,23 +240,29 @@ def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
 
     The shape is (number of constants, K).
     """
-    poles = {mode.number: mode.pole_rad_s for mode in estimate.modes()}
-    rows = []
-    for name in estimate.names:
-        if name in PARAMETERS:
+    poles_by_mode = {beam_mode.number: beam_mode.pole_rad_s for beam_mode in estimate.modes()}
+    derivative_rows = []
+    for parameter_name in estimate.names:
+        if parameter_name in PARAMETERS:
             continue
-        kind, _, number = name.rpartition("_")
-        if kind == "background":
-            rows.append((s / (2 * pi * BAND_HZ)) ** int(number))
+        constant_kind, _, mode_number = parameter_name.rpartition("_")
+        if constant_kind == "background":
+            derivative_rows.append((s / (2 * pi * BAND_HZ)) ** int(mode_number))
             continue
-        pole = poles[int(number)]
-        residue = complex(estimate.loaded_beam.residues(np.array([pole]))[0]) * pole**2
-        by_pole, by_residue = POLE_AND_RESIDUE_DERIVATIVES[kind](pole, residue)
-        upper, lower = s - pole, s - pole.conjugate()
-        row = residue * by_pole / upper**2 + by_residue / upper
-        other = (residue * by_pole).conjugate() / lower**2 + by_residue.conjugate() / lower
-        rows.append(row + other)
-    return np.array(rows, dtype=np.complex128).reshape(-1, s.size)
+        mode_pole = poles_by_mode[int(mode_number)]
+        mode_residue = (
+            complex(estimate.loaded_beam.residues(np.array([mode_pole]))[0]) * mode_pole**2
+        )
+        pole_derivative, residue_derivative = POLE_AND_RESIDUE_DERIVATIVES[constant_kind](
+            mode_pole, mode_residue
+        )
+        upper_term, lower_term = s - mode_pole, s - mode_pole.conjugate()
+        row = mode_residue * pole_derivative / upper_term**2 + residue_derivative / upper_term
+        conjugate_term = (
+            mode_residue * pole_derivative
+        ).conjugate() / lower_term**2 + residue_derivative.conjugate() / lower_term
+        derivative_rows.append(row + conjugate_term)
+    return np.array(derivative_rows, dtype=np.complex128).reshape(-1, s.size)
 
 
 def ticks_per_sample(rate_hz: float) -> int:
@@ -255,23 +273,23 @@ def ticks_per_sample(rate_hz: float) -> int:
 def _whitening_weights(
     estimate: BeamEstimate, frequency_hz: NDArray[np.floating[Any]], sample_hz: float
 ) -> Real:
-    """Return the weights at some frequencies that give the noise of a sample variance 1.
+    """Return weights of frequencies with which the torque noise of a sample has variance 1.
 
     They fade to 0 above the end of the band.
     """
-    density = np.interp(
+    log_noise_density = np.interp(
         frequency_hz, estimate.noise_frequency_hz, np.log(estimate.noise_nm2_per_hz)
     )
-    fade = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADED_OVER_BAND - 1.0), 0.0, 1.0)
-    weight: Real = np.exp(-0.5 * density) * np.sqrt(2.0 / sample_hz)
-    weight *= 0.5 + 0.5 * np.cos(pi * fade)
-    return weight
+    fade_factors = np.clip((frequency_hz / BAND_HZ - 1.0) / (_FADED_OVER_BAND - 1.0), 0.0, 1.0)
+    whitening_weights: Real = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
+    whitening_weights *= 0.5 + 0.5 * np.cos(pi * fade_factors)
+    return whitening_weights
 
 
-def _fast_transform_length(least: int) -> int:
-    """Return a length for a fast Fourier transform: `least`, or at most an eighth more."""
-    unit = 1 << max(0, least.bit_length() - 4)
-    return -(-least // unit) * unit
+def _fast_transform_length(min_length: int) -> int:
+    """Return a length for a fast Fourier transform: `min_length`, or at most an eighth more."""
+    length_unit = 1 << max(0, min_length.bit_length() - 4)
+    return -(-min_length // length_unit) * length_unit
 
 
 # Information
@@ -279,7 +297,7 @@ def _fast_transform_length(least: int) -> int:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RecordSoFar:
-    """Fisher information of a record up to now, and the vibration that continues after it."""
+    """Whitened torque derivatives of a record so far, and the vibration that continues after it."""
 
     estimate: BeamEstimate
     """Estimate of the beam from which the information is computed."""
@@ -296,7 +314,7 @@ class RecordSoFar:
     def from_angle(
         cls, angle_rad: Real, estimate: BeamEstimate, rate_hz: float, ahead_s: float = 0.0
     ) -> "RecordSoFar":
-        """Return the information of a record of the motor's angle.
+        """Return derivatives and continuing vibration, predicted from the motor's angle.
 
         Parameters
         ----------
@@ -310,25 +328,36 @@ class RecordSoFar:
         ahead_s
             Time in s from now on for which the continuing vibration is computed.
         """
-        factor = ticks_per_sample(rate_hz)
+        ticks_per_point = ticks_per_sample(rate_hz)
         # Rest before it, so that a sample lies at its end.
-        angle_rad = np.concatenate([np.zeros(-angle_rad.size % factor), angle_rad - angle_rad[0]])
-        ahead = -(-round(ahead_s * rate_hz) // factor)
-        samples = angle_rad.size // factor
-        model = TorqueModel.for_records(estimate, rate_hz, angle_rad.size + ahead * factor)
-        spectrum = model.spectrum(angle_rad)
-        rows = np.concatenate(
+        angle_rad = np.concatenate(
+            [np.zeros(-angle_rad.size % ticks_per_point), angle_rad - angle_rad[0]]
+        )
+        ahead_samples = -(-round(ahead_s * rate_hz) // ticks_per_point)
+        record_samples = angle_rad.size // ticks_per_point
+        torque_model = TorqueModel.for_records(
+            estimate, rate_hz, angle_rad.size + ahead_samples * ticks_per_point
+        )
+        spectrum = torque_model.spectrum(angle_rad)
+        whitened_rows = np.concatenate(
             [
-                model.whitened_derivatives(spectrum)[:, : samples + ahead],
-                _nuisance_terms(estimate, samples + ahead, model.sample_hz),
+                torque_model.whitened_derivatives(spectrum)[:, : record_samples + ahead_samples],
+                _nuisance_terms(estimate, record_samples + ahead_samples, torque_model.sample_hz),
             ]
         )
-        ringing = np.zeros((2, 0))
-        if ahead:
-            first = angle_rad.size
-            ringing = model.torque_and_slope(spectrum)[:, first : first + ahead * factor]
-        before = rows[:, :samples]
-        return cls(estimate, before @ before.T, rows[:, samples:], ringing)
+        ringing_motion = np.zeros((2, 0))
+        if ahead_samples:
+            next_tick = angle_rad.size
+            ringing_motion = torque_model.torque_and_slope(spectrum)[
+                :, next_tick : next_tick + ahead_samples * ticks_per_point
+            ]
+        recorded_rows = whitened_rows[:, :record_samples]
+        return cls(
+            estimate,
+            recorded_rows @ recorded_rows.T,
+            whitened_rows[:, record_samples:],
+            ringing_motion,
+        )
 
     @property
     def nuisance_projection(self) -> Real:
@@ -336,22 +365,24 @@ class RecordSoFar:
         k = len(self.estimate.names)
         return np.concatenate([np.eye(k), -_regression_coefficients(self.before, k)], axis=1)
 
-    def information_after(self, more: Real | None, samples: int) -> Real:
-        """Return the information on the parameters after further samples, shape (k, k).
+    def information_after(self, added_rows: Real | None, sample_count: int) -> Real:
+        """Return the Fisher information on the parameters after further samples, shape (k, k).
 
         Parameters
         ----------
-        more
-            Derivatives that a segment adds from now on, shape (k, n) with n at least `samples`;
+        added_rows
+            Derivatives that a segment adds from now on, shape (k, n), n at least `sample_count`;
             None: the motor is held.
-        samples
+        sample_count
             Number of further samples that count.
         """
-        rows = self.ahead[:, :samples]
-        if more is not None:
-            rows = rows.copy()
-            rows[: more.shape[0]] += more[:, :samples]
-        return projected_information(self.before + rows @ rows.T, len(self.estimate.names))
+        whitened_rows = self.ahead[:, :sample_count]
+        if added_rows is not None:
+            whitened_rows = whitened_rows.copy()
+            whitened_rows[: added_rows.shape[0]] += added_rows[:, :sample_count]
+        return projected_information(
+            self.before + whitened_rows @ whitened_rows.T, len(self.estimate.names)
+        )
 
 
 def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real:
@@ -392,7 +423,7 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
 
 
 def projected_information(gram: Real, k: int) -> Real:
-    """Return the information on the first k parameters if all others are unknown, shape (k, k).
+    """Return the Fisher information on k parameters if all others are unknown, shape (k, k).
 
     Parameters
     ----------
@@ -410,30 +441,41 @@ def _regression_coefficients(gram: Real, k: int) -> Real:
 
     The shape is (k, m), and `gram` is the Gram matrix of all derivatives.
     """
-    size = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
-    unit = gram[k:, k:] / np.outer(size, size) + 1e-12 * np.eye(size.size)
-    factors: Real = np.linalg.solve(unit, gram[k:, :k] / size[:, None]).T / size
-    return factors
+    derivative_norms = np.sqrt(np.maximum(np.diag(gram)[k:], 1e-300))
+    normalized_gram = gram[k:, k:] / np.outer(derivative_norms, derivative_norms) + 1e-12 * np.eye(
+        derivative_norms.size
+    )
+    coefficients: Real = (
+        np.linalg.solve(normalized_gram, gram[k:, :k] / derivative_norms[:, None]).T
+        / derivative_norms
+    )
+    return coefficients
 
 
-def covariance_of(information: Real, estimate: BeamEstimate) -> Real:
-    """Return the covariance of the parameters for a Fisher information plus prior knowledge."""
-    prior = np.array([_prior_std(name, estimate) for name in estimate.names])
+def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
+    """Return the parameters' covariance from a Fisher information and prior knowledge."""
+    prior_stds = np.array(
+        [_prior_std(parameter_name, estimate) for parameter_name in estimate.names]
+    )
     # In units of the prior the matrix is well scaled wherever something is known.
-    unit = information * np.outer(prior, prior) + np.eye(len(prior))
-    size = np.sqrt(np.diag(unit))
-    inverse: Real = np.linalg.inv(unit / np.outer(size, size))
-    return inverse * np.outer(prior / size, prior / size)
+    scaled_information = fisher_information * np.outer(prior_stds, prior_stds) + np.eye(
+        len(prior_stds)
+    )
+    diagonal_roots = np.sqrt(np.diag(scaled_information))
+    inverse_matrix: Real = np.linalg.inv(
+        scaled_information / np.outer(diagonal_roots, diagonal_roots)
+    )
+    return inverse_matrix * np.outer(prior_stds / diagonal_roots, prior_stds / diagonal_roots)
 
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
-    """Return the standard deviation of a parameter that is known before any record."""
+    """Return the standard deviation that a parameter is assumed to have before any record."""
     beam = estimate.beam
-    kind = name.rpartition("_")[0]
-    if kind == "background":
+    constant_kind = name.rpartition("_")[0]
+    if constant_kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
-    if kind in MODAL_CONSTANTS:
-        return TOLERATED_DEVIATIONS.get(kind, 1.0) * estimate.uniformity
+    if constant_kind in MODAL_CONSTANTS:
+        return TOLERATED_DEVIATIONS.get(constant_kind, 1.0) * estimate.uniformity
     if name == "tool_inertia_kg_m2":
         return beam.inertia_kg_m2
     if name == "tip_mass_kg":
@@ -443,15 +485,17 @@ def _prior_std(name: str, estimate: BeamEstimate) -> float:
     return _PRIOR_STD[name]
 
 
-def _nuisance_terms(estimate: BeamEstimate, samples: int, sample_hz: float) -> Real:
-    """Return the whitened nuisance terms of a record: free decays, offset and drift of the torque.
+def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float) -> Real:
+    """Return effects on a record's torque that are not of interest: free decays, offset, drift.
 
     The shape is (m, samples).
     """
-    time_s = np.arange(samples) / sample_hz
-    poles = np.array([mode.pole_rad_s for mode in estimate.modes()])
-    decays = np.exp(np.outer(poles, time_s))
-    weight = _whitening_weights(estimate, poles.imag / (2 * pi), sample_hz)[:, None]
+    time_s = np.arange(sample_count) / sample_hz
+    mode_poles = np.array([beam_mode.pole_rad_s for beam_mode in estimate.modes()])
+    free_decays = np.exp(np.outer(mode_poles, time_s))
+    decay_weights = _whitening_weights(estimate, mode_poles.imag / (2 * pi), sample_hz)[:, None]
     constant_weight = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]
-    offset_and_drift = np.stack([np.ones(samples), time_s]) * constant_weight
-    return np.concatenate([decays.real * weight, decays.imag * weight, offset_and_drift])
+    offset_and_drift = np.stack([np.ones(sample_count), time_s]) * constant_weight
+    return np.concatenate(
+        [free_decays.real * decay_weights, free_decays.imag * decay_weights, offset_and_drift]
+    )

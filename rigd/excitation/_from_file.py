@@ -55,27 +55,27 @@ def from_csv(
         If the file cannot be read, or a line of it is invalid.
     """
     path = Path(path)
-    times, angles = _read_columns(path)
-    if times is None:
-        ticks = len(angles)
-        sweep = angles
+    times_s, angles_rad = _read_columns(path)
+    if times_s is None:
+        tick_count = len(angles_rad)
+        sweep_rad = angles_rad
     else:
-        check_ticks("The file", (float(times[-1]) - float(times[0])) * rate_hz, rate_hz)
-        time_s = times - times[0]
+        check_ticks("The file", (float(times_s[-1]) - float(times_s[0])) * rate_hz, rate_hz)
+        time_s = times_s - times_s[0]
         # The last row is reached exactly; rounding must not lose its tick.
-        ticks = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
-        sweep = np.interp(np.arange(ticks) / rate_hz, time_s, angles)
-    require_within_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep))))
-    duration_s = ticks / rate_hz
+        tick_count = int(np.floor(time_s[-1] * rate_hz + 1e-6)) + 1
+        sweep_rad = np.interp(np.arange(tick_count) / rate_hz, time_s, angles_rad)
+    require_within_turn(f"{path}: the largest angle_rad", float(np.max(np.abs(sweep_rad))))
+    duration_s = tick_count / rate_hz
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "file": path.name,
-        "amplitude_rad": float(np.max(np.abs(sweep))),
+        "amplitude_rad": float(np.max(np.abs(sweep_rad))),
         "duration_s": duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
     }
-    return assemble_excitation("file", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("file", parameters, rate_hz, segments, sweep_rad)
 
 
 def _read_columns(
@@ -83,65 +83,72 @@ def _read_columns(
 ) -> tuple[npt.NDArray[np.float64] | None, npt.NDArray[np.float64]]:
     """Read times in s and angles in rad; the times are None if the file has one angle a tick."""
     try:
-        with open_plain_file(path, MAX_FILE_BYTES) as file:
-            table = _read_table(file.buffer)
+        with open_plain_file(path, MAX_FILE_BYTES) as text_file:
+            text_table = _read_table(text_file.buffer)
     except OSError as error:
         raise ExcitationError(f"{path}: cannot be read ({error.strerror}).") from error
     except TableError as error:
         # Without its text: the daemon may read files that the requesting user may not.
         raise ExcitationError(f"{path}: {error.unquoted()}") from error
-    angles = next(column for name, column in table.columns.items() if name != TIME_COLUMN)
-    times = table.columns.get(TIME_COLUMN)
-    if len(angles.values) < 2:
+    angle_column = next(
+        column_values
+        for column_name, column_values in text_table.columns.items()
+        if column_name != TIME_COLUMN
+    )
+    time_column = text_table.columns.get(TIME_COLUMN)
+    if len(angle_column.values) < 2:
         raise ExcitationError(
-            f"{path}: has {len(angles.values)} angles; a reference needs at least two."
+            f"{path}: has {len(angle_column.values)} angles; a reference needs at least two."
         )
-    if len(angles.values) > MAX_SAMPLES:
+    if len(angle_column.values) > MAX_SAMPLES:
         raise ExcitationError(f"{path}: has more than {MAX_SAMPLES} angles; shorten it.")
-    if angles.unit and angles.unit.lower() not in _RADIAN_NAMES:
+    if angle_column.unit and angle_column.unit.lower() not in _RADIAN_NAMES:
         raise ExcitationError(
             f"{path}: states another unit than rad for {ANGLE_COLUMN}; write rad."
         )
-    if times is not None and times.unit and time_unit_s(times.unit) != 1.0:
+    if time_column is not None and time_column.unit and time_unit_s(time_column.unit) != 1.0:
         raise ExcitationError(
             f"{path}: states another unit than s for {TIME_COLUMN}; write seconds."
         )
-    for name, column in ((ANGLE_COLUMN, angles), (TIME_COLUMN, times)):
-        if column is not None and not np.isfinite(column.values).all():
-            row = int(np.argmin(np.isfinite(column.values)))
+    for column_name, column_values in ((ANGLE_COLUMN, angle_column), (TIME_COLUMN, time_column)):
+        if column_values is not None and not np.isfinite(column_values.values).all():
+            row = int(np.argmin(np.isfinite(column_values.values)))
             raise ExcitationError(
-                f"{path}: line {table.lines[row]}: {name} is not a finite number."
+                f"{path}: line {text_table.lines[row]}: {column_name} is not a finite number."
             )
-    if times is not None and (not_increasing := times.values[1:] <= times.values[:-1]).any():
-        row = int(np.argmax(not_increasing)) + 1
+    if (
+        time_column is not None
+        and (is_not_increasing := time_column.values[1:] <= time_column.values[:-1]).any()
+    ):
+        row = int(np.argmax(is_not_increasing)) + 1
         raise ExcitationError(
-            f"{path}: line {table.lines[row]}: {TIME_COLUMN} does not come after the one before "
-            "it; times must increase."
+            f"{path}: line {text_table.lines[row]}: {TIME_COLUMN} does not come after the one "
+            "before it; times must increase."
         )
-    return (None if times is None else times.values), angles.values
+    return (None if time_column is None else time_column.values), angle_column.values
 
 
-def _read_table(stream: BinaryIO) -> TextTable:
+def _read_table(table_stream: BinaryIO) -> TextTable:
     """Read a table with the columns of times and angles, or with a single column of angles."""
     try:
-        return read_table(stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
+        return read_table(table_stream, (TIME_COLUMN, ANGLE_COLUMN), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     try:
-        table = read_table(stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
+        text_table = read_table(table_stream, (ANGLE_COLUMN,), most_rows=MAX_SAMPLES)
     except MissingColumnError:
         pass
     else:
-        if table.width > 1:
+        if text_table.width > 1:
             raise TableError(
-                f"has {table.width} columns, {ANGLE_COLUMN} among them, but no {TIME_COLUMN}; name "
-                f"the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
+                f"has {text_table.width} columns, {ANGLE_COLUMN} among them, but no {TIME_COLUMN}; "
+                f"name the column of times in seconds so, or leave {ANGLE_COLUMN} alone."
             )
-        return table
-    table = read_table(stream, ("#1",), most_rows=MAX_SAMPLES)
-    if table.width > 1 or table.columns["#1"].title:
+        return text_table
+    text_table = read_table(table_stream, ("#1",), most_rows=MAX_SAMPLES)
+    if text_table.width > 1 or text_table.columns["#1"].title:
         raise TableError(
             f"must name the columns {TIME_COLUMN} (s) and {ANGLE_COLUMN} (rad) in one line above "
             "the numbers, or be one column of angles in rad."
         )
-    return table
+    return text_table

@@ -17,7 +17,7 @@ Value = float | int | str | Path
 
 
 class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
-    """Interface to a rig's limits and predicted behaviour, for which an excitation is planned."""
+    """Interface to a rig for which any kind of excitation is planned: limits and predictions."""
 
 
 KINDS: Mapping[str, Callable[..., Excitation]] = {
@@ -66,7 +66,7 @@ def make_excitation(
     >>> make_excitation("step", {"amplitude_rad": 0.01}, rate_hz=1000).parameters["amplitude_rad"]
     0.01
     """
-    make = KINDS[kind]
-    if "rig" in inspect.signature(make).parameters:
-        return make(rate_hz=rate_hz, rig=rig, **parameters)
-    return make(rate_hz=rate_hz, **parameters)
+    make_kind = KINDS[kind]
+    if "rig" in inspect.signature(make_kind).parameters:
+        return make_kind(rate_hz=rate_hz, rig=rig, **parameters)
+    return make_kind(rate_hz=rate_hz, **parameters)

@@ -60,7 +60,7 @@ _NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 
 
 class _ModeEntry(BaseModel):
-    """Mode of one fit in an analyser's document.
+    """Mode of one fit in the JSON document of an analysis.
 
     A value is None if the fit has none, and the frequency is 0 Hz if the mode does not oscillate.
     """
@@ -88,7 +88,7 @@ class _HeadlineValue(BaseModel):
 
 
 class _HeadlineMode(BaseModel):
-    """Mode in the main results of an analysis: of the modal model, if the record shows it."""
+    """Mode in the main results of an analysis, with frequency in Hz and damping ratio."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -97,7 +97,7 @@ class _HeadlineMode(BaseModel):
 
     @property
     def entry(self) -> _ModeEntry:
-        """The mode in the form of a single fit's mode."""
+        """Frequency, damping ratio and standard deviation of the mode, as for a mode of one fit."""
         return _ModeEntry(
             frequency_hz=self.frequency_hz.value,
             damping_ratio=self.damping_ratio.value or None,
@@ -106,7 +106,7 @@ class _HeadlineMode(BaseModel):
 
 
 class _Headline(BaseModel):
-    """Main results that an analysis reports of one record or of a campaign."""
+    """Main results of an analysis of one record or of a campaign: its list of modes."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -114,7 +114,7 @@ class _Headline(BaseModel):
 
 
 class _Document(BaseModel):
-    """Analyser's document, reduced to the keys from which modes are read."""
+    """JSON document of an analysis, reduced to the keys from which modes are read."""
 
     model_config = ConfigDict(extra="ignore", frozen=True)
 
@@ -135,12 +135,12 @@ class FoundMode:
     the fits."""
 
 
-def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
-    """Read the modes of a beam from an analyser's document, lowest frequency first.
+def read_modes(document_path: str | Path) -> tuple[FoundMode, ...]:
+    """Read the modes of a beam from the JSON document of an analysis, lowest frequency first.
 
     Parameters
     ----------
-    path
+    document_path
         JSON with the key ``modes``: a list of objects with ``frequency_hz`` (Hz, of the free decay)
         and ``damping_ratio``, and optionally ``frequency_std_hz``. Other keys are ignored. If
         several fits found a mode, their medians are used. Fits of the estimator ``record`` have
@@ -152,24 +152,34 @@ def read_modes(path: str | Path) -> tuple[FoundMode, ...]:
     ExcitationError
         If the file cannot be read or has an invalid value.
     """
-    path = Path(path)
+    document_path = Path(document_path)
     try:
-        document = _Document.model_validate(_read_json(path))
+        analysis_document = _Document.model_validate(_read_json(document_path))
     except ValidationError as error:
-        complaint = _describe_invalid_value(
+        complaint_text = _describe_invalid_value(
             error.errors(include_url=False, include_context=False)[0]
         )
-        raise ExcitationError(f"{path}: {complaint}") from None
-    reported = [mode.entry for headline in document.headlines for mode in headline.modes]
-    entries = [entry for entry in reported or document.modes if entry.oscillates]
-    record_entries = [entry for entry in entries if entry.estimator == "record"]
-    modes = tuple(_median_mode(group) for group in _mode_groups(record_entries or entries))
-    if not modes:
+        raise ExcitationError(f"{document_path}: {complaint_text}") from None
+    reported_entries = [
+        headline_mode.entry
+        for headline in analysis_document.headlines
+        for headline_mode in headline.modes
+    ]
+    mode_entries = [
+        mode_entry
+        for mode_entry in reported_entries or analysis_document.modes
+        if mode_entry.oscillates
+    ]
+    record_entries = [mode_entry for mode_entry in mode_entries if mode_entry.estimator == "record"]
+    found_modes = tuple(
+        _median_mode(mode_group) for mode_group in _mode_groups(record_entries or mode_entries)
+    )
+    if not found_modes:
         raise ExcitationError(
-            f"{path}: modes has no mode that oscillates; take the document of an analysis that "
-            "found one (analyze session.mcap --json fits.json)."
+            f"{document_path}: modes has no mode that oscillates; take the document of an analysis "
+            "that found one (analyze session.mcap --json fits.json)."
         )
-    return modes
+    return found_modes
 
 
 def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
@@ -182,59 +192,67 @@ def _read_json(path: Path) -> Any:  # noqa: ANN401 - any JSON value
         ) from error
 
 
-def _describe_invalid_value(detail: ErrorDetails) -> str:
+def _describe_invalid_value(error_details: ErrorDetails) -> str:
     """Return a sentence that names an invalid value in a document, with a remedy."""
     document_path = ""
-    for part in detail["loc"]:
+    for path_part in error_details["loc"]:
         document_path += (
-            f"[{part}]" if isinstance(part, int) else f".{part}" if document_path else part
+            f"[{path_part}]"
+            if isinstance(path_part, int)
+            else f".{path_part}"
+            if document_path
+            else path_part
         )
     if not document_path:
         return 'is no JSON object; it must have the key "modes".'
-    if detail["type"] == "missing":
+    if error_details["type"] == "missing":
         return f"{document_path} is missing; give it as analyze --json writes it."
-    unit = " Hz" if document_path.endswith("_hz") else ""
-    given_text = json.dumps(detail["input"], default=str)
+    unit_text = " Hz" if document_path.endswith("_hz") else ""
+    given_text = json.dumps(error_details["input"], default=str)
     given_text = given_text if len(given_text) <= 60 else f"{given_text[:60]}..."
-    remedy = {
-        "greater_than": f"must be more than 0{unit}",
-        "greater_than_equal": f"must not be negative: give it in{unit}",
+    remedy_text = {
+        "greater_than": f"must be more than 0{unit_text}",
+        "greater_than_equal": f"must not be negative: give it in{unit_text}",
         "finite_number": "is not a finite number",
         "list_type": "must be a list of modes",
         "model_type": "must be an object with frequency_hz and damping_ratio",
         "string_type": "must be a text",
-    }.get(detail["type"], f"must be a number{' in Hz' if unit else ''}")
-    return f"{document_path} = {given_text}{unit} {remedy}."
+    }.get(error_details["type"], f"must be a number{' in Hz' if unit_text else ''}")
+    return f"{document_path} = {given_text}{unit_text} {remedy_text}."
 
 
-def _mode_groups(entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
+def _mode_groups(mode_entries: Sequence[_ModeEntry]) -> Iterator[list[_ModeEntry]]:
     """Yield lists of entries of several fits that describe the same mode, by rising frequency."""
-    group: list[_ModeEntry] = []
-    for entry in sorted(entries, key=_frequency_hz):
-        if group and _frequency_hz(entry) > SAME_MODE_FREQUENCY_RATIO * _frequency_hz(group[0]):
-            yield group
-            group = []
-        group.append(entry)
-    if group:
-        yield group
+    mode_group: list[_ModeEntry] = []
+    for mode_entry in sorted(mode_entries, key=_frequency_hz):
+        if mode_group and _frequency_hz(mode_entry) > SAME_MODE_FREQUENCY_RATIO * _frequency_hz(
+            mode_group[0]
+        ):
+            yield mode_group
+            mode_group = []
+        mode_group.append(mode_entry)
+    if mode_group:
+        yield mode_group
 
 
-def _median_mode(group: Sequence[_ModeEntry]) -> FoundMode:
+def _median_mode(mode_entries: Sequence[_ModeEntry]) -> FoundMode:
     """Return the median of several fits' entries for one mode."""
-    middle_hz = median(_frequency_hz(entry) for entry in group)
-    stated_hz = median(entry.frequency_std_hz or 0.0 for entry in group)
+    middle_hz = median(_frequency_hz(mode_entry) for mode_entry in mode_entries)
+    stated_hz = median(mode_entry.frequency_std_hz or 0.0 for mode_entry in mode_entries)
     # Fits of unsuitable structures lie far off: the median of the distances tolerates them.
-    scatter_hz = 1.4826 * median(abs(_frequency_hz(entry) - middle_hz) for entry in group)
+    scatter_hz = 1.4826 * median(
+        abs(_frequency_hz(mode_entry) - middle_hz) for mode_entry in mode_entries
+    )
     return FoundMode(
         frequency_hz=middle_hz,
-        damping_ratio=median(entry.damping_ratio or 0.0 for entry in group),
+        damping_ratio=median(mode_entry.damping_ratio or 0.0 for mode_entry in mode_entries),
         uncertainty_hz=2.0 * max(stated_hz, scatter_hz),
     )
 
 
-def _frequency_hz(entry: _ModeEntry) -> float:
+def _frequency_hz(mode_entry: _ModeEntry) -> float:
     """Return the frequency of a mode's entry in Hz, or 0 if it has none."""
-    return entry.frequency_hz or 0.0
+    return mode_entry.frequency_hz or 0.0
 
 
 # Bands, and the time spent in each
@@ -278,17 +296,20 @@ class Band:
     """Upper end of the band in Hz."""
 
     @classmethod
-    def around_mode(cls, mode: FoundMode, widths: float) -> "Band":
-        """Return the band around a mode.
+    def around_mode(cls, found_mode: FoundMode, widths: float) -> "Band":
+        """Return the band of frequencies to be swept around a mode.
 
         On either side it extends by the uncertainty of the frequency and by `widths` half-power
         widths.
         """
-        half_hz = widths * 2.0 * mode.damping_ratio * mode.frequency_hz + mode.uncertainty_hz
+        half_hz = (
+            widths * 2.0 * found_mode.damping_ratio * found_mode.frequency_hz
+            + found_mode.uncertainty_hz
+        )
         # A sweep needs a period: strongly damped modes would begin at 0 Hz or below.
         return cls(
-            mode, max(mode.frequency_hz - half_hz, 0.2 * mode.frequency_hz),
-            mode.frequency_hz + half_hz,
+            found_mode, max(found_mode.frequency_hz - half_hz, 0.2 * found_mode.frequency_hz),
+            found_mode.frequency_hz + half_hz,
         )  # fmt: skip
 
     @property
@@ -297,8 +318,10 @@ class Band:
         return 1.0 / (2.0 * pi * self.mode.frequency_hz * self.mode.damping_ratio)
 
 
-def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig) -> Real:
-    """Return the fractions of the time in each band that determine the damping most precisely.
+def time_fractions(
+    sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig
+) -> Real:
+    """Return the fraction of the sweep's time for each band that measures damping most precisely.
 
     They minimise the geometric mean of the standard deviations of the damping's parameters, with
     all other parameters free, by multiplicative steps (D. M. Titterington, 1976; for criteria
@@ -306,7 +329,7 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
 
     Parameters
     ----------
-    bands, amplitudes_rad
+    sweep_bands, amplitudes_rad
         Bands, and the amplitude of the reference in each band.
     rig
         Predicted behaviour of the rig.
@@ -316,17 +339,20 @@ def time_fractions(bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: 
     ndarray, shape (len(bands),)
         Fractions with the sum 1.
     """
-    damping = first_order_damping([band.mode for band in bands], rig.beam)
-    rates, damping_count = _information_rates(bands, amplitudes_rad, rig, damping)
-    scale = np.sqrt(np.einsum("bii->i", rates))
-    rates = rates / np.outer(scale, scale)
-    fractions = np.full(len(bands), 1.0 / len(bands))
+    beam_damping = first_order_damping([band.mode for band in sweep_bands], rig.beam)
+    information_rates, damping_count = _information_rates(
+        sweep_bands, amplitudes_rad, rig, beam_damping
+    )
+    parameter_scales = np.sqrt(np.einsum("bii->i", information_rates))
+    information_rates = information_rates / np.outer(parameter_scales, parameter_scales)
+    fractions = np.full(len(sweep_bands), 1.0 / len(sweep_bands))
     for _ in range(_TIME_STEPS):
-        information = np.tensordot(fractions, rates, axes=1)
-        covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(scale)))
-        lines = covariance[:damping_count]
+        information = np.tensordot(fractions, information_rates, axes=1)
+        covariance = np.linalg.inv(information + _REGULARISATION * np.eye(len(parameter_scales)))
+        gain_directions = covariance[:damping_count]
         precision_gains = (
-            np.einsum("pi,bij,pj->bp", lines, rates, lines) / np.diag(covariance)[:damping_count]
+            np.einsum("pi,bij,pj->bp", gain_directions, information_rates, gain_directions)
+            / np.diag(covariance)[:damping_count]
         )
         fractions = fractions * np.sqrt(precision_gains.sum(axis=1))
         fractions /= fractions.sum()
@@ -339,13 +365,15 @@ def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
     It minimises the relative squares of ``2 ratio = zeta omega + gamma / ((rho/EI) omega)`` with
     coefficients that are not negative.
     """
-    omega = np.array([2.0 * pi * mode.frequency_hz for mode in modes])
-    ratio = np.array([mode.damping_ratio for mode in modes])
-    columns = np.stack([omega, 1.0 / (beam.density_over_stiffness * omega)]) / (2.0 * ratio)
-    coefficients = np.linalg.lstsq(columns.T, np.ones(len(modes)), rcond=None)[0]
+    mode_rad_s = np.array([2.0 * pi * found_mode.frequency_hz for found_mode in modes])
+    damping_ratios = np.array([found_mode.damping_ratio for found_mode in modes])
+    scaled_columns = np.stack([mode_rad_s, 1.0 / (beam.density_over_stiffness * mode_rad_s)]) / (
+        2.0 * damping_ratios
+    )
+    coefficients = np.linalg.lstsq(scaled_columns.T, np.ones(len(modes)), rcond=None)[0]
     if (coefficients < 0.0).any():
-        single_coefficients = columns.sum(axis=1) / (columns**2).sum(axis=1)
-        squared_errors = ((single_coefficients[:, None] * columns - 1.0) ** 2).sum(axis=1)
+        single_coefficients = scaled_columns.sum(axis=1) / (scaled_columns**2).sum(axis=1)
+        squared_errors = ((single_coefficients[:, None] * scaled_columns - 1.0) ** 2).sum(axis=1)
         coefficients = np.where(np.arange(2) == np.argmin(squared_errors), single_coefficients, 0.0)
     return Damping(
         zeta=float(coefficients[0]), alpha=1.0, gamma=float(coefficients[1]), lambda_=1.0
@@ -353,40 +381,48 @@ def first_order_damping(modes: Sequence[FoundMode], beam: Beam) -> Damping:
 
 
 def _information_rates(
-    bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
+    sweep_bands: Sequence[Band], amplitudes_rad: Sequence[float], rig: SweepRig, damping: Damping
 ) -> tuple[Real, int]:
     """Return the Fisher information per second of each band, and the number of damping parameters.
 
     The information has the shape (bands, k, k), with the damping's parameters first. Coefficients
     are relative. The order of an absent damping cannot be estimated.
     """
-    factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
-    orders = {"alpha": damping.zeta, "lambda": damping.gamma}
-    names = [n for n, factor in factors.items() if factor > 0.0 and orders.get(n, 1.0) > 0.0]
-    rates = []
-    for band, amplitude_rad in zip(bands, amplitudes_rad, strict=True):
-        frequency_hz = np.linspace(band.start_hz, band.stop_hz, _BAND_POINTS)
+    damping_factors = {"zeta": damping.zeta, "alpha": 1.0, "gamma": damping.gamma, "lambda": 1.0}
+    coefficients_by_order = {"alpha": damping.zeta, "lambda": damping.gamma}
+    parameter_names = [
+        n
+        for n, damping_factor in damping_factors.items()
+        if damping_factor > 0.0 and coefficients_by_order.get(n, 1.0) > 0.0
+    ]
+    information_rates = []
+    for sweep_band, amplitude_rad in zip(sweep_bands, amplitudes_rad, strict=True):
+        frequency_hz = np.linspace(sweep_band.start_hz, sweep_band.stop_hz, _BAND_POINTS)
         s = 2j * pi * frequency_hz
-        beam = _beam_with_mode(rig.beam, band.mode.frequency_hz)
-        g, gradient = transfer_and_gradient(s, beam, damping, (*names, *PARAMETERS[4:]))
-        gradient[: len(names)] *= np.array([factors[name] for name in names])[:, None]
-        rows = np.concatenate([gradient, [-s * g, s * s]])
-        rows *= amplitude_rad * rig.tracking(frequency_hz)
-        rates.append((rows.conj() @ rows.T).real / _BAND_POINTS)
-    return np.array(rates), len(names)
+        band_beam = _beam_with_mode(rig.beam, sweep_band.mode.frequency_hz)
+        g, gradient = transfer_and_gradient(
+            s, band_beam, damping, (*parameter_names, *PARAMETERS[4:])
+        )
+        gradient[: len(parameter_names)] *= np.array(
+            [damping_factors[parameter_name] for parameter_name in parameter_names]
+        )[:, None]
+        whitened_rows = np.concatenate([gradient, [-s * g, s * s]])
+        whitened_rows *= amplitude_rad * rig.tracking(frequency_hz)
+        information_rates.append((whitened_rows.conj() @ whitened_rows.T).real / _BAND_POINTS)
+    return np.array(information_rates), len(parameter_names)
 
 
 def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
-    """Return the beam with another density, so that its nearest mode has the given frequency.
+    """Return the beam with a density such that its mode nearest to a frequency has this frequency.
 
     The profile's beam is wrong by more than the width of a band.
     """
-    omega = 2.0 * pi * frequency_hz
+    mode_rad_s = 2.0 * pi * frequency_hz
     modes_rad_s = undamped_frequencies_rad_s(beam, 12)
-    nearest = modes_rad_s[np.argmin(np.abs(np.log(modes_rad_s / omega)))]
+    nearest_rad_s = modes_rad_s[np.argmin(np.abs(np.log(modes_rad_s / mode_rad_s)))]
     return Beam(
         length_m=beam.length_m,
-        density_kg_per_m=beam.density_kg_per_m * float(nearest / omega) ** 2,
+        density_kg_per_m=beam.density_kg_per_m * float(nearest_rad_s / mode_rad_s) ** 2,
         bending_stiffness_n_m2=beam.bending_stiffness_n_m2,
     )
 
@@ -448,32 +484,40 @@ def modes(
     require_positive("taper_s", taper_s, "s")
     require_positive("tip_slope_rad", tip_slope_rad, "rad")
     segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    first, end = segments["sweep"]
-    bands = _read_bands(Path(path), stop_hz, widths, rate_hz)
-    fades = 2 * round(taper_s * rate_hz)
-    if fades < 2 or LEAST_TIME_FRACTION * (end - first) / len(bands) < fades:
+    sweep_begin, end = segments["sweep"]
+    sweep_bands = _read_bands(Path(path), stop_hz, widths, rate_hz)
+    fade_ticks = 2 * round(taper_s * rate_hz)
+    if fade_ticks < 2 or LEAST_TIME_FRACTION * (end - sweep_begin) / len(sweep_bands) < fade_ticks:
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is too short for fades of taper_s = {taper_s:g} s at "
-            f"both ends of {len(bands)} sweeps; choose at least "
-            f"{2.0 * taper_s * len(bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from "
+            f"both ends of {len(sweep_bands)} sweeps; choose at least "
+            f"{2.0 * taper_s * len(sweep_bands) / LEAST_TIME_FRACTION:g} s, or a taper_s from "
             f"{2 / rate_hz:g} s."
         )
-    lengths = _divide_ticks(np.full(len(bands), 1.0 / len(bands)), end - first)
-    amplitudes_rad = [amplitude_rad] * len(bands)
-    sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
+    sweep_ticks = _divide_ticks(
+        np.full(len(sweep_bands), 1.0 / len(sweep_bands)), end - sweep_begin
+    )
+    amplitudes_rad = [amplitude_rad] * len(sweep_bands)
+    sweeps = [
+        _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)
+        for band_and_ticks in zip(sweep_bands, sweep_ticks, strict=True)
+    ]
     if rig is not None:
         reduced_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
-        lengths = _divide_ticks(
-            _raise_to_least(time_fractions(bands, reduced_rad, rig)), end - first
+        sweep_ticks = _divide_ticks(
+            _raise_to_least(time_fractions(sweep_bands, reduced_rad, rig)), end - sweep_begin
         )
-        sweeps = [_unit_sweep(*item, fades, rate_hz) for item in zip(bands, lengths, strict=True)]
+        sweeps = [
+            _unit_sweep(*band_and_ticks, fade_ticks, rate_hz)
+            for band_and_ticks in zip(sweep_bands, sweep_ticks, strict=True)
+        ]
         amplitudes_rad = _admissible_amplitudes(sweeps, amplitude_rad, tip_slope_rad, rig)
     reference_rad = np.concatenate([a * s for a, s in zip(amplitudes_rad, sweeps, strict=True)])
     parameters: dict[str, float | int | str] = {
         "file": Path(path).name,
         "amplitude_rad": max(amplitudes_rad),
-        "start_hz": min(band.start_hz for band in bands),
-        "stop_hz": max(band.stop_hz for band in bands),
+        "start_hz": min(band.start_hz for band in sweep_bands),
+        "stop_hz": max(band.stop_hz for band in sweep_bands),
         "widths": widths,
         "duration_s": duration_s,
         "rest_s": rest_s,
@@ -481,9 +525,11 @@ def modes(
         "taper_s": taper_s,
         "tip_slope_rad": tip_slope_rad,
         "bands": "; ".join(
-            f"{band.start_hz:.6g}-{band.stop_hz:.6g} Hz, {amplitude:.4g} rad, "
+            f"{band.start_hz:.6g}-{band.stop_hz:.6g} Hz, {band_amplitude:.4g} rad, "
             f"{ticks / rate_hz:.6g} s"
-            for band, amplitude, ticks in zip(bands, amplitudes_rad, lengths, strict=True)
+            for band, band_amplitude, ticks in zip(
+                sweep_bands, amplitudes_rad, sweep_ticks, strict=True
+            )
         ),
     }
     return assemble_excitation("modes", parameters, rate_hz, segments, reference_rad)
@@ -491,23 +537,26 @@ def modes(
 
 def _read_bands(path: Path, stop_hz: float, widths: float, rate_hz: float) -> list[Band]:
     """Read modes from a document and return their bands, that of the slowest decay first."""
-    read = read_modes(path)
-    modes_in_band = [mode for mode in read if mode.frequency_hz <= stop_hz]
+    all_modes = read_modes(path)
+    modes_in_band = [found_mode for found_mode in all_modes if found_mode.frequency_hz <= stop_hz]
     if not modes_in_band:
         raise ExcitationError(
-            f"{path}: the lowest mode, frequency_hz = {read[0].frequency_hz:g} Hz, lies above "
-            f"stop_hz = {stop_hz:g} Hz; raise stop_hz."
+            f"{path}: the lowest mode, frequency_hz = {all_modes[0].frequency_hz:g} Hz, lies "
+            f"above stop_hz = {stop_hz:g} Hz; raise stop_hz."
         )
-    bands = sorted(
-        (Band.around_mode(mode, widths) for mode in modes_in_band), key=lambda band: -band.decay_s
+    sweep_bands = sorted(
+        (Band.around_mode(found_mode, widths) for found_mode in modes_in_band),
+        key=lambda sweep_band: -sweep_band.decay_s,
     )
-    for band in bands:
-        require_frequency(f"The upper end of a band of {widths:g} widths", band.stop_hz, rate_hz)
-    return bands
+    for sweep_band in sweep_bands:
+        require_frequency(
+            f"The upper end of a band of {widths:g} widths", sweep_band.stop_hz, rate_hz
+        )
+    return sweep_bands
 
 
 def _admissible_amplitudes(
-    sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
+    unit_sweeps: Sequence[Real], amplitude_rad: float, tip_slope_rad: float, rig: SweepRig
 ) -> list[float]:
     """Return the amplitude of each sweep in rad, reduced where the rig's limits require it.
 
@@ -515,51 +564,56 @@ def _admissible_amplitudes(
     sweep.
     """
     amplitudes_rad = []
-    before_rad = np.empty(0)
-    for sweep in sweeps:
+    earlier_sweeps_rad = np.empty(0)
+    for sweep in unit_sweeps:
         reduced_rad = amplitude_rad
         for _ in range(_MAX_REDUCTIONS):
-            so_far_rad = np.concatenate([before_rad, reduced_rad * sweep])
-            fraction = max(
-                rig.fraction_of_limits(so_far_rad), rig.tip_slope_rad(so_far_rad) / tip_slope_rad
+            sweeps_so_far_rad = np.concatenate([earlier_sweeps_rad, reduced_rad * sweep])
+            limit_fraction = max(
+                rig.fraction_of_limits(sweeps_so_far_rad),
+                rig.tip_slope_rad(sweeps_so_far_rad) / tip_slope_rad,
             )
-            if fraction <= LIMIT_FRACTION * _LIMIT_TOLERANCE:
+            if limit_fraction <= LIMIT_FRACTION * _LIMIT_TOLERANCE:
                 break
-            reduced_rad *= LIMIT_FRACTION / fraction
+            reduced_rad *= LIMIT_FRACTION / limit_fraction
         amplitudes_rad.append(reduced_rad)
-        before_rad = np.concatenate([before_rad, reduced_rad * sweep])
+        earlier_sweeps_rad = np.concatenate([earlier_sweeps_rad, reduced_rad * sweep])
     return amplitudes_rad
 
 
-def _divide_ticks(fractions: Real, ticks: int) -> list[int]:
-    """Return numbers of ticks in proportion to fractions, whose sum is exactly `ticks`."""
-    ends = np.round(np.cumsum(fractions) * ticks).astype(int)
-    return [int(length) for length in np.diff(ends, prepend=0)]
+def _divide_ticks(band_fractions: Real, tick_count: int) -> list[int]:
+    """Divide `tick_count` ticks in proportion to `band_fractions`; the sum is exact."""
+    end_ticks = np.round(np.cumsum(band_fractions) * tick_count).astype(int)
+    return [int(part_ticks) for part_ticks in np.diff(end_ticks, prepend=0)]
 
 
-def _raise_to_least(fractions: Real) -> Real:
-    """Return fractions of the time of which none is less than `LEAST_TIME_FRACTION` allows.
+def _raise_to_least(band_fractions: Real) -> Real:
+    """Return the bands' fractions of the time, each raised to the least that is allowed.
 
     The other fractions are reduced in proportion, so that the sum remains 1.
     """
-    least = LEAST_TIME_FRACTION / len(fractions)
-    is_low = fractions < least
-    for _ in fractions:
-        remaining_scale = (1.0 - least * np.count_nonzero(is_low)) / fractions[~is_low].sum()
-        raised_fractions = np.where(is_low, least, fractions * remaining_scale)
-        is_low = raised_fractions <= least
+    least_fraction = LEAST_TIME_FRACTION / len(band_fractions)
+    is_low = band_fractions < least_fraction
+    for _ in band_fractions:
+        remaining_scale = (1.0 - least_fraction * np.count_nonzero(is_low)) / band_fractions[
+            ~is_low
+        ].sum()
+        raised_fractions = np.where(is_low, least_fraction, band_fractions * remaining_scale)
+        is_low = raised_fractions <= least_fraction
     return raised_fractions
 
 
-def _unit_sweep(band: Band, ticks: int, fades: int, rate_hz: float) -> Real:
-    """Return a sweep of amplitude 1 through a band, shape (ticks,).
+def _unit_sweep(band: Band, tick_count: int, fade_ticks: int, rate_hz: float) -> Real:
+    """Return a sweep of amplitude 1 through a band, shape (tick_count,).
 
     Both ends have a raised-cosine fade of ``fades / 2`` ticks.
     """
-    duration_s = ticks / rate_hz
-    t = np.arange(ticks) / rate_hz
-    phase = (
+    duration_s = tick_count / rate_hz
+    t = np.arange(tick_count) / rate_hz
+    phase_rad = (
         2.0 * pi * (band.start_hz * t + (band.stop_hz - band.start_hz) * t**2 / (2 * duration_s))
     )
-    edge = np.minimum(np.arange(ticks), ticks - np.arange(ticks)) / (fades / 2)
-    return (0.5 - 0.5 * np.cos(pi * np.minimum(edge, 1.0))) * np.sin(phase)
+    edge_fraction = np.minimum(np.arange(tick_count), tick_count - np.arange(tick_count)) / (
+        fade_ticks / 2
+    )
+    return (0.5 - 0.5 * np.cos(pi * np.minimum(edge_fraction, 1.0))) * np.sin(phase_rad)

@@ -85,35 +85,36 @@ def predict_move_end(rig: DisturbedRig, reference_rad: Real, ring_down_s: float)
         Duration of the ring-down in the session, in s.
     """
     rate_hz, end = rig.rate_hz, reference_rad.size
-    ringing = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
-    if not ringing.size:
-        ringing = rig.poles_rad_s[:1]
-    decay_per_s = -ringing.real
+    ringing_poles = rig.poles_rad_s[np.abs(rig.poles_rad_s) < 2 * np.pi * ROBUST_BELOW_HZ]
+    if not ringing_poles.size:
+        ringing_poles = rig.poles_rad_s[:1]
+    decay_per_s = -ringing_poles.real
     # The loop has followed up and the motor is at rest; from here the amplitudes only decay.
     measured_tick = end + round(2 * rig.settling_s * rate_hz)
     held_angle_rad = np.full(
         max(measured_tick - end + 1, round(_MIN_SIMULATED_S * rate_hz)), reference_rad[-1]
     )
-    angle, torque = rig.disturbed(
-        np.concatenate([[0.0], reference_rad, held_angle_rad]), ringing.size
+    angles_rad, mode_torques_nm = rig.disturbed(
+        np.concatenate([[0.0], reference_rad, held_angle_rad]), ringing_poles.size
     )
     ticks_outside = np.flatnonzero(
-        (np.abs(angle - reference_rad[-1]) > ARRIVAL_TOLERANCE_RAD).any(axis=1)
+        (np.abs(angles_rad - reference_rad[-1]) > ARRIVAL_TOLERANCE_RAD).any(axis=1)
     )
     arrival_tick = int(ticks_outside[-1]) + 1 if ticks_outside.size else 0
-    amplitude = (
-        torque[measured_tick] * np.exp(decay_per_s * (measured_tick - end) / rate_hz)[:, None]
+    mode_amplitudes = (
+        mode_torques_nm[measured_tick]
+        * np.exp(decay_per_s * (measured_tick - end) / rate_hz)[:, None]
     )
     # Variance of a decaying cosine's amplitude in white noise, by least squares.
     first_s, last_s = max(arrival_tick - end, 0) / rate_hz, max(ring_down_s, _MIN_RING_DOWN_S)
     decay_factors = [
-        np.exp(-2 * decay_per_s * at_s) for at_s in (first_s, max(last_s, 2 * first_s))
+        np.exp(-2 * decay_per_s * time_s) for time_s in (first_s, max(last_s, 2 * first_s))
     ]
-    variance = (
+    amplitude_variances = (
         rig.torque_noise_nm**2 * 4 * decay_per_s / (decay_factors[0] - decay_factors[1]) / rate_hz
     )
     return MoveEnd(
-        arrival_s=arrival_tick / rate_hz if arrival_tick < angle.shape[0] - 1 else None,
-        residual_nm=float(np.sqrt((amplitude**2).sum(axis=0).mean())),
-        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_1_IN_1000 * variance.sum())),
+        arrival_s=arrival_tick / rate_hz if arrival_tick < angles_rad.shape[0] - 1 else None,
+        residual_nm=float(np.sqrt((mode_amplitudes**2).sum(axis=0).mean())),
+        floor_nm=float(np.sqrt(_SQUARED_AMPLITUDE_1_IN_1000 * amplitude_variances.sum())),
     )

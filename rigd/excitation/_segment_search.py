@@ -70,7 +70,7 @@ _LIMIT_CHECK_TICKS: Final = 4
 
 @dataclass(frozen=True, slots=True)
 class PrecisionForecast:
-    """Forecast of the time until all target precisions are reached."""
+    """Forecast of the time in s until all target standard deviations are reached."""
 
     seconds: float
     """Time in s until all targets are reached with the best segments; infinite: never."""
@@ -80,7 +80,7 @@ class PrecisionForecast:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Segment:
-    """Planned segment of excitation, with the precision expected from it.
+    """Planned segment of excitation, with the standard deviations expected after it.
 
     It begins and ends with angle, speed and acceleration zero.
     """
@@ -128,7 +128,7 @@ class _SweepBand:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _UnitSweep:
-    """Reference and predicted response of a sweep of amplitude 1 rad in one phase."""
+    """Reference angle and predicted response of a sweep of amplitude 1 rad in one phase."""
 
     reference_rad: Real
     """Reference angle at each tick of the segment; shape (n,)."""
@@ -148,7 +148,7 @@ class _UnitSweep:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _SegmentCandidate:
-    """Candidate for the next segment, at the largest amplitude that the limits allow."""
+    """Candidate for the next segment of excitation, as a sum of sweeps within the limits."""
 
     duration_s: float
     """Duration of the segment in s."""
@@ -168,18 +168,21 @@ class _SegmentCandidate:
     """Information up to the planning horizon if the first band is driven on after the segment, as
     the time in s in which the best mixture would give it."""
 
-    def weighted_sum(self, name: str) -> Real:
-        """Return an array of the whole segment: the weighted sum of an attribute of its sweeps.
+    def weighted_sum(self, attribute_name: str) -> Real:
+        """Return the sum of an array attribute of the segment's sweeps, weighted by amplitude.
 
-        `name` is an attribute of `_UnitSweep`.
+        `attribute_name` is an attribute of `_UnitSweep`.
         """
-        values: Real = sum(factor * getattr(sweep, name) for factor, sweep in self.terms)
-        return values
+        summed_values: Real = sum(
+            sweep_factor * getattr(candidate_sweep, attribute_name)
+            for sweep_factor, candidate_sweep in self.terms
+        )
+        return summed_values
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _ContinuedDrive:
-    """Response to driving a mode further after a segment, in two phases of the sine."""
+    """Response to exciting a mode by a sine after a segment, in two phases of the sine."""
 
     weighted: Real
     """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
@@ -190,7 +193,7 @@ class _ContinuedDrive:
 
 
 class SegmentSearch:
-    """Search for the best next segment, with the quantities that all candidates have in common."""
+    """Search for the next segment of excitation that improves the target precisions most."""
 
     def __init__(
         self,
@@ -223,12 +226,16 @@ class SegmentSearch:
         )
         # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
         torque_nm, slope_rad = record.ringing
-        zeros = np.zeros_like(torque_nm)
-        ringing = np.stack([zeros, zeros, zeros, torque_nm, torque_nm, slope_rad])
-        self.ringing = ringing / self.limits[:, None]
-        self.line_hz, line_rad = self.steady_sines()
-        known = record.information_after(None, 0)
-        self.mixture = best_mixture(known, estimate, quantities, self.line_hz, line_rad)
+        zero_channel = np.zeros_like(torque_nm)
+        ringing_channels = np.stack(
+            [zero_channel, zero_channel, zero_channel, torque_nm, torque_nm, slope_rad]
+        )
+        self.ringing = ringing_channels / self.limits[:, None]
+        self.line_hz, line_amplitudes_rad = self.steady_sines()
+        known_information = record.information_after(None, 0)
+        self.mixture = best_mixture(
+            known_information, estimate, quantities, self.line_hz, line_amplitudes_rad
+        )
         self.needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
         # With too little time all targets are missed by one factor, not the last mode alone.
         relaxation, needed_s = 1.0, self.needed_s
@@ -237,7 +244,12 @@ class SegmentSearch:
                 break
             relaxation *= (needed_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
-                known, estimate, quantities, self.line_hz, line_rad, relaxation
+                known_information,
+                estimate,
+                quantities,
+                self.line_hz,
+                line_amplitudes_rad,
+                relaxation,
             )
             needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
         self.weighted_if_held = self.mixture.weights @ record.nuisance_projection @ record.ahead
@@ -245,14 +257,14 @@ class SegmentSearch:
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
 
     def candidate_bands(self) -> list[_SweepBand]:
-        """Return the bands that candidate sweeps cover: through every mode, and on either side."""
-        bands = []
-        for mode in self.modes:
-            hz = mode.frequency_hz
+        """Return the frequency bands of candidate sweeps: at every mode, and on either side."""
+        sweep_bands = []
+        for beam_mode in self.modes:
+            hz = beam_mode.frequency_hz
             # A sine, a narrow sweep, and one over the whole resonance where that is wider.
             narrow_half_width_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
             resonance_half_width_hz = min(
-                _RESONANCE_HALF_WIDTHS * mode.damping_ratio * hz, 0.2 * hz
+                _RESONANCE_HALF_WIDTHS * beam_mode.damping_ratio * hz, 0.2 * hz
             )
             widths_hz = [
                 0.0,
@@ -263,60 +275,78 @@ class SegmentSearch:
                     else []
                 ),
             ]
-            bands += [_SweepBand(mode.number, hz, each, _FADE_S) for each in widths_hz]
+            sweep_bands += [
+                _SweepBand(beam_mode.number, hz, offset_width, _FADE_S)
+                for offset_width in widths_hz
+            ]
             # Fades as long as the beat with the mode: a shorter one excites the mode as well.
-            bands += [
+            sweep_bands += [
                 _SweepBand(
-                    mode.number,
-                    (1.0 + step) * hz,
+                    beam_mode.number,
+                    (1.0 + offset_step) * hz,
                     0.0,
                     max(_FADE_S, 1.0 / (_SIDE_OFFSET * hz)),
                     False,
                 )
-                for step in (-_SIDE_OFFSET, _SIDE_OFFSET)
-                if (1.0 + step) * hz < BAND_HZ
+                for offset_step in (-_SIDE_OFFSET, _SIDE_OFFSET)
+                if (1.0 + offset_step) * hz < BAND_HZ
             ]
-        return bands
+        return sweep_bands
 
     def steady_sines(self) -> tuple[Real, Real]:
-        """Return the steady sines of the forecast, at the largest amplitudes that limits allow.
+        """Return frequencies and largest allowed amplitudes of the forecast's steady sines.
 
         The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
         """
-        steps = [
-            (*(mode.damping_ratio * np.array(_SINE_OFFSETS)), -_SIDE_OFFSET, _SIDE_OFFSET)
-            for mode in self.modes
+        relative_offsets = [
+            (*(beam_mode.damping_ratio * np.array(_SINE_OFFSETS)), -_SIDE_OFFSET, _SIDE_OFFSET)
+            for beam_mode in self.modes
         ]
         frequency_hz = np.array(
             [
-                mode.frequency_hz * (1.0 + step)
-                for mode, of_mode in zip(self.modes, steps, strict=True)
-                for step in of_mode
+                beam_mode.frequency_hz * (1.0 + relative_offset)
+                for beam_mode, mode_offsets in zip(self.modes, relative_offsets, strict=True)
+                for relative_offset in mode_offsets
             ]
         )
         frequency_hz = frequency_hz[(frequency_hz > 0.0) & (frequency_hz < BAND_HZ)]
         s = 2j * pi * frequency_hz
-        _, response, slope = responses(self.estimate, s)
+        _, torque_response, slope_response = responses(self.estimate, s)
         # The response to a short pulse gives the torque for the motor's own inertia, and its lag.
-        pulse = np.zeros(round(self.plant.rate_hz))
-        rise = quintic(0.01, self.plant.rate_hz)
-        pulse[: 2 * rise.size] = 1e-3 * np.concatenate([rise, rise[::-1]])
-        pulse_response = self.plant.respond(pulse)
-        transform = np.exp(-np.outer(s, np.arange(pulse.size) / self.plant.rate_hz))
-        angle = transform @ pulse_response.angle_rad
-        lag = transform @ (pulse - pulse_response.angle_rad) / angle
-        motor_torque = (
-            transform @ (pulse_response.torque_nm - pulse_response.coupling_torque_nm) / angle
+        pulse_reference_rad = np.zeros(round(self.plant.rate_hz))
+        pulse_rise = quintic(0.01, self.plant.rate_hz)
+        pulse_reference_rad[: 2 * pulse_rise.size] = 1e-3 * np.concatenate(
+            [pulse_rise, pulse_rise[::-1]]
         )
-        fractions = np.abs([np.ones_like(s), s, lag, motor_torque + response, response, slope])
-        return frequency_hz, 1.0 / (fractions / self.limits[:, None]).max(axis=0)
+        pulse_response = self.plant.respond(pulse_reference_rad)
+        laplace_factors = np.exp(
+            -np.outer(s, np.arange(pulse_reference_rad.size) / self.plant.rate_hz)
+        )
+        angle_transform = laplace_factors @ pulse_response.angle_rad
+        lag = laplace_factors @ (pulse_reference_rad - pulse_response.angle_rad) / angle_transform
+        motor_torque_response = (
+            laplace_factors
+            @ (pulse_response.torque_nm - pulse_response.coupling_torque_nm)
+            / angle_transform
+        )
+        limit_fractions = np.abs(
+            [
+                np.ones_like(s),
+                s,
+                lag,
+                motor_torque_response + torque_response,
+                torque_response,
+                slope_response,
+            ]
+        )
+        return frequency_hz, 1.0 / (limit_fractions / self.limits[:, None]).max(axis=0)
 
     def best_candidate(
-        self, time_left_s: float, through: Collection[int] = ()
+        self, time_left_s: float, mode_numbers: Collection[int] = ()
     ) -> _SegmentCandidate:
-        """Return the most informative candidate that fits into `time_left_s`.
+        """Return the most informative candidate segment that fits into `time_left_s`.
 
-        It drives one of the modes in `through`, or any mode if `through` is empty.
+        It drives one of the modes in `mode_numbers`, or any mode if `mode_numbers` is empty.
         """
         durations_s = [d for d in DURATIONS_S if d <= time_left_s + 1e-9]
         if not durations_s:
@@ -325,15 +355,21 @@ class SegmentSearch:
                 f"{DURATIONS_S[0]:g} s."
             )
         return max(
-            (self.best_of_duration(d, through) for d in durations_s), key=lambda each: each.value
+            (self.best_of_duration(d, mode_numbers) for d in durations_s),
+            key=lambda each: each.value,
         )
 
-    def best_of_duration(self, duration_s: float, through: Collection[int]) -> _SegmentCandidate:
-        """Return the most informative candidate of a given duration.
+    def best_of_duration(
+        self, duration_s: float, mode_numbers: Collection[int]
+    ) -> _SegmentCandidate:
+        """Return the most informative candidate segment of a given duration.
 
         The best band comes first; bands of further modes are added if they give more information.
         """
-        sweep_pairs = [(band, self.sweep_pair(band, duration_s)) for band in self.candidate_bands()]
+        sweep_pairs = [
+            (sweep_band, self.sweep_pair(sweep_band, duration_s))
+            for sweep_band in self.candidate_bands()
+        ]
         empty_candidate = _SegmentCandidate(
             duration_s,
             (),
@@ -344,44 +380,49 @@ class SegmentSearch:
             0.0,
         )
         mode_sweeps = {
-            band.mode_number: sweep_pair
-            for band, sweep_pair in reversed(sweep_pairs)
-            if band.at_mode
+            sweep_band.mode_number: sweep_pair
+            for sweep_band, sweep_pair in reversed(sweep_pairs)
+            if sweep_band.at_mode
         }
         # A single line does not show a mode: any smooth response could produce it.
         resonance_bands = {
-            band.mode_number: band
-            for band, _ in sweep_pairs
-            if band.at_mode and band.mode_number in through
+            sweep_band.mode_number: sweep_band
+            for sweep_band, _ in sweep_pairs
+            if sweep_band.at_mode and sweep_band.mode_number in mode_numbers
         }
         candidates_at_rest = {
             mode_number: self.with_modes_at_rest(empty_candidate, mode_number, mode_sweeps)
             for mode_number in mode_sweeps
         }
-        best = max(
+        leading_candidate = max(
             (
-                self.with_band(start, 1.0, band, sweep_pair, phase_index)
-                for band, sweep_pair in sweep_pairs
-                if band.at_mode and (not through or band is resonance_bands.get(band.mode_number))
-                for start in (empty_candidate, candidates_at_rest[band.mode_number])
+                self.with_band(start_candidate, 1.0, sweep_band, sweep_pair, phase_index)
+                for sweep_band, sweep_pair in sweep_pairs
+                if sweep_band.at_mode
+                and (not mode_numbers or sweep_band is resonance_bands.get(sweep_band.mode_number))
+                for start_candidate in (empty_candidate, candidates_at_rest[sweep_band.mode_number])
                 for phase_index in range(_PHASE_COUNT)
             ),
             key=lambda each: each.value,
         )
         for _ in range(2):
-            driven_modes = {band.mode_number for band, _ in best.parts}
+            driven_modes = {sweep_band.mode_number for sweep_band, _ in leading_candidate.parts}
             extended_candidates = [
-                self.with_band(best, fraction, band, sweep_pair, phase_index)
-                for band, sweep_pair in sweep_pairs
-                if band.mode_number not in driven_modes
-                for fraction in _BASE_AMPLITUDE_FACTORS
+                self.with_band(
+                    leading_candidate, amplitude_fraction, sweep_band, sweep_pair, phase_index
+                )
+                for sweep_band, sweep_pair in sweep_pairs
+                if sweep_band.mode_number not in driven_modes
+                for amplitude_fraction in _BASE_AMPLITUDE_FACTORS
                 for phase_index in range(0, _PHASE_COUNT, 2)
             ]
-            better_candidate = max(extended_candidates, key=lambda each: each.value, default=best)
-            if better_candidate.value <= best.value:
+            better_candidate = max(
+                extended_candidates, key=lambda each: each.value, default=leading_candidate
+            )
+            if better_candidate.value <= leading_candidate.value:
                 break
-            best = better_candidate
-        return best
+            leading_candidate = better_candidate
+        return leading_candidate
 
     def ticks(self, time_s: float) -> int:
         """Return a time in s as a number of ticks of the rig."""
@@ -393,60 +434,78 @@ class SegmentSearch:
 
     def with_modes_at_rest(
         self,
-        start: _SegmentCandidate,
+        start_candidate: _SegmentCandidate,
         mode_number: int,
         mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
     ) -> _SegmentCandidate:
-        """Return a candidate that also brings all modes but one to rest by the segment's end.
+        """Return a candidate segment that also brings all modes but one to rest by its end.
 
         If the limits do not allow that, the modes' vibration is reduced as far as they allow.
         """
-        sweeps = [
-            sweep
-            for other, sweep_pair in mode_sweeps.items()
-            if other != mode_number
-            for sweep in sweep_pair
+        other_sweeps = [
+            other_sweep
+            for other_mode, sweep_pair in mode_sweeps.items()
+            if other_mode != mode_number
+            for other_sweep in sweep_pair
         ]
-        if not sweeps:
-            return start
-        first = self.model_samples(start.duration_s)
-        tail = slice(first, first + self.model_samples(_TAIL_S))
+        if not other_sweeps:
+            return start_candidate
+        first_sample = self.model_samples(start_candidate.duration_s)
+        tail_samples = slice(first_sample, first_sample + self.model_samples(_TAIL_S))
         # One second of the tip's slope suffices to separate the modes.
-        tip_slopes = np.stack([sweep.slope[tail] for sweep in sweeps], axis=1)
-        present_slope = self.tip_slope[tail]
-        factors = -np.linalg.lstsq(tip_slopes, present_slope)[0]
-        unit = sum(
-            f * sweep.channels[:, ::_LIMIT_CHECK_TICKS]
-            for f, sweep in zip(factors, sweeps, strict=True)
+        tip_slopes = np.stack(
+            [other_sweep.slope[tail_samples] for other_sweep in other_sweeps], axis=1
         )
-        fraction = min(1.0, largest_factor(start.channels, unit))
-        weighted = sum(f * sweep.weighted for f, sweep in zip(factors, sweeps, strict=True))
+        present_slope = self.tip_slope[tail_samples]
+        sweep_factors = -np.linalg.lstsq(tip_slopes, present_slope)[0]
+        summed_channels = sum(
+            f * other_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
+            for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
+        )
+        amplitude_fraction = min(1.0, largest_factor(start_candidate.channels, summed_channels))
+        summed_weighted = sum(
+            f * other_sweep.weighted
+            for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
+        )
         return _SegmentCandidate(
-            start.duration_s,
+            start_candidate.duration_s,
             (),
-            tuple((fraction * f, sweep) for f, sweep in zip(factors, sweeps, strict=True)),
-            start.channels + fraction * unit,
-            start.weighted + fraction * weighted,
-            start.tip_slope
-            + fraction * sum(f * sweep.slope for f, sweep in zip(factors, sweeps, strict=True)),
+            tuple(
+                (amplitude_fraction * f, other_sweep)
+                for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
+            ),
+            start_candidate.channels + amplitude_fraction * summed_channels,
+            start_candidate.weighted + amplitude_fraction * summed_weighted,
+            start_candidate.tip_slope
+            + amplitude_fraction
+            * sum(
+                f * other_sweep.slope
+                for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
+            ),
             0.0,
         )
 
-    def sweep_pair(self, band: _SweepBand, duration_s: float) -> tuple[_UnitSweep, _UnitSweep]:
-        """Return two unit sweeps through a band, whose phases differ by a quarter of a period."""
+    def sweep_pair(
+        self, sweep_band: _SweepBand, duration_s: float
+    ) -> tuple[_UnitSweep, _UnitSweep]:
+        """Return two sweeps of 1 rad through a band, a quarter of a period apart in phase."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
         from_middle_s = np.arange(1, n + 1) / rate_hz - 0.5 * duration_s
-        phase = 2 * pi * band.middle_hz * from_middle_s
-        phase += 2 * pi * band.half_width_hz * from_middle_s**2 / duration_s
-        fade = quintic(min(band.fade_s, 0.4 * duration_s), rate_hz)
+        phase_rad = 2 * pi * sweep_band.middle_hz * from_middle_s
+        phase_rad += 2 * pi * sweep_band.half_width_hz * from_middle_s**2 / duration_s
+        fade_factors = quintic(min(sweep_band.fade_s, 0.4 * duration_s), rate_hz)
         # The motor comes to rest as well before the segment ends.
-        last = n - self.ticks(self.plant.settling_s)
-        window = np.zeros(n)
-        window[:last] = 1.0
-        window[: fade.size] = fade
-        window[last - fade.size : last] = np.minimum(window[last - fade.size : last], 1.0 - fade)
-        return self.unit_sweep(window * np.sin(phase)), self.unit_sweep(window * np.cos(phase))
+        end_tick = n - self.ticks(self.plant.settling_s)
+        fade_window = np.zeros(n)
+        fade_window[:end_tick] = 1.0
+        fade_window[: fade_factors.size] = fade_factors
+        fade_window[end_tick - fade_factors.size : end_tick] = np.minimum(
+            fade_window[end_tick - fade_factors.size : end_tick], 1.0 - fade_factors
+        )
+        return self.unit_sweep(fade_window * np.sin(phase_rad)), self.unit_sweep(
+            fade_window * np.cos(phase_rad)
+        )
 
     def unit_sweep(self, reference_rad: Real) -> _UnitSweep:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
@@ -454,92 +513,118 @@ class SegmentSearch:
         extended_reference_rad = np.concatenate(
             [reference_rad, np.zeros(round(_SETTLING_S * self.plant.rate_hz))]
         )
-        response = self.plant.respond(extended_reference_rad)
-        spectrum = self.model.spectrum(response.angle_rad)
-        rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
+        loop_response = self.plant.respond(extended_reference_rad)
+        spectrum = self.model.spectrum(loop_response.angle_rad)
+        whitened_rows = self.model.whitened_derivatives(spectrum)[:, : self.samples]
         slope_rad = self.model.torque_and_slope(spectrum)[1]
-        channels = np.stack(
+        limit_channels = np.stack(
             [
-                response.angle_rad,
-                response.velocity_rad_s,
-                extended_reference_rad - response.angle_rad,
-                response.torque_nm,
-                response.coupling_torque_nm,
+                loop_response.angle_rad,
+                loop_response.velocity_rad_s,
+                extended_reference_rad - loop_response.angle_rad,
+                loop_response.torque_nm,
+                loop_response.coupling_torque_nm,
                 slope_rad[: extended_reference_rad.size],
             ]
         )
         return _UnitSweep(
             reference_rad=reference_rad,
-            angle_rad=response.angle_rad[:n],
-            rows=rows,
-            weighted=self.mixture.weights @ rows,
+            angle_rad=loop_response.angle_rad[:n],
+            rows=whitened_rows,
+            weighted=self.mixture.weights @ whitened_rows,
             slope=slope_rad[:: self.model.factor][: self.samples] / self.limits[-1],
-            channels=channels / self.limits[:, None],
+            channels=limit_channels / self.limits[:, None],
         )
 
     def with_band(
         self,
-        base: _SegmentCandidate,
-        fraction: float,
-        band: _SweepBand,
+        base_candidate: _SegmentCandidate,
+        amplitude_fraction: float,
+        sweep_band: _SweepBand,
         sweep_pair: tuple[_UnitSweep, _UnitSweep],
         phase_index: int,
     ) -> _SegmentCandidate:
-        """Return a candidate with a further band, at the largest amplitude that limits allow.
+        """Return a candidate segment with a further band, at the largest allowed amplitude.
 
-        The amplitudes of the candidate `base` are multiplied by `fraction`. The phase of the new
-        sweep is ``phase_index / _PHASE_COUNT`` of a turn.
+        The amplitudes of `base_candidate` are multiplied by `amplitude_fraction`. The phase of the
+        new sweep is ``phase_index / _PHASE_COUNT`` of a turn.
         """
         phase_rad = 2 * pi * phase_index / _PHASE_COUNT
-        sine, cosine = float(np.cos(phase_rad)), float(np.sin(phase_rad))
-        first, second = sweep_pair
-        ringing = self.ringing[:, : first.channels.shape[1] : _LIMIT_CHECK_TICKS]
-        unit = (
-            sine * first.channels[:, ::_LIMIT_CHECK_TICKS]
-            + cosine * second.channels[:, ::_LIMIT_CHECK_TICKS]
+        sine_factor, cosine_factor = float(np.cos(phase_rad)), float(np.sin(phase_rad))
+        first_sweep, second_sweep = sweep_pair
+        ringing_channels = self.ringing[:, : first_sweep.channels.shape[1] : _LIMIT_CHECK_TICKS]
+        unit_channels = (
+            sine_factor * first_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
+            + cosine_factor * second_sweep.channels[:, ::_LIMIT_CHECK_TICKS]
         )
-        before = ringing + fraction * (base.channels - ringing)
-        amplitude_rad = largest_factor(before, unit)
-        tip_slope = self.tip_slope + fraction * (base.tip_slope - self.tip_slope)
-        tip_slope += amplitude_rad * (sine * first.slope + cosine * second.slope)
-        weighted = self.weighted_if_held + fraction * (base.weighted - self.weighted_if_held)
-        weighted += amplitude_rad * (sine * first.weighted + cosine * second.weighted)
-        leading = base.parts[0][0] if base.parts else band
-        value = self.information_to_horizon(leading, weighted, tip_slope, base.duration_s)
+        base_channels = ringing_channels + amplitude_fraction * (
+            base_candidate.channels - ringing_channels
+        )
+        amplitude_rad = largest_factor(base_channels, unit_channels)
+        tip_slope_fractions = self.tip_slope + amplitude_fraction * (
+            base_candidate.tip_slope - self.tip_slope
+        )
+        tip_slope_fractions += amplitude_rad * (
+            sine_factor * first_sweep.slope + cosine_factor * second_sweep.slope
+        )
+        weighted_rows = self.weighted_if_held + amplitude_fraction * (
+            base_candidate.weighted - self.weighted_if_held
+        )
+        weighted_rows += amplitude_rad * (
+            sine_factor * first_sweep.weighted + cosine_factor * second_sweep.weighted
+        )
+        leading_band = base_candidate.parts[0][0] if base_candidate.parts else sweep_band
+        information_value = self.information_to_horizon(
+            leading_band, weighted_rows, tip_slope_fractions, base_candidate.duration_s
+        )
         return _SegmentCandidate(
-            base.duration_s,
-            (*((other, fraction * size) for other, size in base.parts), (band, amplitude_rad)),
+            base_candidate.duration_s,
             (
-                *((fraction * factor, sweep) for factor, sweep in base.terms),
-                (amplitude_rad * sine, first),
-                (amplitude_rad * cosine, second),
+                *(
+                    (base_part, amplitude_fraction * part_amplitude)
+                    for base_part, part_amplitude in base_candidate.parts
+                ),
+                (sweep_band, amplitude_rad),
             ),
-            before + amplitude_rad * unit,
-            weighted,
-            tip_slope,
-            value,
+            (
+                *(
+                    (amplitude_fraction * sweep_factor, base_sweep)
+                    for sweep_factor, base_sweep in base_candidate.terms
+                ),
+                (amplitude_rad * sine_factor, first_sweep),
+                (amplitude_rad * cosine_factor, second_sweep),
+            ),
+            base_channels + amplitude_rad * unit_channels,
+            weighted_rows,
+            tip_slope_fractions,
+            information_value,
         )
 
     def information_to_horizon(
-        self, band: _SweepBand, weighted: Real, tip_slope: Real, duration_s: float
+        self,
+        sweep_band: _SweepBand,
+        weighted_rows: Real,
+        tip_slope_fractions: Real,
+        duration_s: float,
     ) -> float:
         """Return the information up to the planning horizon if a mode is driven after a segment.
 
         The motor then holds the amplitude that the mode has at the end of the segment.
         """
-        first = self.model_samples(duration_s)
-        remaining_samples = self.samples - first
-        continued_drive = self.continued_drive(band)
-        amplitudes = (
-            self.amplitude_matrix @ tip_slope[first : first + self.amplitude_matrix.shape[1]]
+        first_sample = self.model_samples(duration_s)
+        remaining_samples = self.samples - first_sample
+        continued_drive = self.continued_drive(sweep_band)
+        mode_amplitudes = (
+            self.amplitude_matrix
+            @ tip_slope_fractions[first_sample : first_sample + self.amplitude_matrix.shape[1]]
         )
-        index = 2 * [mode.number for mode in self.modes].index(band.mode_number)
-        factors = continued_drive.per_amplitude @ amplitudes[index : index + 2]
-        before = weighted[:, :first]
-        after = weighted[:, first:] + np.tensordot(
-            factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
+        mode_row = 2 * [beam_mode.number for beam_mode in self.modes].index(sweep_band.mode_number)
+        drive_factors = continued_drive.per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
+        rows_before = weighted_rows[:, :first_sample]
+        rows_after = weighted_rows[:, first_sample:] + np.tensordot(
+            drive_factors, continued_drive.weighted[:, :, :remaining_samples], axes=1
         )
-        return float(np.vdot(before, before) + np.vdot(after, after))
+        return float(np.vdot(rows_before, rows_before) + np.vdot(rows_after, rows_after))
 
     @cached_property
     def amplitude_matrix(self) -> Real:
@@ -548,53 +633,67 @@ class SegmentSearch:
         The shape is (2 m, n), with a row each for real and imaginary part of the m amplitudes.
         """
         time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
-        free = np.exp(np.outer([mode.pole_rad_s for mode in self.modes], time_s))
-        columns = np.stack([free.real, -free.imag], axis=1).reshape(-1, time_s.size)
-        return np.linalg.pinv(columns.T)
+        free_oscillations = np.exp(
+            np.outer([beam_mode.pole_rad_s for beam_mode in self.modes], time_s)
+        )
+        decay_columns = np.stack([free_oscillations.real, -free_oscillations.imag], axis=1).reshape(
+            -1, time_s.size
+        )
+        return np.linalg.pinv(decay_columns.T)
 
-    def continued_drive(self, band: _SweepBand) -> _ContinuedDrive:
-        """Return the response to driving the mode of a band by a sine up to the horizon."""
-        if band.middle_hz not in self._continued_drives:
+    def continued_drive(self, sweep_band: _SweepBand) -> _ContinuedDrive:
+        """Return the response to exciting a band's mode by a sine up to the planning horizon."""
+        if sweep_band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
-            sweeps = self.sweep_pair(replace(band, half_width_hz=0.0), duration_s)
-            weighted = np.stack([sweep.weighted for sweep in sweeps])
-            mode = next(each for each in self.modes if each.number == band.mode_number)
-            last = self.model_samples(duration_s - _FADE_S)
-            window = slice(last - self.model_samples(_TAIL_S), last)
-            time_s = np.arange(window.start, window.stop) / self.model.sample_hz
+            sine_pair = self.sweep_pair(replace(sweep_band, half_width_hz=0.0), duration_s)
+            weighted_rows = np.stack([sine_sweep.weighted for sine_sweep in sine_pair])
+            driven_mode = next(
+                beam_mode for beam_mode in self.modes if beam_mode.number == sweep_band.mode_number
+            )
+            end_sample = self.model_samples(duration_s - _FADE_S)
+            tail_window = slice(end_sample - self.model_samples(_TAIL_S), end_sample)
+            time_s = np.arange(tail_window.start, tail_window.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
-            ring_up_fraction = 1.0 - np.exp(mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
-            oscillation = np.exp(1j * mode.pole_rad_s.imag * time_s)
-            columns = (
+            ring_up_fraction = 1.0 - np.exp(driven_mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
+            oscillation = np.exp(1j * driven_mode.pole_rad_s.imag * time_s)
+            oscillation_columns = (
                 np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
             )
-            slopes = np.stack([sweep.slope[window] for sweep in sweeps], axis=1)
-            per_amplitude = np.linalg.inv(np.linalg.lstsq(columns, slopes)[0])
-            self._continued_drives[band.middle_hz] = _ContinuedDrive(weighted, per_amplitude)
-        return self._continued_drives[band.middle_hz]
+            tip_slopes = np.stack(
+                [sine_sweep.slope[tail_window] for sine_sweep in sine_pair], axis=1
+            )
+            drive_per_amplitude = np.linalg.inv(np.linalg.lstsq(oscillation_columns, tip_slopes)[0])
+            self._continued_drives[sweep_band.middle_hz] = _ContinuedDrive(
+                weighted_rows, drive_per_amplitude
+            )
+        return self._continued_drives[sweep_band.middle_hz]
 
-    def segment(self, chosen: _SegmentCandidate, time_left_s: float) -> Segment:
-        """Return the chosen candidate as a segment, with the precisions expected from it."""
+    def segment(self, chosen_candidate: _SegmentCandidate, time_left_s: float) -> Segment:
+        """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
-        samples = self.model_samples(chosen.duration_s)
-        channels = chosen.weighted_sum("channels")
-        ringing = self.ringing[:, : channels.shape[1]]
+        segment_samples = self.model_samples(chosen_candidate.duration_s)
+        segment_channels = chosen_candidate.weighted_sum("channels")
+        ringing_channels = self.ringing[:, : segment_channels.shape[1]]
         # Between the checked ticks a peak is a little higher.
-        fraction = min(1.0, largest_factor(ringing, channels))
-        now = covariance_of(self.record.information_after(None, 0), estimate)
-        after = covariance_of(
-            self.record.information_after(fraction * chosen.weighted_sum("rows"), samples), estimate
+        amplitude_fraction = min(1.0, largest_factor(ringing_channels, segment_channels))
+        present_covariance = covariance_of(self.record.information_after(None, 0), estimate)
+        later_covariance = covariance_of(
+            self.record.information_after(
+                amplitude_fraction * chosen_candidate.weighted_sum("rows"), segment_samples
+            ),
+            estimate,
         )
         return Segment(
-            name=_describe_candidate(chosen),
-            reference_rad=fraction * chosen.weighted_sum("reference_rad"),
-            angle_rad=fraction * chosen.weighted_sum("angle_rad"),
+            name=_describe_candidate(chosen_candidate),
+            reference_rad=amplitude_fraction * chosen_candidate.weighted_sum("reference_rad"),
+            angle_rad=amplitude_fraction * chosen_candidate.weighted_sum("angle_rad"),
             names=estimate.names,
-            covariance=after,
-            now=quantities.precisions(now),
-            expected=quantities.precisions(after),
+            covariance=later_covariance,
+            now=quantities.precisions(present_covariance),
+            expected=quantities.precisions(later_covariance),
             forecast=self.forecast(time_left_s),
-            fraction_of_limits=LIMIT_FRACTION * float(np.abs(ringing + fraction * channels).max()),
+            fraction_of_limits=LIMIT_FRACTION
+            * float(np.abs(ringing_channels + amplitude_fraction * segment_channels).max()),
         )
 
     def time_with_ring_up(self) -> float:
@@ -604,31 +703,39 @@ class SegmentSearch:
         """
         times_s = self.mixture.times_s
         needed_s = float(times_s.sum())
-        grid = np.geomspace(1e-3, 1e3, 400)
-        information_gain = grid - 2.0 * (1.0 - np.exp(-grid)) + 0.5 * (1.0 - np.exp(-2.0 * grid))
-        for mode in self.modes:
-            range_hz = 1.5 * _SINE_OFFSETS[-1] * mode.damping_ratio * mode.frequency_hz
-            at_mode_s = float(times_s[np.abs(self.line_hz - mode.frequency_hz) < range_hz].sum())
-            decay_s = -1.0 / mode.pole_rad_s.real
+        time_ratios = np.geomspace(1e-3, 1e3, 400)
+        information_gain = (
+            time_ratios
+            - 2.0 * (1.0 - np.exp(-time_ratios))
+            + 0.5 * (1.0 - np.exp(-2.0 * time_ratios))
+        )
+        for beam_mode in self.modes:
+            range_hz = 1.5 * _SINE_OFFSETS[-1] * beam_mode.damping_ratio * beam_mode.frequency_hz
+            at_mode_s = float(
+                times_s[np.abs(self.line_hz - beam_mode.frequency_hz) < range_hz].sum()
+            )
+            decay_s = -1.0 / beam_mode.pole_rad_s.real
             if at_mode_s > 0.01 * needed_s:
                 needed_s += (
-                    decay_s * float(np.interp(at_mode_s / decay_s, information_gain, grid))
+                    decay_s * float(np.interp(at_mode_s / decay_s, information_gain, time_ratios))
                     - at_mode_s
                 )
         return needed_s
 
     def forecast(self, time_left_s: float) -> PrecisionForecast:
-        """Forecast the time until all targets are reached."""
-        impossible = [each.impossible for each in self.quantities.items if each.impossible]
-        if impossible:
-            return PrecisionForecast(inf, impossible[0])
-        seconds = self.needed_s
-        if not seconds < _UNREACHABLE_S:
+        """Return the forecast of the time in s until all target standard deviations are reached."""
+        impossible_reasons = [
+            precision.impossible for precision in self.quantities.items if precision.impossible
+        ]
+        if impossible_reasons:
+            return PrecisionForecast(inf, impossible_reasons[0])
+        forecast_s = self.needed_s
+        if not forecast_s < _UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
-        if seconds <= time_left_s:
-            return PrecisionForecast(seconds, "")
+        if forecast_s <= time_left_s:
+            return PrecisionForecast(forecast_s, "")
         return PrecisionForecast(
-            seconds, f"about {seconds:.0f} s are needed, and {time_left_s:.0f} s are left"
+            forecast_s, f"about {forecast_s:.0f} s are needed, and {time_left_s:.0f} s are left"
         )
 
 
@@ -637,7 +744,7 @@ class SegmentSearch:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SineMixture:
-    """Mixture of steady sines that reaches all targets in the shortest time, without ring-up."""
+    """Durations of steady sines that reach all target precisions soonest, ring-up neglected."""
 
     times_s: Real
     """Time in s for which each sine lasts; shape (m,)."""
@@ -647,14 +754,14 @@ class SineMixture:
 
 
 def best_mixture(
-    information: Real,
+    fisher_information: Real,
     estimate: BeamEstimate,
     quantities: Quantities,
     frequency_hz: Real,
     angle_rad: Real,
-    relaxation: float = 1.0,
+    target_relaxation: float = 1.0,
 ) -> SineMixture:
-    """Return the times of steady sines that together reach all targets soonest.
+    """Return durations of steady sines that together reach all target precisions soonest.
 
     Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
     equivalence theorem all sines of the best mixture give the same information per second on the
@@ -663,7 +770,7 @@ def best_mixture(
 
     Parameters
     ----------
-    information
+    fisher_information
         Information that the record contains already, shape (k, k).
     estimate
         Beam, damping and noise.
@@ -671,45 +778,51 @@ def best_mixture(
         The q target quantities.
     frequency_hz, angle_rad
         Frequencies of the sines and amplitudes of the angle, each of shape (m,).
-    relaxation
+    target_relaxation
         Factor by which all standard deviations may exceed their targets.
     """
-    rates = _information_rates(estimate, frequency_hz, angle_rad)
+    information_rates = _information_rates(estimate, frequency_hz, angle_rad)
     target_stds = np.array(
-        [inf if each.impossible else each.target_std for each in quantities.items]
+        [inf if precision.impossible else precision.target_std for precision in quantities.items]
     )
-    scaled_gradients = quantities.gradients / (relaxation * target_stds[:, None])
+    scaled_gradients = quantities.gradients / (target_relaxation * target_stds[:, None])
     if not scaled_gradients.any():
         return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
     multipliers = np.ones(len(scaled_gradients))
     times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
     for _ in range(_MIXTURE_STEPS):
-        covariance = covariance_of(information + np.tensordot(times_s, rates, axes=1), estimate)
-        lines = scaled_gradients @ covariance
-        variances = np.einsum("qi,qi->q", lines, scaled_gradients)
-        multipliers = multipliers * np.maximum(variances, 1e-12) ** 0.5
+        covariance = covariance_of(
+            fisher_information + np.tensordot(times_s, information_rates, axes=1), estimate
+        )
+        gain_directions = scaled_gradients @ covariance
+        relative_variances = np.einsum("qi,qi->q", gain_directions, scaled_gradients)
+        multipliers = multipliers * np.maximum(relative_variances, 1e-12) ** 0.5
         multipliers /= max(float(multipliers.sum()), 1e-300)
-        gain_rates = np.einsum("q,qi,fij,qj->f", multipliers, lines, rates, lines)
+        gain_rates = np.einsum(
+            "q,qi,fij,qj->f", multipliers, gain_directions, information_rates, gain_directions
+        )
         times_s = times_s * np.sqrt(
             gain_rates / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
         )
         # Scale the total time towards the targets, until they are met or the time is too long.
-        times_s *= float(np.clip(np.sqrt(variances.max()), 0.5, 2.0))
+        times_s *= float(np.clip(np.sqrt(relative_variances.max()), 0.5, 2.0))
         if times_s.sum() > _UNREACHABLE_S:
             break
-    scale = np.sqrt(multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300))
-    return SineMixture(times_s, scale[:, None] * lines)
+    multiplier_scales = np.sqrt(
+        multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
+    )
+    return SineMixture(times_s, multiplier_scales[:, None] * gain_directions)
 
 
 def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
     """Return the Fisher information per second of each steady sine, shape (m, k, k)."""
     kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
-    rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
-    return rates
+    information_rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
+    return information_rates
 
 
 def least_deviations(
-    information: Real,
+    fisher_information: Real,
     estimate: BeamEstimate,
     quantities: Quantities,
     frequency_hz: Real,
@@ -722,7 +835,7 @@ def least_deviations(
 
     Parameters
     ----------
-    information, estimate, quantities, frequency_hz, angle_rad
+    fisher_information, estimate, quantities, frequency_hz, angle_rad
         As for `best_mixture`.
     duration_s
         Total duration of all sines in s.
@@ -732,49 +845,57 @@ def least_deviations(
     ndarray, shape (q,)
         Lower bound of each standard deviation for a record of this duration.
     """
-    rates = _information_rates(estimate, frequency_hz, angle_rad)
-    deviations = np.empty(len(quantities.gradients))
+    information_rates = _information_rates(estimate, frequency_hz, angle_rad)
+    least_stds = np.empty(len(quantities.gradients))
     for row, gradient in enumerate(quantities.gradients):
         times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
         for _ in range(_MIXTURE_STEPS):
-            total = information + np.tensordot(times_s, rates, axes=1)
-            line = gradient @ covariance_of(total, estimate)
-            deviations[row] = np.sqrt(max(float(line @ gradient), 0.0))
-            times_s = times_s * np.sqrt(np.einsum("i,fij,j->f", line, rates, line))
+            total_information = fisher_information + np.tensordot(
+                times_s, information_rates, axes=1
+            )
+            gain_direction = gradient @ covariance_of(total_information, estimate)
+            least_stds[row] = np.sqrt(max(float(gain_direction @ gradient), 0.0))
+            times_s = times_s * np.sqrt(
+                np.einsum("i,fij,j->f", gain_direction, information_rates, gain_direction)
+            )
             times_s *= duration_s / max(float(times_s.sum()), 1e-300)
-    return deviations
+    return least_stds
 
 
-def largest_factor(before: Real, unit: Real) -> float:
-    """Return the largest factor by which a motion can be added without exceeding the limits.
+def largest_factor(existing_motion: Real, added_motion: Real) -> float:
+    """Return the largest factor with which a motion can be added within the limits.
 
     All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
     existing motion exceeds this range by itself, the sum may be as large, but no larger.
 
     Parameters
     ----------
-    before, unit
+    existing_motion, added_motion
         Quantities of the existing motion and of the added motion, shape (c, n).
     """
-    size = np.abs(unit)
-    margin = np.maximum(1.0, np.abs(before)) - np.sign(unit) * before
+    unit_magnitude = np.abs(added_motion)
+    limit_margin = (
+        np.maximum(1.0, np.abs(existing_motion)) - np.sign(added_motion) * existing_motion
+    )
     with np.errstate(divide="ignore", invalid="ignore"):
-        factor = np.where(size > 1e-9 * size.max(), margin / size, inf)
-    return max(float(factor.min()), 0.0)
+        allowed_factor = np.where(
+            unit_magnitude > 1e-9 * unit_magnitude.max(), limit_margin / unit_magnitude, inf
+        )
+    return max(float(allowed_factor.min()), 0.0)
 
 
-def _describe_candidate(chosen: _SegmentCandidate) -> str:
+def _describe_candidate(chosen_candidate: _SegmentCandidate) -> str:
     """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
-    parts = sorted(chosen.parts, key=lambda part: part[0].middle_hz)
-    bands = [
+    sorted_parts = sorted(chosen_candidate.parts, key=lambda part: part[0].middle_hz)
+    band_texts = [
         f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
         if band.half_width_hz
         else f"{band.middle_hz:.4g}"
-        for band, _ in parts
+        for band, _ in sorted_parts
     ]
     return (
-        f"mode{'s' if len(parts) > 1 else ''} "
-        f"{' + '.join(str(band.mode_number) for band, _ in parts)}, "
-        f"{' + '.join(bands)} Hz, {chosen.duration_s:g} s, "
-        f"{' + '.join(f'{size:.2g}' for _, size in parts)} rad"
+        f"mode{'s' if len(sorted_parts) > 1 else ''} "
+        f"{' + '.join(str(band.mode_number) for band, _ in sorted_parts)}, "
+        f"{' + '.join(band_texts)} Hz, {chosen_candidate.duration_s:g} s, "
+        f"{' + '.join(f'{amplitude:.2g}' for _, amplitude in sorted_parts)} rad"
     )

@@ -68,7 +68,7 @@ _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
 
 
 class Response(Protocol):
-    """Response of the closed loop to a reference, with a value for each tick; arrays (n,)."""
+    """Interface to the closed loop's response to a reference: arrays (n,), one value a tick."""
 
     @property
     def angle_rad(self) -> Real:
@@ -183,55 +183,61 @@ def shortest_move(
     T. D. Tuttle and W. P. Seering, Journal of Guidance, Control, and Dynamics 17 (1994) 1032, with
     the limits of the rig instead of an impulse's.
     """
-    search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
-    acceleration = search.shortest_accelerations()
-    reference = from_acceleration(acceleration, plant.rate_hz)
-    n = reference.size
+    move_search = _MoveSearch(plant, distance_rad, start_rad, 2 if robust else 1, ringing)
+    accelerations_rad_s2 = move_search.shortest_accelerations()
+    reference_rad = from_acceleration(accelerations_rad_s2, plant.rate_hz)
+    n = reference_rad.size
     quintic_rad = distance_rad * quintic(n / plant.rate_hz, plant.rate_hz)
     return Move(
-        reference_rad=reference,
+        reference_rad=reference_rad,
         duration_s=n / plant.rate_hz,
-        limit_fraction=search.limit_fraction(reference),
-        residual_nm=_residual_torque_nm(plant, reference, ringing),
+        limit_fraction=move_search.limit_fraction(reference_rad),
+        residual_nm=_residual_torque_nm(plant, reference_rad, ringing),
         quintic_residual_nm=_residual_torque_nm(plant, quintic_rad, ringing),
     )
 
 
-def _residual_torque_nm(plant: MovePlant, reference: Real, ringing: Complex | None) -> float:
-    """Return the coupling torque in N·m of the vibration after a move.
+def _residual_torque_nm(
+    plant: MovePlant, reference_rad: Real, initial_states: Complex | None
+) -> float:
+    """Return the largest coupling torque in N·m of the beam's vibration after a move.
 
     It is the sum of the modes' amplitudes, each for a frequency wrong by its uncertainty.
     """
     residuals_nm = []
     for frequency_error in (-plant.frequency_uncertainty, plant.frequency_uncertainty):
-        poles = plant.poles_rad_s * (1.0 + frequency_error)
-        state = modal_state(np.concatenate([[0.0], reference]), plant.rate_hz, poles)
-        if ringing is not None:
-            state = state + ringing * np.exp(poles * reference.size / plant.rate_hz)
-        residuals_nm.append(np.abs(state) * plant.torque_per_state_nm_s)
+        shifted_poles = plant.poles_rad_s * (1.0 + frequency_error)
+        modal_states = modal_state(
+            np.concatenate([[0.0], reference_rad]), plant.rate_hz, shifted_poles
+        )
+        if initial_states is not None:
+            modal_states = modal_states + initial_states * np.exp(
+                shifted_poles * reference_rad.size / plant.rate_hz
+            )
+        residuals_nm.append(np.abs(modal_states) * plant.torque_per_state_nm_s)
     return float(np.maximum(*residuals_nm).sum())
 
 
 class _MoveSearch:
-    """Search for the shortest duration of a move, with a linear programme for each duration."""
+    """Search for the shortest move of the motor, with a linear programme for each duration."""
 
     def __init__(
         self,
         plant: MovePlant,
         distance_rad: float,
         start_rad: float,
-        order: int,
-        ringing: Complex | None,
+        zero_order: int,
+        initial_states: Complex | None,
     ) -> None:
         self._plant = plant
         self._distance_rad = distance_rad
         self._start_rad = start_rad
-        self._order = order
-        self._ringing = ringing
+        self._order = zero_order
+        self._ringing = initial_states
         self._unit_response = _UnitResponse(plant)
         ringing_torque_nm = 0.0
-        if ringing is not None:
-            ringing_torque_nm = float(np.abs(ringing) @ plant.torque_per_state_nm_s)
+        if initial_states is not None:
+            ringing_torque_nm = float(np.abs(initial_states) @ plant.torque_per_state_nm_s)
         # The remaining vibration is fed forward to the motor, and is in the sensor's reading.
         self._limits = {
             "torque": LIMIT_FRACTION * plant.peak_torque_nm - plant.friction_nm - ringing_torque_nm,
@@ -254,31 +260,46 @@ class _MoveSearch:
         longest_ticks = round(LONGEST_MOVE_S * rate_hz)
         slowest_rad_s = float(np.abs(self._plant.poles_rad_s).min())
         n = round((1.0 if self._order == 1 else 2.35) * rate_hz * np.pi / slowest_rad_s)
-        too_short, sufficient, fraction_short, fraction_sufficient = 8, longest_ticks + 1, inf, 0.0
-        best: Real | None = None
+        too_short_ticks, sufficient_ticks, fraction_short, fraction_sufficient = (
+            8,
+            longest_ticks + 1,
+            inf,
+            0.0,
+        )
+        best_accelerations: Real | None = None
         for _ in range(_MAX_ROUNDS):
-            fraction, acceleration = self._least_limit_fraction(n)
-            if fraction <= 1.0:
-                sufficient, fraction_sufficient, best = n, fraction, acceleration
+            used_fraction, accelerations = self._least_limit_fraction(n)
+            if used_fraction <= 1.0:
+                sufficient_ticks, fraction_sufficient, best_accelerations = (
+                    n,
+                    used_fraction,
+                    accelerations,
+                )
             else:
-                too_short, fraction_short = n, fraction
-            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient <= max(
-                _CONVERGED_DURATION_RATIO * too_short, too_short + 1
+                too_short_ticks, fraction_short = n, used_fraction
+            if fraction_sufficient >= _CONVERGED_LIMIT_FRACTION or sufficient_ticks <= max(
+                _CONVERGED_DURATION_RATIO * too_short_ticks, too_short_ticks + 1
             ):
                 break
-            if too_short >= longest_ticks:
+            if too_short_ticks >= longest_ticks:
                 break
             n = _next_duration_ticks(
-                too_short, sufficient, fraction_short, fraction_sufficient, n, fraction, self._order
+                too_short_ticks,
+                sufficient_ticks,
+                fraction_short,
+                fraction_sufficient,
+                n,
+                used_fraction,
+                self._order,
             )
             n = min(n, longest_ticks)
-        if best is None:
+        if best_accelerations is None:
             raise ExcitationError(
                 f"No move of at most {LONGEST_MOVE_S:g} s by {self._distance_rad:g} rad stays "
                 "within the limits of the profile; choose a smaller angle, or check "
                 "limits.velocity_rad_s."
             )
-        return best
+        return best_accelerations
 
     def _least_limit_fraction(self, n: int) -> tuple[float, Real | None]:
         """Solve the linear programme for a move of n ticks.
@@ -289,63 +310,81 @@ class _MoveSearch:
         from scipy.optimize import linprog
 
         plant, rate_hz = self._plant, self._plant.rate_hz
-        held = max(1, round(_MIN_INTERVAL_S * rate_hz))
-        intervals = min(ceil(n / held), _MAX_INTERVALS)
-        edges = np.round(np.linspace(0, n, intervals + 1)).astype(int)
-        scale = plant.largest_acceleration_rad_s2
+        interval_ticks = max(1, round(_MIN_INTERVAL_S * rate_hz))
+        interval_count = min(ceil(n / interval_ticks), _MAX_INTERVALS)
+        edge_ticks = np.round(np.linspace(0, n, interval_count + 1)).astype(int)
+        acceleration_scale = plant.largest_acceleration_rad_s2
 
-        zeros = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._order)
-        per_interval = np.add.reduceat(zeros, edges[:-1], axis=1) * scale
-        steps = np.diff(edges) / rate_hz
+        vibration_map = residual_vibration_map(n, rate_hz, plant.poles_rad_s, self._order)
+        vibration_per_interval = (
+            np.add.reduceat(vibration_map, edge_ticks[:-1], axis=1) * acceleration_scale
+        )
+        interval_s = np.diff(edge_ticks) / rate_hz
         # The centre of an interval's held acceleration, as `from_acceleration` sums them up.
-        remaining_s = (n - (edges[:-1] + edges[1:] - 1) / 2) / rate_hz
+        remaining_s = (n - (edge_ticks[:-1] + edge_ticks[1:] - 1) / 2) / rate_hz
         equality_matrix = np.concatenate(
-            [[steps * scale], [steps * remaining_s * scale], per_interval]
+            [
+                [interval_s * acceleration_scale],
+                [interval_s * remaining_s * acceleration_scale],
+                vibration_per_interval,
+            ]
         )
         equality_values = np.zeros(len(equality_matrix))
         equality_values[1] = self._distance_rad
         if self._ringing is not None:
             equality_values[2:] = np.negative(self._ringing_rows(n))
-        size = np.linalg.norm(equality_matrix, axis=1)
+        row_norms = np.linalg.norm(equality_matrix, axis=1)
 
-        limited, bounded, bounds = self._inequalities(n, edges, scale)
-        limited = np.concatenate([limited, np.eye(intervals)])
-        fraction_column = -np.ones((len(limited), 1))
-        zero_column = np.zeros((len(bounded), 1))
-        inequality_matrix = np.block(
-            [[limited, fraction_column], [-limited, fraction_column], [bounded, zero_column]]
+        limited_map, bounded_map, bound_values = self._inequalities(
+            n, edge_ticks, acceleration_scale
         )
-        upper_bounds = np.concatenate([np.zeros(2 * len(limited)), bounds])
-        solution = linprog(
-            np.append(np.zeros(intervals), 1.0),
+        limited_map = np.concatenate([limited_map, np.eye(interval_count)])
+        fraction_column = -np.ones((len(limited_map), 1))
+        zero_column = np.zeros((len(bounded_map), 1))
+        inequality_matrix = np.block(
+            [
+                [limited_map, fraction_column],
+                [-limited_map, fraction_column],
+                [bounded_map, zero_column],
+            ]
+        )
+        upper_bounds = np.concatenate([np.zeros(2 * len(limited_map)), bound_values])
+        optimum = linprog(
+            np.append(np.zeros(interval_count), 1.0),
             A_ub=inequality_matrix,
             b_ub=upper_bounds,
-            A_eq=np.column_stack([equality_matrix / size[:, None], np.zeros(len(equality_matrix))]),
-            b_eq=equality_values / size,
-            bounds=[(None, None)] * intervals + [(0.0, None)],
+            A_eq=np.column_stack(
+                [equality_matrix / row_norms[:, None], np.zeros(len(equality_matrix))]
+            ),
+            b_eq=equality_values / row_norms,
+            bounds=[(None, None)] * interval_count + [(0.0, None)],
             method="highs-ds",
         )
-        if solution.x is None or solution.status != 0:
+        if optimum.x is None or optimum.status != 0:
             return inf, None
-        return float(solution.fun), np.repeat(solution.x[:-1] * scale, np.diff(edges))
+        return float(optimum.fun), np.repeat(
+            optimum.x[:-1] * acceleration_scale, np.diff(edge_ticks)
+        )
 
     def _ringing_rows(self, n: int) -> list[float]:
-        """Return the state at the end of the move that the initial vibration decays to.
+        """Return the modes' complex states to which the initial vibration decays during a move.
 
         Real and imaginary parts are in the order of the rows of `residual_vibration_map`.
         """
         assert self._ringing is not None
-        rows: list[float] = []
-        for pole, state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
-            end_state = state * np.exp(pole * n / self._plant.rate_hz)
+        state_rows: list[float] = []
+        for mode_pole, mode_state in zip(self._plant.poles_rad_s, self._ringing, strict=True):
+            end_state = mode_state * np.exp(mode_pole * n / self._plant.rate_hz)
             # The row of the derivative weighs the start by 1.
-            second_order = self._order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+            second_order = self._order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
             for _ in range(2 if second_order else 1):
-                rows += [end_state.real, end_state.imag] if pole.imag != 0.0 else [end_state.real]
-        return rows
+                state_rows += (
+                    [end_state.real, end_state.imag] if mode_pole.imag != 0.0 else [end_state.real]
+                )
+        return state_rows
 
     def _inequalities(
-        self, n: int, edges: NDArray[np.intp], scale: float
+        self, n: int, edge_ticks: NDArray[np.intp], acceleration_scale: float
     ) -> tuple[Real, Real, Real]:
         """Return the inequalities of the linear programme for a move of n ticks.
 
@@ -360,119 +399,130 @@ class _MoveSearch:
         plant = self._plant
         end = n + round(plant.settling_s * plant.rate_hz)
         # The ends of all intervals and the ticks between them: the solution exploits every gap.
-        interval_middles = np.round((edges[:-1] + edges[1:]) / 2).astype(int)
-        settling_ticks = np.arange(n, end, max(1, ceil(n / len(edges))))[: _MAX_INTERVALS // 2]
+        interval_middles = np.round((edge_ticks[:-1] + edge_ticks[1:]) / 2).astype(int)
+        settling_ticks = np.arange(n, end, max(1, ceil(n / len(edge_ticks))))[: _MAX_INTERVALS // 2]
         checked_ticks = np.unique(
-            np.concatenate([edges, interval_middles if n > 2 * len(edges) else [], settling_ticks])
+            np.concatenate(
+                [edge_ticks, interval_middles if n > 2 * len(edge_ticks) else [], settling_ticks]
+            )
         )
         checked_ticks = checked_ticks.astype(int)
         every_second_tick = checked_ticks[::2]
         unit_responses = self._unit_response.for_ticks(end)
-        rows = [
+        limited_rows = [
             _interval_responses(
-                unit_responses[name],
-                edges,
-                every_second_tick if name == "coupling" else checked_ticks,
+                unit_responses[limit_name],
+                edge_ticks,
+                every_second_tick if limit_name == "coupling" else checked_ticks,
             )
-            * (scale / self._limits[name])
-            for name in self._limits
+            * (acceleration_scale / self._limits[limit_name])
+            for limit_name in self._limits
         ]
         if self._order > 1 and self._ringing is None:
-            forward_scale = np.copysign(scale, self._distance_rad)
-            backward_speed = -forward_scale * _interval_responses(
-                unit_responses["velocity"], edges, every_second_tick
+            forward_scale = np.copysign(acceleration_scale, self._distance_rad)
+            backward_speed_map = -forward_scale * _interval_responses(
+                unit_responses["velocity"], edge_ticks, every_second_tick
             )
-            mean_rad_s = abs(self._distance_rad) * plant.rate_hz / n
+            mean_speed_rad_s = abs(self._distance_rad) * plant.rate_hz / n
             return (
-                np.concatenate(rows),
-                backward_speed,
-                np.full(len(every_second_tick), _MAX_BACKWARD_SPEED_FRACTION * mean_rad_s),
+                np.concatenate(limited_rows),
+                backward_speed_map,
+                np.full(len(every_second_tick), _MAX_BACKWARD_SPEED_FRACTION * mean_speed_rad_s),
             )
-        angle = scale * _interval_responses(unit_responses["angle"], edges, every_second_tick)
-        free_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
+        angle_map = acceleration_scale * _interval_responses(
+            unit_responses["angle"], edge_ticks, every_second_tick
+        )
+        free_angles_rad = plant.angle_rad - self._start_rad, plant.angle_rad + self._start_rad
         return (
-            np.concatenate(rows),
-            np.vstack([angle, -angle]),
-            np.repeat(free_rad, len(every_second_tick)),
+            np.concatenate(limited_rows),
+            np.vstack([angle_map, -angle_map]),
+            np.repeat(free_angles_rad, len(every_second_tick)),
         )
 
-    def limit_fraction(self, reference: Real) -> float:
-        """Return the largest fraction of a limit that the response to a reference reaches."""
+    def limit_fraction(self, reference_rad: Real) -> float:
+        """Return the largest fraction of a rig's limit that the response to a reference reaches."""
         plant = self._plant
-        held = round(plant.settling_s * plant.rate_hz)
-        whole_reference_rad = np.concatenate([[0.0], reference, np.full(held, reference[-1])])
-        response = plant.respond(whole_reference_rad)
-        peaks = (
-            (np.abs(response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
-            np.abs(response.velocity_rad_s).max() / plant.velocity_rad_s,
-            np.abs(whole_reference_rad - response.angle_rad).max() / plant.tracking_error_rad,
-            np.abs(response.coupling_torque_nm).max() / plant.coupling_torque_nm,
-            np.abs(self._start_rad + response.angle_rad).max() / plant.angle_rad,
+        held_ticks = round(plant.settling_s * plant.rate_hz)
+        whole_reference_rad = np.concatenate(
+            [[0.0], reference_rad, np.full(held_ticks, reference_rad[-1])]
         )
-        return float(max(peaks))
+        loop_response = plant.respond(whole_reference_rad)
+        peak_fractions = (
+            (np.abs(loop_response.torque_nm).max() + plant.friction_nm) / plant.peak_torque_nm,
+            np.abs(loop_response.velocity_rad_s).max() / plant.velocity_rad_s,
+            np.abs(whole_reference_rad - loop_response.angle_rad).max() / plant.tracking_error_rad,
+            np.abs(loop_response.coupling_torque_nm).max() / plant.coupling_torque_nm,
+            np.abs(self._start_rad + loop_response.angle_rad).max() / plant.angle_rad,
+        )
+        return float(max(peak_fractions))
 
 
 def _next_duration_ticks(
-    too_short: int,
-    sufficient: int,
+    too_short_ticks: int,
+    sufficient_ticks: int,
     fraction_short: float,
     fraction_sufficient: float,
     n: int,
-    fraction: float,
-    order: int,
+    used_fraction: float,
+    zero_order: int,
 ) -> int:
     """Return the duration in ticks that the search for the shortest move tries next.
 
-    `too_short` and `sufficient` are the longest insufficient and the shortest sufficient duration,
-    with the fractions of the limits that they use. The fraction falls with a power of the duration:
-    about the third, and more if the modes, not the distance, determine the duration.
+    `too_short_ticks` and `sufficient_ticks` are the longest insufficient and the shortest
+    sufficient duration, with the fractions of the limits that they use. The fraction falls with a
+    power of the duration: about the third, and more if the modes, not the distance, determine the
+    duration.
     """
     if fraction_sufficient == 0.0:  # none has sufficed yet
-        return int(max(n + 2, round(1.03 * n * min(fraction, 4.0) ** 0.3)))
-    if fraction_short == inf and n == sufficient:
-        guess = round(n * max(fraction, 0.02) ** (0.08 if order > 1 else 0.22))
+        return int(max(n + 2, round(1.03 * n * min(used_fraction, 4.0) ** 0.3)))
+    if fraction_short == inf and n == sufficient_ticks:
+        guessed_ticks = round(n * max(used_fraction, 0.02) ** (0.08 if zero_order > 1 else 0.22))
     elif fraction_short == inf:
-        guess = round((too_short * sufficient) ** 0.5)
+        guessed_ticks = round((too_short_ticks * sufficient_ticks) ** 0.5)
     else:
-        power = np.log(fraction_short / fraction_sufficient) / np.log(sufficient / too_short)
-        guess = round(1.004 * sufficient * fraction_sufficient ** (1.0 / power))
-    return int(min(max(guess, too_short + 1), sufficient - 1))
+        duration_power = np.log(fraction_short / fraction_sufficient) / np.log(
+            sufficient_ticks / too_short_ticks
+        )
+        guessed_ticks = round(
+            1.004 * sufficient_ticks * fraction_sufficient ** (1.0 / duration_power)
+        )
+    return int(min(max(guessed_ticks, too_short_ticks + 1), sufficient_ticks - 1))
 
 
 class _UnitResponse:
-    """Responses of the closed loop to a constant acceleration of 1 rad/s², by quantity."""
+    """Responses of torque, speed and angle to a reference acceleration of 1 rad/s²."""
 
     def __init__(self, plant: MovePlant) -> None:
         self._plant = plant
         self._rows: dict[str, Real] = {}
         self._ticks = 0
 
-    def for_ticks(self, ticks: int) -> dict[str, Real]:
-        """Return the responses by quantity, each for at least the given number of ticks."""
-        if ticks > self._ticks:
-            self._ticks = max(2 * ticks, 1024)
+    def for_ticks(self, tick_count: int) -> dict[str, Real]:
+        """Return the response of each quantity by name, for at least the given number of ticks."""
+        if tick_count > self._ticks:
+            self._ticks = max(2 * tick_count, 1024)
             one = from_acceleration(np.ones(self._ticks), self._plant.rate_hz)
-            reference = np.concatenate([[0.0], one[:-1]])
-            response = self._plant.respond(reference)
+            reference_rad = np.concatenate([[0.0], one[:-1]])
+            loop_response = self._plant.respond(reference_rad)
             self._rows = {
-                "torque": response.torque_nm,
-                "velocity": response.velocity_rad_s,
-                "tracking": reference - response.angle_rad,
-                "coupling": response.coupling_torque_nm,
-                "angle": response.angle_rad,
+                "torque": loop_response.torque_nm,
+                "velocity": loop_response.velocity_rad_s,
+                "tracking": reference_rad - loop_response.angle_rad,
+                "coupling": loop_response.coupling_torque_nm,
+                "angle": loop_response.angle_rad,
             }
         return self._rows
 
 
 def _interval_responses(
-    unit_responses: Real, edges: NDArray[np.intp], ticks: NDArray[np.intp]
+    unit_responses: Real, edge_ticks: NDArray[np.intp], response_ticks: NDArray[np.intp]
 ) -> Real:
-    """Return the response at some ticks to an acceleration of 1 in one interval only.
+    """Return the response at some ticks to an acceleration of 1 rad/s² in one interval only.
 
     The shape is (ticks, intervals). `unit_responses` is the response to a constant acceleration of
-    1, and `edges` are the ticks at which the intervals begin and end.
+    1, and `edge_ticks` are the ticks at which the intervals begin and end.
     """
-    ticks_since_edge = ticks[:, None] - edges
+    ticks_since_edge = response_ticks[:, None] - edge_ticks
     step_response: Real = np.where(
         ticks_since_edge >= 0, unit_responses[np.maximum(ticks_since_edge, 0)], 0.0
     )
@@ -502,22 +552,26 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
     The closed loop is simulated with braking from ticks all along the reference. During braking the
     torque is linear in speed and acceleration of the reference at the start.
     """
-    held = np.zeros(round(plant.settling_s * plant.rate_hz))
-    starts = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
+    held_reference = np.zeros(round(plant.settling_s * plant.rate_hz))
+    start_ticks = np.unique(np.linspace(2, reference_rad.size - 1, _BRAKING_STARTS).astype(int))
     available_torque_nm = plant.peak_torque_nm - plant.friction_nm
     duration_s, longest_s = _BRAKING_DURATIONS_S
     while duration_s <= longest_s:
-        braking = braking_path(duration_s, plant.rate_hz)
-        fraction = 0.0
-        for tick in starts:
-            path = braked_reference(reference_rad, int(tick), braking)
-            response = plant.respond(np.concatenate([path, held + path[-1]]))
-            fraction = max(fraction, float(np.abs(response.torque_nm).max()) / available_torque_nm)
-            if fraction > 1.0:
+        braking_law = braking_path(duration_s, plant.rate_hz)
+        torque_fraction = 0.0
+        for start_tick in start_ticks:
+            braked_path_rad = braked_reference(reference_rad, int(start_tick), braking_law)
+            loop_response = plant.respond(
+                np.concatenate([braked_path_rad, held_reference + braked_path_rad[-1]])
+            )
+            torque_fraction = max(
+                torque_fraction, float(np.abs(loop_response.torque_nm).max()) / available_torque_nm
+            )
+            if torque_fraction > 1.0:
                 break
-        if fraction <= 1.0:
-            return braking
-        duration_s *= min(max(fraction, 1.1), 1.5)
+        if torque_fraction <= 1.0:
+            return braking_law
+        duration_s *= min(max(torque_fraction, 1.1), 1.5)
     raise ExcitationError(
         f"The reference cannot be braked within {longest_s:g} s by motor.peak_torque_nm = "
         f"{plant.peak_torque_nm:g} N·m; lower its speed."
@@ -528,7 +582,7 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
 
 
 class MoveRig(Protocol):
-    """Interface to a rig for which a move is planned."""
+    """Interface to a rig for which a move of the motor to another angle is planned."""
 
     @property
     def start_rad(self) -> float:
@@ -589,21 +643,21 @@ def move(
         raise ExcitationError("A move is planned for a rig; run it with its profile.")
     if (angle_rad is None) == (by_rad is None):
         raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
-    for option, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
+    for option_name, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
         if value_rad is not None:
-            require_finite(option, value_rad, "rad")
+            require_finite(option_name, value_rad, "rad")
     if robust not in (0, 1):
         raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
     start_rad = rig.start_rad
     target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
     require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
-    plant = rig.move_plant(path, MOVE)
-    farthest_rad = _MAX_END_ANGLE_FRACTION * plant.angle_rad
+    rig_plant = rig.move_plant(path, MOVE)
+    farthest_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
     if not abs(target_rad) <= farthest_rad:
         raise ExcitationError(
             f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either side; "
-            "choose at most "
+            f"{rig_plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either "
+            "side; choose at most "
             f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
         )
     distance_rad = target_rad - start_rad
@@ -612,9 +666,9 @@ def move(
             f"The motor stands at {start_rad:.4g} rad already, and a move is of "
             f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
         )
-    planned_move = shortest_move(plant, distance_rad, start_rad=start_rad, robust=bool(robust))
-    segments = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
-    end = predict_move_end(plant, planned_move.reference_rad, ring_down_s)
+    planned_move = shortest_move(rig_plant, distance_rad, start_rad=start_rad, robust=bool(robust))
+    segment_ticks = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
+    end = predict_move_end(rig_plant, planned_move.reference_rad, ring_down_s)
     parameters: dict[str, float | int | str] = {
         "angle_rad": target_rad,
         "by_rad": distance_rad,
@@ -632,12 +686,12 @@ def move(
     if end.arrival_s is not None:
         parameters["arrival_s"] = end.arrival_s
     excitation = assemble_excitation(
-        "move", parameters, rate_hz, segments, planned_move.reference_rad
+        "move", parameters, rate_hz, segment_ticks, planned_move.reference_rad
     )
-    return replace(excitation, stays=True, model=plant.model)
+    return replace(excitation, stays=True, model=rig_plant.model)
 
 
 def _allowed_range(farthest_rad: float, start_rad: float) -> str:
     """Return the end of a message that states the range of distances which a move may have."""
-    low, high = -farthest_rad - start_rad, farthest_rad - start_rad
-    return f", that is by {low:.4g} to {high:.4g} rad from {start_rad:.4g} rad"
+    lowest_rad, highest_rad = -farthest_rad - start_rad, farthest_rad - start_rad
+    return f", that is by {lowest_rad:.4g} to {highest_rad:.4g} rad from {start_rad:.4g} rad"

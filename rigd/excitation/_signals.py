@@ -105,7 +105,9 @@ def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
     """
     if excitation.kind != "chirp":
         return None
-    start_hz, stop_hz = (float(excitation.parameters[name]) for name in ("start_hz", "stop_hz"))
+    start_hz, stop_hz = (
+        float(excitation.parameters[option_name]) for option_name in ("start_hz", "stop_hz")
+    )
     return sweep_frequency_hz(excitation.segments, (start_hz, stop_hz), tick)
 
 
@@ -117,13 +119,13 @@ def to_whole_ticks(option: str, value_s: float, rate_hz: float) -> int:
 
     `option` is the name of the option in the message.
     """
-    ticks = round(value_s * rate_hz)
-    if ticks < 2 or abs(ticks / rate_hz - value_s) > 1e-9 * value_s:
+    tick_count = round(value_s * rate_hz)
+    if tick_count < 2 or abs(tick_count / rate_hz - value_s) > 1e-9 * value_s:
         raise ExcitationError(
             f"{option} = {value_s:g} s is not a whole number of ticks at {rate_hz:g} Hz; choose "
-            f"for example {max(ticks, 2) / rate_hz:g} s."
+            f"for example {max(tick_count, 2) / rate_hz:g} s."
         )
-    return ticks
+    return tick_count
 
 
 def require_finite(option: str, value: float, unit: str) -> None:
@@ -167,14 +169,14 @@ def require_frequency(
     With `zero_allowed`, 0 Hz is valid as well.
     """
     require_finite(option, value, "Hz")
-    highest = rate_hz / SAMPLES_PER_PERIOD
+    highest_hz = rate_hz / SAMPLES_PER_PERIOD
     if not (value > 0.0 or (zero_allowed and value == 0.0)):
-        bound = "must not be negative" if zero_allowed else "must be more than 0 Hz"
-        raise ExcitationError(f"{option} = {value:g} Hz {bound}.")
-    if value > highest:
+        bound_text = "must not be negative" if zero_allowed else "must be more than 0 Hz"
+        raise ExcitationError(f"{option} = {value:g} Hz {bound_text}.")
+    if value > highest_hz:
         raise ExcitationError(
             f"{option} = {value:g} Hz leaves fewer than {SAMPLES_PER_PERIOD} samples per period at "
-            f"{rate_hz:g} Hz; choose at most {highest:g} Hz."
+            f"{rate_hz:g} Hz; choose at most {highest_hz:g} Hz."
         )
 
 
@@ -184,7 +186,7 @@ def require_frequency(
 def lay_out_segments(
     rate_hz: float, rest_s: float, duration_s: float, ring_down_s: float
 ) -> dict[str, tuple[int, int]]:
-    """Return first tick and end of the segments rest, sweep and ring-down, by name.
+    """Return the first tick and the tick after the last of rest, sweep and ring-down, by name.
 
     The times are rounded to ticks, and the rounding changes the length of the ring-down only.
     """
@@ -193,15 +195,19 @@ def lay_out_segments(
     require_not_negative("ring_down_s", ring_down_s)
     around_s = rest_s + ring_down_s
     check_ticks("The session", (duration_s + around_s) * rate_hz, rate_hz, around_s)
-    first = round(rate_hz * rest_s)
-    end = first + round(rate_hz * duration_s)
-    last = max(end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
-    if end - first < 2:
+    sweep_begin = round(rate_hz * rest_s)
+    sweep_end = sweep_begin + round(rate_hz * duration_s)
+    record_end = max(sweep_end, round(rate_hz * (rest_s + duration_s + ring_down_s)))
+    if sweep_end - sweep_begin < 2:
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is less than two ticks at {rate_hz:g} Hz; choose at "
             f"least {2 / rate_hz:g} s."
         )
-    return {"rest": (0, first), "sweep": (first, end), "ring_down": (end, last)}
+    return {
+        "rest": (0, sweep_begin),
+        "sweep": (sweep_begin, sweep_end),
+        "ring_down": (sweep_end, record_end),
+    }
 
 
 def check_ticks(what: str, ticks: float, rate_hz: float, around_s: float = 0.0) -> None:
@@ -228,16 +234,16 @@ def assemble_excitation(
     parameters: Mapping[str, float | int | str],
     rate_hz: float,
     segments: Mapping[str, tuple[int, int]],
-    sweep: FloatArray,
+    sweep_rad: FloatArray,
     *,
     approach: "Approach | None" = None,
 ) -> Excitation:
     """Return an excitation with a sweep, shape (n,) in rad, between rest and ring-down."""
-    reference = np.zeros(segments["ring_down"][1])
-    reference[slice(*segments["sweep"])] = sweep
-    reference[slice(*segments["ring_down"])] = sweep[-1]
-    reference.flags.writeable = False
-    return Excitation(kind, parameters, rate_hz, reference, segments, approach=approach)
+    reference_rad = np.zeros(segments["ring_down"][1])
+    reference_rad[slice(*segments["sweep"])] = sweep_rad
+    reference_rad[slice(*segments["ring_down"])] = sweep_rad[-1]
+    reference_rad.flags.writeable = False
+    return Excitation(kind, parameters, rate_hz, reference_rad, segments, approach=approach)
 
 
 # Signals
@@ -300,24 +306,24 @@ def chirp(
         raise ExcitationError(
             f"there_and_back = {there_and_back} must be 0 (one sweep) or 1 (two sweeps)."
         )
-    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     if there_and_back:
-        there_ticks = segments["sweep"]
-        segments = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
-        back_ticks = there_ticks[1], segments["sweep"][1]
-        segments |= {"there": there_ticks, "back": back_ticks}
-    t = _sweep_times_s(segments, rate_hz)
+        there_ticks = segment_ticks["sweep"]
+        segment_ticks = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
+        back_ticks = there_ticks[1], segment_ticks["sweep"][1]
+        segment_ticks |= {"there": there_ticks, "back": back_ticks}
+    t = _sweep_times_s(segment_ticks, rate_hz)
     # Time on the way there and on the way back, where the phase goes on from the turn.
     outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
-    phase = (
+    phase_rad = (
         2.0 * pi * (start_hz * outward_s + (stop_hz - start_hz) * outward_s**2 / (2.0 * duration_s))
     )
-    phase += (
+    phase_rad += (
         2.0 * pi * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
     )
-    sweep = (
+    sweep_rad = (
         amplitude_rad
-        * np.sin(phase)
+        * np.sin(phase_rad)
         * _taper_factors(t, (1 + there_and_back) * duration_s, taper_s)
     )
     parameters = {
@@ -330,13 +336,13 @@ def chirp(
         "taper_s": taper_s,
         **({"there_and_back": 1} if there_and_back else {}),
     }
-    return assemble_excitation("chirp", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("chirp", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
 def hold(
     *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
 ) -> Excitation:
-    """Return an excitation that holds the start angle, to measure noise and drift.
+    """Return an excitation that holds the start angle, to record noise and drift of the sensor.
 
     Parameters
     ----------
@@ -358,10 +364,10 @@ def hold(
     >>> hold(rate_hz=1000, duration_s=2.0).segments
     {'rest': (0, 1000), 'sweep': (1000, 3000), 'ring_down': (3000, 3000)}
     """
-    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {"duration_s": duration_s, "rest_s": rest_s, "ring_down_s": ring_down_s}
-    sweep = np.zeros(segments["sweep"][1] - segments["sweep"][0])
-    return assemble_excitation("hold", parameters, rate_hz, segments, sweep)
+    sweep_rad = np.zeros(segment_ticks["sweep"][1] - segment_ticks["sweep"][0])
+    return assemble_excitation("hold", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
 def step(
@@ -402,15 +408,15 @@ def step(
             "amplitude_rad = 0 rad is not a step; give an angle other than zero, or use hold."
         )
     require_within_turn("amplitude_rad", amplitude_rad)
-    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "duration_s": duration_s,
         "rest_s": rest_s,
         "ring_down_s": ring_down_s,
     }
-    sweep = np.full(segments["sweep"][1] - segments["sweep"][0], amplitude_rad)
-    return assemble_excitation("step", parameters, rate_hz, segments, sweep)
+    sweep_rad = np.full(segment_ticks["sweep"][1] - segment_ticks["sweep"][0], amplitude_rad)
+    return assemble_excitation("step", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
 def multisine(
@@ -474,18 +480,20 @@ def multisine(
     require_positive("period_s", period_s, "s")
     if seed < 0:
         raise ExcitationError(f"seed = {seed} is negative; give a whole number from 0 on.")
-    segments = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
-    ticks = to_whole_ticks("period_s", period_s, rate_hz)
-    periods = round(duration_s / period_s)
-    if periods < 1 or abs(periods * period_s - duration_s) > 1e-9 * duration_s:
+    segment_ticks = lay_out_segments(rate_hz, rest_s, duration_s, ring_down_s)
+    period_ticks = to_whole_ticks("period_s", period_s, rate_hz)
+    period_count = round(duration_s / period_s)
+    if period_count < 1 or abs(period_count * period_s - duration_s) > 1e-9 * duration_s:
         raise ExcitationError(
             f"duration_s = {duration_s:g} s is not a whole number of periods of "
-            f"period_s = {period_s:g} s; choose for example {max(periods, 1) * period_s:g} s."
+            f"period_s = {period_s:g} s; choose for example {max(period_count, 1) * period_s:g} s."
         )
-    period = amplitude_rad * _random_phase_period(ticks, period_s, (start_hz, stop_hz), seed)
-    crest_factor = amplitude_rad / float(np.sqrt(np.mean(period**2)))
-    t = _sweep_times_s(segments, rate_hz)
-    sweep = np.tile(period, periods) * _taper_factors(t, duration_s, taper_s)
+    period_rad = amplitude_rad * _random_phase_period(
+        period_ticks, period_s, (start_hz, stop_hz), seed
+    )
+    crest_factor = amplitude_rad / float(np.sqrt(np.mean(period_rad**2)))
+    t = _sweep_times_s(segment_ticks, rate_hz)
+    sweep_rad = np.tile(period_rad, period_count) * _taper_factors(t, duration_s, taper_s)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -498,37 +506,37 @@ def multisine(
         "seed": seed,
         "crest_factor": crest_factor,
     }
-    return assemble_excitation("multisine", parameters, rate_hz, segments, sweep)
+    return assemble_excitation("multisine", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
 def _random_phase_period(
-    ticks: int, period_s: float, band_hz: tuple[float, float], seed: int
+    tick_count: int, period_s: float, band_hz: tuple[float, float], seed: int
 ) -> FloatArray:
-    """Return one period of the multisine with peak 1, shape (ticks,), which starts near zero."""
-    frequency_hz = np.arange(1, ticks // 2) / period_s
+    """Return one period of the multisine with peak 1, which starts near 0, (tick_count,)."""
+    frequency_hz = np.arange(1, tick_count // 2) / period_s
     tolerance_hz = 1e-9 * band_hz[1]
-    in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (
+    is_in_band = (frequency_hz >= band_hz[0] - tolerance_hz) & (
         frequency_hz <= band_hz[1] + tolerance_hz
     )
-    harmonics = 1 + np.flatnonzero(in_band)
+    harmonics = 1 + np.flatnonzero(is_in_band)
     if harmonics.size == 0:
         raise ExcitationError(
             f"No harmonic of period_s = {period_s:g} s lies between start_hz = {band_hz[0]:g} Hz "
             f"and stop_hz = {band_hz[1]:g} Hz; take a longer period or a wider band."
         )
-    spectrum = np.zeros(ticks // 2 + 1, dtype=complex)
-    phases = 2 * pi * np.random.default_rng(seed).random(harmonics.size)
-    spectrum[harmonics] = np.exp(1j * phases)
-    period: FloatArray = np.fft.irfft(spectrum, ticks)
-    period = np.roll(period, -int(np.argmin(np.abs(period))))
-    period /= np.max(np.abs(period))
-    return period
+    spectrum = np.zeros(tick_count // 2 + 1, dtype=complex)
+    phases_rad = 2 * pi * np.random.default_rng(seed).random(harmonics.size)
+    spectrum[harmonics] = np.exp(1j * phases_rad)
+    unit_period: FloatArray = np.fft.irfft(spectrum, tick_count)
+    unit_period = np.roll(unit_period, -int(np.argmin(np.abs(unit_period))))
+    unit_period /= np.max(np.abs(unit_period))
+    return unit_period
 
 
 def _sweep_times_s(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> FloatArray:
     """Return the time in s of each tick of the sweep, from its first tick on."""
-    first, end = segments["sweep"]
-    return np.arange(end - first) / rate_hz
+    sweep_begin, sweep_end = segments["sweep"]
+    return np.arange(sweep_end - sweep_begin) / rate_hz
 
 
 def _taper_factors(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:
@@ -541,5 +549,5 @@ def _taper_factors(t: FloatArray, duration_s: float, taper_s: float) -> FloatArr
             f"taper_s = {taper_s:g} s at both ends does not fit into duration_s = "
             f"{duration_s:g} s; choose at most {duration_s / 2:g} s."
         )
-    edge = np.minimum(t, duration_s - t) / taper_s
-    return 0.5 - 0.5 * np.cos(pi * np.minimum(edge, 1.0))
+    edge_fractions = np.minimum(t, duration_s - t) / taper_s
+    return 0.5 - 0.5 * np.cos(pi * np.minimum(edge_fractions, 1.0))

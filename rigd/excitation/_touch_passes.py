@@ -37,7 +37,7 @@ margin."""
 
 @dataclass(frozen=True, slots=True)
 class TouchPass:
-    """Ticks at which the parts of one pass in search of an obstacle begin and end."""
+    """Ticks at which one pass in search of an obstacle begins, turns back and ends."""
 
     begins: int
     """Tick at which the way out begins; the rest before it belongs to the pass."""
@@ -49,7 +49,7 @@ class TouchPass:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Approach:
-    """Passes in search of an obstacle, and the control loop's reaction to a touch."""
+    """Passes of a search for an obstacle, and how the motor brakes and returns after a touch."""
 
     passes: tuple[TouchPass, ...]
     """Passes in the order of time."""
@@ -133,42 +133,46 @@ def touch(
         raise ExcitationError(f"passes = {passes} must be at least 1.")
     at_least_s = settle_s + abs(by_rad) / speed_rad_s + hold_s
     check_ticks("The session", passes * at_least_s * rate_hz, rate_hz)
-    plant = rig.move_plant(path, TOUCH)
+    move_plant = rig.move_plant(path, TOUCH)
     way_out_rad = slew(
         by_rad,
         speed_rad_s=speed_rad_s,
         acceleration_rad_s2=acceleration_rad_s2,
         rate_hz=rate_hz,
-        poles_rad_s=plant.poles_rad_s,
+        poles_rad_s=move_plant.poles_rad_s,
     )
-    braking = shortest_braking(plant, np.concatenate([[0.0, 0.0], way_out_rad]))
+    braking = shortest_braking(move_plant, np.concatenate([[0.0, 0.0], way_out_rad]))
     hold_ticks = ceil(hold_s * rate_hz)
     if hold_s < braking.duration_s:
         raise ExcitationError(
             f"hold_s = {hold_s:g} s ends before the motor has stopped, which takes "
             f"{braking.duration_s:.3g} s; hold longer."
         )
-    slowest_rad_s = float(np.abs(plant.poles_rad_s).min(initial=np.inf))
+    slowest_rad_s = float(np.abs(move_plant.poles_rad_s).min(initial=np.inf))
     # At least one period of the slowest mode: a path that leaves it at rest is then gentle.
     return_duration_s = max(
         _PEAK_OVER_MEAN_SPEED * abs(by_rad) / speed_rad_s, 2 * np.pi / slowest_rad_s
     )
-    return_path = vibration_free_path(return_duration_s, rate_hz, plant.poles_rad_s)
+    return_path = vibration_free_path(return_duration_s, rate_hz, move_plant.poles_rad_s)
     rest_rad = np.zeros(ceil(settle_s * rate_hz))
     single_pass = np.concatenate(
         [rest_rad, way_out_rad, np.full(hold_ticks, by_rad), by_rad * (1.0 - return_path)]
     )
     check_ticks("The session", passes * single_pass.size, rate_hz)
-    segments = lay_out_segments(rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s)
-    first = segments["sweep"][0]
+    segment_ticks = lay_out_segments(
+        rate_hz, rest_s, passes * single_pass.size / rate_hz, ring_down_s
+    )
+    sweep_begin = segment_ticks["sweep"][0]
     approach = Approach(
         passes=tuple(
             TouchPass(
-                begins=start + rest_rad.size,
-                returns=start + single_pass.size - return_path.size,
-                ends=start + single_pass.size,
+                begins=pass_begin + rest_rad.size,
+                returns=pass_begin + single_pass.size - return_path.size,
+                ends=pass_begin + single_pass.size,
             )
-            for start in range(first, first + passes * single_pass.size, single_pass.size)
+            for pass_begin in range(
+                sweep_begin, sweep_begin + passes * single_pass.size, single_pass.size
+            )
         ),
         braking=braking,
         hold_ticks=hold_ticks,
@@ -189,16 +193,16 @@ def touch(
         "by_rad": by_rad,
         "braking_s": braking.duration_s,
     }
-    sweep = np.tile(single_pass, passes)
+    sweep_rad = np.tile(single_pass, passes)
     excitation = assemble_excitation(
-        "touch", parameters, rate_hz, segments, sweep, approach=approach
+        "touch", parameters, rate_hz, segment_ticks, sweep_rad, approach=approach
     )
-    return replace(excitation, model=plant.model)
+    return replace(excitation, model=move_plant.model)
 
 
 def reference_after_touch(
     approach: Approach,
-    ends: int,
+    pass_end: int,
     tick: int,
     recent_rad: tuple[float, float, float],
     start_rad: float,
@@ -209,7 +213,7 @@ def reference_after_touch(
     ----------
     approach
         Passes and reaction to a touch.
-    ends
+    pass_end
         First tick after the pass.
     tick
         Tick at which the touch was detected, before the way back begins.
@@ -225,19 +229,21 @@ def reference_after_touch(
     """
     braking, return_path = approach.braking, approach.back
     angle_two_ticks_before, angle_one_tick_before, present_angle = recent_rad
-    acceleration = (
+    acceleration_rad_s2 = (
         present_angle - 2 * angle_one_tick_before + angle_two_ticks_before
     ) * braking.rate_hz**2
-    speed = (present_angle - angle_one_tick_before) * braking.rate_hz + acceleration / (
-        2 * braking.rate_hz
-    )
-    reference = np.full(ends - tick - 1, start_rad)
-    braking_rad = braking.path(present_angle, speed, acceleration)
-    return_index = reference.size - return_path.size
-    hold = min(approach.hold_ticks, return_index)
+    speed_rad_s = (
+        present_angle - angle_one_tick_before
+    ) * braking.rate_hz + acceleration_rad_s2 / (2 * braking.rate_hz)
+    reference_rad = np.full(pass_end - tick - 1, start_rad)
+    braking_rad = braking.path(present_angle, speed_rad_s, acceleration_rad_s2)
+    return_index = reference_rad.size - return_path.size
+    held_ticks = min(approach.hold_ticks, return_index)
     held_rad = braking_rad[-1]
-    reference[:hold] = held_rad
+    reference_rad[:held_ticks] = held_rad
     # A touch during the pause needs no braking; the remaining pause follows.
-    reference[: min(hold, len(braking_rad))] = braking_rad[:hold]
-    reference[hold : hold + return_path.size] = held_rad + (start_rad - held_rad) * return_path
-    return reference
+    reference_rad[: min(held_ticks, len(braking_rad))] = braking_rad[:held_ticks]
+    reference_rad[held_ticks : held_ticks + return_path.size] = (
+        held_rad + (start_rad - held_rad) * return_path
+    )
+    return reference_rad

@@ -56,7 +56,7 @@ _EXAMPLE_TARGET: Final = "--damping 1%"
 
 
 class ScanRig(DesignRig, Protocol):
-    """Interface to a rig's predicted behaviour, for which a scan is planned."""
+    """Interface to a rig for which a quick sweep through all modes is planned: predictions."""
 
     def fraction_of_limits(self, reference_rad: Real) -> float:
         """Return the largest fraction of a limit that a reference in rad is predicted to use."""
@@ -79,7 +79,7 @@ class ScanRig(DesignRig, Protocol):
 
 @dataclass(frozen=True, slots=True)
 class PrecisionSearch:
-    """Target precisions of a session that ends when they are reached, and its planned beginning.
+    """Target standard deviations at which a session ends, and its planned quick sweep.
 
     Attributes
     ----------
@@ -117,7 +117,7 @@ def until(
     uniformity_percent: float | None = None,
     rig: ScanRig | None = None,
 ) -> Excitation:
-    """Return the excitation of a session that continues until target precisions are reached.
+    """Return the excitation of a session until target standard deviations are reached.
 
     It begins with a quick scan of all modes. The segments after it are planned during the session:
     each is the most informative excitation.
@@ -162,7 +162,7 @@ def until(
     >>> session.search.planned_ticks, session.reference_rad.size
     (6500, 60000)
     """
-    requested = _parse_targets(targets)
+    requested_targets = _parse_targets(targets)
     require_positive("at_most_s", at_most_s, "s")
     require_positive("amplitude_rad", amplitude_rad, "rad")
     require_within_turn("amplitude_rad", amplitude_rad)
@@ -174,8 +174,8 @@ def until(
             f"uniformity_percent = {uniformity_percent:g} % must lie between 0 and "
             f"{_MAX_UNIFORMITY_PERCENT:g} %."
         )
-    segments = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
-    first, end = segments["sweep"]
+    segment_ticks = lay_out_segments(rate_hz, rest_s, scan_s, 0.0)
+    scan_begin, end = segment_ticks["sweep"]
     if scan_s < 2 * _FADE_S:
         raise ExcitationError(
             f"scan_s = {scan_s:g} s is too short for fades of {_FADE_S:g} s at both ends; choose "
@@ -183,25 +183,27 @@ def until(
         )
     check_ticks("With at_most_s, the session", at_most_s * rate_hz, rate_hz)
     planned_ticks = end + round(PAUSE_S * rate_hz)
-    ticks = round(at_most_s * rate_hz)
-    if ticks < planned_ticks:
+    record_ticks = round(at_most_s * rate_hz)
+    if record_ticks < planned_ticks:
         raise ExcitationError(
             f"at_most_s = {at_most_s:g} s is too short for rest, scan and pause; choose at least "
             f"{planned_ticks / rate_hz:g} s."
         )
     scan_rad = np.zeros(end)
-    beam = None if rig is None else rig.beam
-    scan_rad[first:] = amplitude_rad * _unit_scan(end - first, rate_hz, start_hz, stop_hz, beam)
+    profile_beam = None if rig is None else rig.beam
+    scan_rad[scan_begin:] = amplitude_rad * _unit_scan(
+        end - scan_begin, rate_hz, start_hz, stop_hz, profile_beam
+    )
     if rig is not None:
         uniformity = rig.uniformity if uniformity_percent is None else uniformity_percent / 100.0
-        _require_reachable_targets(rig, requested, uniformity, at_most_s, tip_slope_rad)
-        fraction = max(
+        _require_reachable_targets(rig, requested_targets, uniformity, at_most_s, tip_slope_rad)
+        limit_fraction = max(
             rig.fraction_of_limits(scan_rad), rig.tip_slope_rad(scan_rad) / tip_slope_rad
         )
-        if fraction > _SCAN_LIMIT_FRACTION:
-            amplitude_rad *= _SCAN_LIMIT_FRACTION / fraction
-            scan_rad *= _SCAN_LIMIT_FRACTION / fraction
-    reference_rad = np.zeros(ticks)
+        if limit_fraction > _SCAN_LIMIT_FRACTION:
+            amplitude_rad *= _SCAN_LIMIT_FRACTION / limit_fraction
+            scan_rad *= _SCAN_LIMIT_FRACTION / limit_fraction
+    reference_rad = np.zeros(record_ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
     return Excitation(
@@ -221,12 +223,16 @@ def until(
         reference_rad=reference_rad,
         # The sweep goes on for as long as it takes.
         segments={
-            "rest": (0, first),
-            "scan": (first, end),
-            "sweep": (first, ticks),
+            "rest": (0, scan_begin),
+            "scan": (scan_begin, end),
+            "sweep": (scan_begin, record_ticks),
         },
         search=PrecisionSearch(
-            requested, planned_ticks, (first, scan_rad[first:]), tip_slope_rad, uniformity_percent
+            requested_targets,
+            planned_ticks,
+            (scan_begin, scan_rad[scan_begin:]),
+            tip_slope_rad,
+            uniformity_percent,
         ),
     )
 
@@ -238,19 +244,19 @@ def _require_reachable_targets(
     at_most_s: float,
     tip_slope_rad: float,
 ) -> None:
-    """Raise `ExcitationError` if the tolerance of the geometry makes a target unreachable."""
-    floors = geometry_floors(
+    """Raise `ExcitationError` if a beam of limited uniformity cannot reach a target precision."""
+    geometry_limits = geometry_floors(
         rig.stated_estimate, rig, targets, uniformity, at_most_s, tip_slope_rad
     )
-    unreachable_floors = [each for each in floors if each.makes_unreachable]
+    unreachable_floors = [floor for floor in geometry_limits if floor.makes_unreachable]
     if not unreachable_floors:
         return
     floors_text = "; ".join(
-        f"{each.target} (standard deviation) is below the floor of "
-        f"{with_percentage(each.std, each.value)}, "
-        f"{with_percentage(each.exact_std, each.value)} if the beam "
+        f"{floor.target} (standard deviation) is below the floor of "
+        f"{with_percentage(floor.std, floor.value)}, "
+        f"{with_percentage(floor.exact_std, floor.value)} if the beam "
         "is exactly uniform"
-        for each in unreachable_floors
+        for floor in unreachable_floors
     )
     raise ExcitationError(
         f"With modes that differ from those of a uniform beam by {100 * uniformity:g} % "
@@ -261,14 +267,14 @@ def _require_reachable_targets(
 
 
 def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Beam | None) -> Real:
-    """Return the scan of n ticks with a largest amplitude of 1, at rest at both ends; shape (n,).
+    """Return a quick sweep of n ticks with largest amplitude 1, at rest at both ends; shape (n,).
 
     With a beam, the amplitude depends on the frequency relative to the beam's first mode.
     """
     t = np.arange(n) / rate_hz
     u = t * (rate_hz / n)
     frequency_hz = start_hz + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER
-    phase = (
+    phase_rad = (
         2.0
         * pi
         * t
@@ -277,34 +283,34 @@ def _unit_scan(n: int, rate_hz: float, start_hz: float, stop_hz: float, beam: Be
             + (stop_hz - start_hz) * u**_SCAN_FREQUENCY_POWER / (_SCAN_FREQUENCY_POWER + 1.0)
         )
     )
-    amplitude = np.ones(n)
+    relative_amplitude = np.ones(n)
     if beam is not None:
         first_hz = undamped_frequencies_rad_s(beam, 1)[0] / (2.0 * pi)
         relative_frequency = np.maximum(frequency_hz / first_hz, _SCAN_RELATIVE_FREQUENCIES[0])
-        amplitude = np.exp(
+        relative_amplitude = np.exp(
             np.interp(
                 np.log(relative_frequency),
                 np.log(_SCAN_RELATIVE_FREQUENCIES),
                 np.log(_SCAN_RELATIVE_AMPLITUDES),
             )
         )
-    fade = quintic(_FADE_S, rate_hz)
-    amplitude[: fade.size] *= fade
-    amplitude[n - fade.size :] *= 1.0 - fade
-    sweep: Real = amplitude * np.sin(phase)
-    return sweep
+    fade_factors = quintic(_FADE_S, rate_hz)
+    relative_amplitude[: fade_factors.size] *= fade_factors
+    relative_amplitude[n - fade_factors.size :] *= 1.0 - fade_factors
+    unit_sweep: Real = relative_amplitude * np.sin(phase_rad)
+    return unit_sweep
 
 
 def _parse_targets(targets: str) -> tuple[Target, ...]:
-    """Parse target precisions, separated by semicolons; raise `ExcitationError` without any."""
-    requested = []
-    for text in targets.split(";"):
-        if text.strip():
-            quantity, _, std_text = text.strip().partition(" ")
-            requested.append(parse_target(quantity, std_text))
-    if not requested:
+    """Parse targets such as "damping 1%", separated by ";"; raise `ExcitationError` if none."""
+    parsed_targets = []
+    for target_text in targets.split(";"):
+        if target_text.strip():
+            quantity_name, _, std_text = target_text.strip().partition(" ")
+            parsed_targets.append(parse_target(quantity_name, std_text))
+    if not parsed_targets:
         raise ExcitationError(
             f"No precision is requested; give one or more of {', '.join(QUANTITIES)}, such "
             f"as {_EXAMPLE_TARGET}."
         )
-    return tuple(requested)
+    return tuple(parsed_targets)

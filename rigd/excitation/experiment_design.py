@@ -64,7 +64,7 @@ class DesignRig(Protocol):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Design:
-    """Designed excitation of a whole session, segment after segment."""
+    """Designed excitation of a session: its segments, reference angle and expected precision."""
 
     segments: tuple[Segment, ...]
     """Segments in the order of time."""
@@ -90,7 +90,7 @@ def next_segment(
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
 ) -> Segment:
-    """Return the next segment, which reduces the targets' standard deviations most per second.
+    """Return the segment of excitation that reduces the targets' standard deviations most.
 
     Parameters
     ----------
@@ -117,21 +117,27 @@ def next_segment(
     ExcitationError
         If there is no target, or no segment fits into the time or drives a mode.
     """
-    driven = [mode.number for mode in estimate.modes() if mode.number in through]
+    driven_modes = [
+        beam_mode.number for beam_mode in estimate.modes() if beam_mode.number in through
+    ]
     quantities = Quantities.linearised(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
-    plant = rig.plant_with(estimate.loaded_beam)
-    record = RecordSoFar.from_angle(angle_rad_so_far, estimate, plant.rate_hz, HORIZON_S)
-    search = SegmentSearch(
-        estimate, quantities, plant, rig.start_rad, record, tip_slope_rad, time_left_s
+    move_plant = rig.plant_with(estimate.loaded_beam)
+    record_so_far = RecordSoFar.from_angle(
+        angle_rad_so_far, estimate, move_plant.rate_hz, HORIZON_S
     )
-    return search.segment(search.best_candidate(time_left_s, driven), time_left_s)
+    segment_search = SegmentSearch(
+        estimate, quantities, move_plant, rig.start_rad, record_so_far, tip_slope_rad, time_left_s
+    )
+    return segment_search.segment(
+        segment_search.best_candidate(time_left_s, driven_modes), time_left_s
+    )
 
 
 @dataclass(frozen=True, slots=True)
 class GeometryFloor:
-    """Smallest standard deviation that a quantity can have with a tolerance of the geometry."""
+    """Smallest standard deviation that a parameter of a not quite uniform beam can have."""
 
     target: Target
     """Target of the quantity."""
@@ -144,7 +150,7 @@ class GeometryFloor:
 
     @property
     def makes_unreachable(self) -> bool:
-        """Whether the tolerance of the geometry makes the target unreachable."""
+        """Whether the beam's non-uniformity makes the target standard deviation unreachable."""
         target_std = self.target.std * (abs(self.value) if self.target.relative else 1.0)
         return target_std < self.std and self.std > _GEOMETRY_DOMINANCE_RATIO * self.exact_std
 
@@ -157,7 +163,7 @@ def geometry_floors(
     duration_s: float,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> tuple[GeometryFloor, ...]:
-    """Return the smallest standard deviations of the parameters of a nearly uniform beam.
+    """Return the smallest possible standard deviations of a nearly uniform beam's parameters.
 
     Each is computed for the mixture of steady sines that is best for this parameter alone, at the
     largest amplitudes that the rig and the linear model allow. Quantities of modes have no such
@@ -183,39 +189,41 @@ def geometry_floors(
     ExcitationError
         If no mode can be driven.
     """
-    targets = [target for target in targets if target.quantity not in MODE_QUANTITIES]
+    targets = [
+        single_target for single_target in targets if single_target.quantity not in MODE_QUANTITIES
+    ]
     if not targets or not uniformity:
         return ()
-    plant = rig.plant_with(estimate.loaded_beam)
-    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, plant.rate_hz, SHORTEST_S)
+    move_plant = rig.plant_with(estimate.loaded_beam)
+    resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_S)
     quantities = Quantities.linearised(targets, estimate)
-    search = SegmentSearch(
-        estimate, quantities, plant, rig.start_rad, resting_record, tip_slope_rad
+    segment_search = SegmentSearch(
+        estimate, quantities, move_plant, rig.start_rad, resting_record, tip_slope_rad
     )
     tolerant_estimate = estimate.with_tolerance(uniformity)
     floors = [
         least_deviations(
-            np.zeros((len(each.names), len(each.names))),
-            each,
-            Quantities.linearised(targets, each),
-            *search.steady_sines(),
+            np.zeros((len(beam_estimate.names), len(beam_estimate.names))),
+            beam_estimate,
+            Quantities.linearised(targets, beam_estimate),
+            *segment_search.steady_sines(),
             duration_s,
         )
-        for each in (tolerant_estimate, estimate)
+        for beam_estimate in (tolerant_estimate, estimate)
     ]
     return tuple(
-        GeometryFloor(item.target, item.value, std, exact_std)
-        for item, std, exact_std in zip(
+        GeometryFloor(quantity_precision.target, quantity_precision.value, std, exact_std)
+        for quantity_precision, std, exact_std in zip(
             quantities.items, floors[0].tolist(), floors[1].tolist(), strict=True
         )
-        if not item.impossible
+        if not quantity_precision.impossible
     )
 
 
 def expected_precisions(
     angle_rad: Real, estimate: BeamEstimate, targets: Iterable[Target], rate_hz: float
 ) -> tuple[Precision, ...]:
-    """Return the precision of each target that is expected from a record of the motor's angle.
+    """Return the standard deviation of each target quantity expected from a motor angle record.
 
     Parameters
     ----------
@@ -241,7 +249,7 @@ def design_excitation(
     angle_rad_so_far: Real | None = None,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
 ) -> Design:
-    """Design the segments of a session until all targets are reached or the time is over.
+    """Design segments of excitation until all target precisions are reached or time is over.
 
     Parameters
     ----------
@@ -285,28 +293,29 @@ def design_excitation(
     >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
     (True, True)
     """
-    plant = rig.plant_with(estimate.loaded_beam)
+    move_plant = rig.plant_with(estimate.loaded_beam)
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
-    left_s = duration_s
-    segments: list[Segment] = []
-    while not segments or (
-        left_s >= SHORTEST_S and not all(each.reached for each in segments[-1].expected)
+    remaining_s = duration_s
+    planned_segments: list[Segment] = []
+    while not planned_segments or (
+        remaining_s >= SHORTEST_S
+        and not all(planned_segment.reached for planned_segment in planned_segments[-1].expected)
     ):
-        so_far_rad = np.concatenate([before_rad, angle_rad])
-        segment = next_segment(
-            estimate, so_far_rad, targets, rig, left_s, tip_slope_rad=tip_slope_rad
+        whole_angle_rad = np.concatenate([before_rad, angle_rad])
+        new_segment = next_segment(
+            estimate, whole_angle_rad, targets, rig, remaining_s, tip_slope_rad=tip_slope_rad
         )
-        segments.append(segment)
-        reference_rad = np.concatenate([reference_rad, segment.reference_rad])
+        planned_segments.append(new_segment)
+        reference_rad = np.concatenate([reference_rad, new_segment.reference_rad])
         # The loop's state after one segment is the initial state of the next.
-        angle_rad = plant.respond(reference_rad).angle_rad
-        left_s -= segment.reference_rad.size / plant.rate_hz
+        angle_rad = move_plant.respond(reference_rad).angle_rad
+        remaining_s -= new_segment.reference_rad.size / move_plant.rate_hz
     return Design(
-        segments=tuple(segments),
+        segments=tuple(planned_segments),
         reference_rad=reference_rad,
         angle_rad=angle_rad,
         names=estimate.names,
-        covariance=segments[-1].covariance,
-        expected=segments[-1].expected,
+        covariance=planned_segments[-1].covariance,
+        expected=planned_segments[-1].expected,
     )

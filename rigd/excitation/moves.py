@@ -29,7 +29,7 @@ path shorter than about half a period of a mode would exceed it, and then has fe
 
 
 def quintic(duration_s: float, rate_hz: float) -> Real:
-    """Return the minimum-jerk path from 0 to 1, at rest at both ends.
+    """Return the minimum-jerk path from 0 to 1 at each tick, at rest at both ends, shape (n,).
 
     Parameters
     ----------
@@ -55,8 +55,8 @@ def quintic(duration_s: float, rate_hz: float) -> Real:
     """
     n = max(1, round(duration_s * rate_hz))
     u = np.arange(1, n + 1) / n
-    path: Real = u**3 * (10 - 15 * u + 6 * u**2)
-    return path
+    unit_path: Real = u**3 * (10 - 15 * u + 6 * u**2)
+    return unit_path
 
 
 def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: Complex) -> Real:
@@ -80,15 +80,18 @@ def vibration_free_path(duration_s: float, rate_hz: float, poles_rad_s: Complex)
         Path at the n ticks after the start; the last value is 1.
     """
     n = max(1, round(duration_s * rate_hz))
-    for order in (2, 1):
-        rows = np.concatenate(
-            [_motion_map(n, rate_hz), residual_vibration_map(n, rate_hz, poles_rad_s, order)]
+    for zero_order in (2, 1):
+        linear_map = np.concatenate(
+            [_motion_map(n, rate_hz), residual_vibration_map(n, rate_hz, poles_rad_s, zero_order)]
         )
-        if len(rows) > n:
+        if len(linear_map) > n:
             continue
-        acceleration, solved = _least_norm_solution(rows, np.array([0.0, 1.0]))
-        if solved and np.abs(acceleration).max() * (n / rate_hz) ** 2 <= _MAX_PEAK_ACCELERATION:
-            return from_acceleration(acceleration, rate_hz)
+        unit_accelerations, is_solved = _least_norm_solution(linear_map, np.array([0.0, 1.0]))
+        if (
+            is_solved
+            and np.abs(unit_accelerations).max() * (n / rate_hz) ** 2 <= _MAX_PEAK_ACCELERATION
+        ):
+            return from_acceleration(unit_accelerations, rate_hz)
     return quintic(duration_s, rate_hz)
 
 
@@ -131,20 +134,25 @@ def slew(
     require_positive("speed_rad_s", speed_rad_s, "rad/s")
     require_positive("acceleration_rad_s2", acceleration_rad_s2, "rad/s²")
     slowest_rad_s = float(np.abs(poles_rad_s.imag[poles_rad_s.imag != 0]).min(initial=np.inf))
-    speed = speed_rad_s
+    cruise_speed_rad_s = speed_rad_s
     n = max(4 * len(poles_rad_s), round(rate_hz * np.pi / slowest_rad_s), 8)
     while True:
-        pulse = _speed_change_pulse(n, rate_hz, poles_rad_s)
+        start_pulse = _speed_change_pulse(n, rate_hz, poles_rad_s)
         # Both pulses together cover the distance of one at full speed.
-        speed = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
-        if pulse is not None and speed * np.abs(pulse).max() <= acceleration_rad_s2:
+        cruise_speed_rad_s = min(speed_rad_s, abs(distance_rad) * rate_hz / n)
+        if (
+            start_pulse is not None
+            and cruise_speed_rad_s * np.abs(start_pulse).max() <= acceleration_rad_s2
+        ):
             break
         n = n + max(1, n // 20)
-    cruise_ticks = round(abs(distance_rad) / speed * rate_hz) - n
+    cruise_ticks = round(abs(distance_rad) / cruise_speed_rad_s * rate_hz) - n
     # With a whole number of cruise ticks the speed is slightly lower than requested.
-    speed = abs(distance_rad) * rate_hz / (n + cruise_ticks)
-    acceleration = np.concatenate([pulse, np.zeros(cruise_ticks), -pulse])
-    return from_acceleration(np.copysign(speed, distance_rad) * acceleration, rate_hz)
+    cruise_speed_rad_s = abs(distance_rad) * rate_hz / (n + cruise_ticks)
+    accelerations_rad_s2 = np.concatenate([start_pulse, np.zeros(cruise_ticks), -start_pulse])
+    return from_acceleration(
+        np.copysign(cruise_speed_rad_s, distance_rad) * accelerations_rad_s2, rate_hz
+    )
 
 
 def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | None:
@@ -152,11 +160,11 @@ def _speed_change_pulse(n: int, rate_hz: float, poles_rad_s: Complex) -> Real | 
 
     They leave all modes at rest. Return None if `n` ticks are too few.
     """
-    rows = np.concatenate(
+    linear_map = np.concatenate(
         [_motion_map(n, rate_hz)[:1], residual_vibration_map(n, rate_hz, poles_rad_s, 1)]
     )
-    pulse, solved = _least_norm_solution(rows, np.array([1.0]))
-    return pulse if solved else None
+    unit_pulse, is_solved = _least_norm_solution(linear_map, np.array([1.0]))
+    return unit_pulse if is_solved else None
 
 
 def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
@@ -169,8 +177,8 @@ def from_acceleration(acceleration_rad_s2: Real, rate_hz: float) -> Real:
     rate_hz
         Ticks a second.
     """
-    reference: Real = np.cumsum(np.cumsum(acceleration_rad_s2)) / rate_hz**2
-    return reference
+    reference_rad: Real = np.cumsum(np.cumsum(acceleration_rad_s2)) / rate_hz**2
+    return reference_rad
 
 
 def _motion_map(n: int, rate_hz: float) -> Real:
@@ -179,13 +187,13 @@ def _motion_map(n: int, rate_hz: float) -> Real:
     return np.stack([np.full(n, 1.0 / rate_hz), remaining_ticks / rate_hz**2])
 
 
-def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: int) -> Real:
+def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, zero_order: int) -> Real:
     """Return the linear map from n accelerations to the modes' residual vibration after them.
 
     Its product with the accelerations is zero if the path leaves all modes at rest. Each mode has a
     row for the real part and one for the imaginary part of its complex state at the end of the
-    path. With ``order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by the
-    pole as well. The shape is (rows, n).
+    path. With ``zero_order`` 2 the modes below `ROBUST_BELOW_HZ` have rows for the derivative by
+    the pole as well. The shape is (rows, n).
 
     Parameters
     ----------
@@ -195,34 +203,38 @@ def residual_vibration_map(n: int, rate_hz: float, poles_rad_s: Complex, order: 
         Ticks a second.
     poles_rad_s
         Poles of the modes, shape (m,): one pole of each pair.
-    order
+    zero_order
         Order of the zeros: 1 or 2.
     """
     remaining_s = (n - np.arange(n)) / rate_hz
-    rows: list[Real] = []
-    for pole in poles_rad_s:
-        transform = np.exp(pole * remaining_s) / rate_hz
-        second_order = order > 1 and abs(pole) < 2 * np.pi * ROBUST_BELOW_HZ
+    map_rows: list[Real] = []
+    for mode_pole in poles_rad_s:
+        pole_transform = np.exp(mode_pole * remaining_s) / rate_hz
+        second_order = zero_order > 1 and abs(mode_pole) < 2 * np.pi * ROBUST_BELOW_HZ
         for row in (
-            (transform, transform * remaining_s / remaining_s[0]) if second_order else (transform,)
+            (pole_transform, pole_transform * remaining_s / remaining_s[0])
+            if second_order
+            else (pole_transform,)
         ):
-            rows.append(row.real)
-            if pole.imag != 0.0:
-                rows.append(row.imag)
-    return np.array(rows).reshape(-1, n)
+            map_rows.append(row.real)
+            if mode_pole.imag != 0.0:
+                map_rows.append(row.imag)
+    return np.array(map_rows).reshape(-1, n)
 
 
-def _least_norm_solution(rows: Real, wanted: Real) -> tuple[Real, bool]:
+def _least_norm_solution(linear_map: Real, wanted_values: Real) -> tuple[Real, bool]:
     """Return the least-norm solution a of ``rows @ a = wanted``, and whether it is a solution.
 
-    Rows beyond the length of `wanted` have the right-hand side 0.
+    Rows beyond the length of `wanted_values` have the right-hand side 0.
     """
-    right_hand_side = np.zeros(len(rows))
-    right_hand_side[: wanted.size] = wanted
-    scale = np.linalg.norm(rows, axis=1)
-    solution = np.linalg.lstsq(rows / scale[:, None], right_hand_side / scale, rcond=1e-12)[0]
-    residuals = np.abs(rows @ solution - right_hand_side) / scale
-    return solution, bool(residuals.max() <= 1e-9 * np.linalg.norm(solution))
+    right_hand_side = np.zeros(len(linear_map))
+    right_hand_side[: wanted_values.size] = wanted_values
+    row_norms = np.linalg.norm(linear_map, axis=1)
+    least_norm = np.linalg.lstsq(
+        linear_map / row_norms[:, None], right_hand_side / row_norms, rcond=1e-12
+    )[0]
+    relative_residuals = np.abs(linear_map @ least_norm - right_hand_side) / row_norms
+    return least_norm, bool(relative_residuals.max() <= 1e-9 * np.linalg.norm(least_norm))
 
 
 def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Complex:
@@ -244,11 +256,13 @@ def modal_state(reference_rad: Real, rate_hz: float, poles_rad_s: Complex) -> Co
     ndarray, shape (m,)
         Complex state in rad/s; 0 if the mode is at rest.
     """
-    acceleration = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
+    accelerations_rad_s2 = np.diff(reference_rad, n=2, prepend=(reference_rad[0],) * 2) * rate_hz**2
     # r[k+1] - 2 r[k] + r[k-1] belongs to tick k: one before the sample in which it shows.
-    remaining_s = np.arange(acceleration.size, 0, -1) / rate_hz
-    state: Complex = np.exp(np.outer(poles_rad_s, remaining_s)) @ acceleration / rate_hz
-    return state
+    remaining_s = np.arange(accelerations_rad_s2.size, 0, -1) / rate_hz
+    modal_states: Complex = (
+        np.exp(np.outer(poles_rad_s, remaining_s)) @ accelerations_rad_s2 / rate_hz
+    )
+    return modal_states
 
 
 # Braking
@@ -323,9 +337,11 @@ def braking_path(duration_s: float, rate_hz: float) -> Braking:
     n = max(2, round(duration_s * rate_hz))
     time_s = n / rate_hz
     u = np.arange(1, n + 1) / n
-    per_speed = time_s * (u**4 / 2 - u**3 + u)
-    per_acceleration = time_s**2 * (u**4 / 4 - 2 * u**3 / 3 + u**2 / 2)
-    return Braking(rate_hz, tuple(per_speed.tolist()), tuple(per_acceleration.tolist()))
+    path_per_speed_s = time_s * (u**4 / 2 - u**3 + u)
+    path_per_acceleration_s2 = time_s**2 * (u**4 / 4 - 2 * u**3 / 3 + u**2 / 2)
+    return Braking(
+        rate_hz, tuple(path_per_speed_s.tolist()), tuple(path_per_acceleration_s2.tolist())
+    )
 
 
 def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: Braking) -> Real:
@@ -348,11 +364,15 @@ def braked_reference(reference_rad: Sequence[float] | Real, tick: int, braking: 
         standstill.
     """
     angle_two_ticks_before, angle_one_tick_before, present_angle = (
-        float(value) for value in reference_rad[tick - 2 : tick + 1]
+        float(angle_rad) for angle_rad in reference_rad[tick - 2 : tick + 1]
     )
     rate_hz = braking.rate_hz
-    acceleration = (present_angle - 2 * angle_one_tick_before + angle_two_ticks_before) * rate_hz**2
-    speed = (present_angle - angle_one_tick_before) * rate_hz + acceleration / (2 * rate_hz)
+    acceleration_rad_s2 = (
+        present_angle - 2 * angle_one_tick_before + angle_two_ticks_before
+    ) * rate_hz**2
+    speed_rad_s = (present_angle - angle_one_tick_before) * rate_hz + acceleration_rad_s2 / (
+        2 * rate_hz
+    )
     return np.concatenate(
-        [reference_rad[: tick + 1], braking.path(present_angle, speed, acceleration)]
+        [reference_rad[: tick + 1], braking.path(present_angle, speed_rad_s, acceleration_rad_s2)]
     )

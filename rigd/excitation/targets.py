@@ -44,7 +44,7 @@ _DAMPING_KIND: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Target:
-    """Target precision of a session: the requested standard deviation of a quantity."""
+    """Requested standard deviation of a quantity, such as the damping ratio of a mode."""
 
     quantity: str
     """Name of the quantity, one of `QUANTITIES`."""
@@ -69,7 +69,7 @@ class Target:
 
 
 def parse_target(quantity: str, text: str) -> Target:
-    """Parse the target precision of a quantity from the text of an option, such as ``2:0.5%``.
+    """Parse the requested precision of a quantity from an option's text, such as ``2:0.5%``.
 
     Parameters
     ----------
@@ -97,50 +97,50 @@ def parse_target(quantity: str, text: str) -> Target:
             f"{', '.join(QUANTITIES)}."
         )
     option, unit = f"--{quantity} {text}", _UNITS.get(quantity, "")
-    example = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
+    example_text = {"damping": "1% or 2:0.5%", "frequency": "0.01% or 1:0.002Hz"}.get(
         quantity, "5% or 0.01"
     )
-    mode_text, colon, std_text = text.strip().rpartition(":")
-    mode = None
-    if colon:
+    mode_text, colon_text, std_text = text.strip().rpartition(":")
+    mode_number = None
+    if colon_text:
         if quantity not in MODE_QUANTITIES:
             raise ExcitationError(
-                f"{option}: {quantity} is no quantity of a mode; give for example {example}."
+                f"{option}: {quantity} is no quantity of a mode; give for example {example_text}."
             )
         if not mode_text.strip().isdecimal() or not 1 <= int(mode_text) <= _MAX_MODE_NUMBER:
             raise ExcitationError(
                 f"{option}: {mode_text.strip()!r} is no number of a mode, 1 to {_MAX_MODE_NUMBER}; "
-                f"give for example {example}."
+                f"give for example {example_text}."
             )
-        mode = int(mode_text)
+        mode_number = int(mode_text)
     std_text = std_text.strip()
-    relative = std_text.endswith("%")
-    number = std_text.removesuffix("%") if relative else std_text.removesuffix(unit)
+    is_relative = std_text.endswith("%")
+    number_text = std_text.removesuffix("%") if is_relative else std_text.removesuffix(unit)
     try:
-        std = float(number)
+        std = float(number_text)
     except ValueError:
         raise ExcitationError(
             f"{option}: {std_text!r} is no standard deviation; give a percentage of the value or a "
-            f"number{f' in {unit}' if unit else ''}, for example {example}."
+            f"number{f' in {unit}' if unit else ''}, for example {example_text}."
         ) from None
-    std = std / 100 if relative else std
+    std = std / 100 if is_relative else std
     if not (isfinite(std) and std > 0.0):
         raise ExcitationError(
             f"{option}: the standard deviation must be finite and more than 0; give for example "
-            f"{example}."
+            f"{example_text}."
         )
     useless_std = _USELESS_STD.get(quantity, inf)
-    if not relative and std >= useless_std:
+    if not is_relative and std >= useless_std:
         raise ExcitationError(
             f"{option}: a standard deviation of {std:g} is no precision of {quantity}, since it is "
             f"not below {useless_std:g}; for a percentage of the value write {text.strip()}%."
         )
-    return Target(quantity, std, relative, mode)
+    return Target(quantity, std, is_relative, mode_number)
 
 
 @dataclass(frozen=True, slots=True)
 class Precision:
-    """Precision of one quantity in comparison with its target."""
+    """Standard deviation of one quantity, in comparison with the requested one."""
 
     target: Target
     """Target of the quantity, with the number of the mode if the quantity belongs to a mode."""
@@ -155,7 +155,7 @@ class Precision:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the standard deviation to its target, which is reached at 1 and below."""
+        """Ratio of the standard deviation to the requested one; 1 or less: reached."""
         if self.impossible:
             return inf
         return self.std / self.target_std if self.target_std > 0.0 else inf
@@ -168,7 +168,7 @@ class Precision:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Quantities:
-    """Target quantities of a session as linear functions of the parameters near an estimate."""
+    """Quantities with a requested precision, as linear functions of the beam's parameters."""
 
     items: tuple[Precision, ...]
     """Value and target of each quantity; the standard deviations are still unknown."""
@@ -177,7 +177,7 @@ class Quantities:
 
     @classmethod
     def linearised(cls, targets: Iterable[Target], estimate: BeamEstimate) -> "Quantities":
-        """Return the target quantities, linearised at an estimate of the beam.
+        """Return the quantities with a requested precision, linearised at an estimate of the beam.
 
         Parameters
         ----------
@@ -186,19 +186,30 @@ class Quantities:
         estimate
             Estimate at which the quantities are linearised.
         """
-        modes = estimate.modes()
-        items, gradients = [], []
-        for target in targets:
-            for single_target in _targets_of_modes(target, modes):
-                value, gradient, impossible = _linearise(single_target, estimate, modes)
-                target_std = (
-                    single_target.std * abs(value) if single_target.relative else single_target.std
+        estimated_modes = estimate.modes()
+        quantity_items, gradients = [], []
+        for joint_target in targets:
+            for single_target in _targets_of_modes(joint_target, estimated_modes):
+                quantity_value, quantity_gradient, impossible_reason = _linearise(
+                    single_target, estimate, estimated_modes
                 )
-                if target_std == 0.0 and not impossible:
-                    impossible = f"{single_target.name} is 0: no percentage of it is a precision"
-                items.append(Precision(single_target, value, inf, target_std, impossible))
-                gradients.append(gradient)
-        return cls(tuple(items), np.array(gradients).reshape(len(items), len(estimate.names)))
+                target_std = (
+                    single_target.std * abs(quantity_value)
+                    if single_target.relative
+                    else single_target.std
+                )
+                if target_std == 0.0 and not impossible_reason:
+                    impossible_reason = (
+                        f"{single_target.name} is 0: no percentage of it is a precision"
+                    )
+                quantity_items.append(
+                    Precision(single_target, quantity_value, inf, target_std, impossible_reason)
+                )
+                gradients.append(quantity_gradient)
+        return cls(
+            tuple(quantity_items),
+            np.array(gradients).reshape(len(quantity_items), len(estimate.names)),
+        )
 
     def ratios(self, covariance: Real) -> Real:
         """Return the ratio of each quantity's standard deviation to its target, shape (q,).
@@ -210,51 +221,75 @@ class Quantities:
         covariance
             Covariance of the free parameters, shape (k, k).
         """
-        variance = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
-        target_std = np.array([inf if each.impossible else each.target_std for each in self.items])
-        ratios: Real = np.sqrt(np.maximum(variance, 0.0)) / target_std
+        variances = np.einsum("qi,ij,qj->q", self.gradients, covariance, self.gradients)
+        target_std = np.array(
+            [inf if precision.impossible else precision.target_std for precision in self.items]
+        )
+        ratios: Real = np.sqrt(np.maximum(variances, 0.0)) / target_std
         return ratios
 
     def precisions(self, covariance: Real) -> tuple[Precision, ...]:
-        """Return the precision of every target for a covariance of the parameters, shape (k, k)."""
+        """Return each quantity's standard deviation for a covariance (k, k) of the parameters."""
         return tuple(
-            replace(each, std=sqrt(max(float(slope @ covariance @ slope), 0.0)))
-            for each, slope in zip(self.items, self.gradients, strict=True)
+            replace(
+                precision,
+                std=sqrt(max(float(quantity_gradient @ covariance @ quantity_gradient), 0.0)),
+            )
+            for precision, quantity_gradient in zip(self.items, self.gradients, strict=True)
         )
 
 
-def _targets_of_modes(target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+def _targets_of_modes(given_target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
     """Return a target for each mode, if the given target applies to every mode in the band."""
-    if target.quantity not in MODE_QUANTITIES or target.mode is not None:
-        return [target]
-    return [replace(target, mode=mode.number) for mode in modes]
+    if given_target.quantity not in MODE_QUANTITIES or given_target.mode is not None:
+        return [given_target]
+    return [replace(given_target, mode=estimated_mode.number) for estimated_mode in modes]
 
 
 def _linearise(
-    target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
+    given_target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
 ) -> tuple[float, Real, str]:
-    """Return the value of a target quantity and its derivatives by the parameters, shape (k,).
+    """Return the value of a quantity and its derivatives by the beam's parameters, shape (k,).
 
     The third result is the reason why no record can determine the quantity, or an empty text.
     """
-    gradient = np.zeros(len(estimate.names))
-    name = target.quantity
-    if name in MODE_QUANTITIES:
-        mode = next((each for each in modes if each.number == target.mode), None)
-        if mode is None:
-            mode_numbers = ", ".join(str(each.number) for each in modes) or "none"
+    quantity_gradient = np.zeros(len(estimate.names))
+    quantity_name = given_target.quantity
+    if quantity_name in MODE_QUANTITIES:
+        target_mode = next(
+            (
+                estimated_mode
+                for estimated_mode in modes
+                if estimated_mode.number == given_target.mode
+            ),
+            None,
+        )
+        if target_mode is None:
+            mode_numbers = (
+                ", ".join(str(estimated_mode.number) for estimated_mode in modes) or "none"
+            )
             return (
                 0.0,
-                gradient,
-                f"mode {target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
+                quantity_gradient,
+                f"mode {given_target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
             )
-        if name == "damping":
-            return mode.damping_ratio, mode.damping_gradient, ""
-        return mode.frequency_hz, mode.frequency_gradient_hz, ""
-    value = estimate.values[name]
-    coefficient = _COEFFICIENT_OF_ORDER.get(name, name)
-    if estimate.values[coefficient] == 0.0 or name not in estimate.names:
-        reason = "is absent" if estimate.values[coefficient] == 0.0 else f"has {name} fixed"
-        return value, gradient, f"{_DAMPING_KIND[name]} damping {reason} in the estimate so far"
-    gradient[estimate.names.index(name)] = value if name in LOGARITHMIC_PARAMETERS else 1.0
-    return value, gradient, ""
+        if quantity_name == "damping":
+            return target_mode.damping_ratio, target_mode.damping_gradient, ""
+        return target_mode.frequency_hz, target_mode.frequency_gradient_hz, ""
+    quantity_value = estimate.values[quantity_name]
+    coefficient_name = _COEFFICIENT_OF_ORDER.get(quantity_name, quantity_name)
+    if estimate.values[coefficient_name] == 0.0 or quantity_name not in estimate.names:
+        impossible_reason = (
+            "is absent"
+            if estimate.values[coefficient_name] == 0.0
+            else f"has {quantity_name} fixed"
+        )
+        return (
+            quantity_value,
+            quantity_gradient,
+            f"{_DAMPING_KIND[quantity_name]} damping {impossible_reason} in the estimate so far",
+        )
+    quantity_gradient[estimate.names.index(quantity_name)] = (
+        quantity_value if quantity_name in LOGARITHMIC_PARAMETERS else 1.0
+    )
+    return quantity_value, quantity_gradient, ""

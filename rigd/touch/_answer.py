@@ -39,126 +39,149 @@ _WIDE_LIKELIHOOD_DROP = 8.0
 
 
 def estimate_from_explanations(
-    search: ExplanationSearch, explained: ExplainedRecord, *, scan: bool
+    explanation_search: ExplanationSearch, explained_record: ExplainedRecord, *, scan: bool
 ) -> TouchEstimate:
-    """Return the estimate of a touch from the likeliest explanations of its record.
+    """Return position, instant, force and stiffness of a touch from its likeliest explanations.
 
     Parameters
     ----------
-    search
+    explanation_search
         Search that found the explanations.
-    explained
+    explained_record
         Explanations of the record.
     scan
         Whether the estimate contains the likelihood of all positions; otherwise it is empty.
     """
-    explanations, window = explained.explanations, explained.window
+    explanations, sample_window = explained_record.explanations, explained_record.window
     at_rest = explanations[0]
-    best = min(explanations, key=lambda each: each.chi2)
-    if at_rest.chi2 < best.chi2 + DECISIVE_CHI2_DIFFERENCE:
-        best = at_rest
+    best_explanation = min(explanations, key=lambda explanation: explanation.chi2)
+    if at_rest.chi2 < best_explanation.chi2 + DECISIVE_CHI2_DIFFERENCE:
+        best_explanation = at_rest
     likely_explanations = [
-        best,
-        *(each for each in explanations if _is_about_as_likely(best, each)),
+        best_explanation,
+        *(
+            explanation
+            for explanation in explanations
+            if _is_about_as_likely(best_explanation, explanation)
+        ),
     ]
-    is_unambiguous = len(likely_explanations) == 1 and best.kind != "two"
-    if best is at_rest:
-        likely_explanations += [each for each in explanations if each.kind == "two"]
-    offset = search.begin / search.rate
-    x_m = time_s = force_n = stiffness = None
-    force_history_n, instants = np.zeros(0), np.zeros(0)
-    kind = "unknown"
-    if search.fits(best, window):
-        is_poor_fit = not search.fits(best, window, POOR_FIT_STDS)
+    is_unambiguous = len(likely_explanations) == 1 and best_explanation.kind != "two"
+    if best_explanation is at_rest:
+        likely_explanations += [
+            explanation for explanation in explanations if explanation.kind == "two"
+        ]
+    begin_s = explanation_search.begin / explanation_search.rate
+    x_m = time_s = force_n = stiffness_n_per_m = None
+    force_history_n, force_times_s = np.zeros(0), np.zeros(0)
+    obstacle_kind = "unknown"
+    if explanation_search.fits(best_explanation, sample_window):
+        is_poor_fit = not explanation_search.fits(best_explanation, sample_window, POOR_FIT_STDS)
         is_doubtful = (
-            explained.later_samples_contradict or explained.other_kinds_untried
-            if best is at_rest
+            explained_record.later_samples_contradict or explained_record.other_kinds_untried
+            if best_explanation is at_rest
             else is_poor_fit
         )
         if is_unambiguous and not is_doubtful:
-            kind = best.kind
+            obstacle_kind = best_explanation.kind
         x_m, time_s = (
-            _position_estimate(search, likely_explanations),
-            _common_parameter(likely_explanations, 1, offset),
+            _position_estimate(explanation_search, likely_explanations),
+            _common_parameter(likely_explanations, 1, begin_s),
         )
-        if is_poor_fit or explained.other_kinds_untried:
-            x_m = _with_wide_interval(search, x_m)
-        force_history_n, instants, force_n = _force_estimate(search, best, window)
-        if kind == "rigid":
-            stiffness = _stiffness_estimate(at_rest.posterior)
+        if is_poor_fit or explained_record.other_kinds_untried:
+            x_m = _with_wide_interval(explanation_search, x_m)
+        force_history_n, force_times_s, force_n = _force_estimate(
+            explanation_search, best_explanation, sample_window
+        )
+        if obstacle_kind == "rigid":
+            stiffness_n_per_m = _stiffness_estimate(at_rest.posterior)
     elif (
-        search.any_force.chi2 < search.max_chi2(search.any_force.degrees)
-        and not search.begins_before_window
+        explanation_search.any_force.chi2
+        < explanation_search.max_chi2(explanation_search.any_force.degrees)
+        and not explanation_search.begins_before_window
     ):
-        x_m = _unexplained_position(search)
+        x_m = _unexplained_position(explanation_search)
     return TouchEstimate(
         x_m=x_m,
         time_s=time_s,
         force_n=force_n,
-        stiffness_n_per_m=stiffness,
-        kind=kind,
-        model=search.tables.model.source,
-        channels=search.motion.noise.size,
-        samples=window.end - search.detected,
-        chi2_per_degree=best.chi2 / (window.data.size - best.parameters.size),
-        positions_m=search.any_force.x_m if scan else np.zeros(0),
-        log_likelihood=search.any_force.log_likelihood if scan else np.zeros(0),
-        innovations=search.motion.innovations / search.motion.noise[:, None],
-        innovation_times_s=search.motion.t + offset,
+        stiffness_n_per_m=stiffness_n_per_m,
+        kind=obstacle_kind,
+        model=explanation_search.tables.model.source,
+        channels=explanation_search.motion.noise.size,
+        samples=sample_window.end - explanation_search.detected,
+        chi2_per_degree=best_explanation.chi2
+        / (sample_window.data.size - best_explanation.parameters.size),
+        positions_m=explanation_search.any_force.x_m if scan else np.zeros(0),
+        log_likelihood=explanation_search.any_force.log_likelihood if scan else np.zeros(0),
+        innovations=explanation_search.motion.innovations
+        / explanation_search.motion.noise[:, None],
+        innovation_times_s=explanation_search.motion.t + begin_s,
         force_history_n=force_history_n,
-        force_times_s=instants + offset,
+        force_times_s=force_times_s + begin_s,
     )
 
 
-def _unexplained_position(search: ExplanationSearch) -> Estimated:
+def _unexplained_position(explanation_search: ExplanationSearch) -> Estimated:
     """Return the position of an unexplained touch in m, with a wide interval.
 
     The interval contains all positions at which any force could cause the first samples, or the
     first and later samples. Later more than one point may be touched.
     """
-    early = [search.tables.any_force.scan(search.window(seconds)) for seconds in _EARLY_TIMES_S]
+    early_likelihoods = [
+        explanation_search.tables.any_force.scan(explanation_search.window(time_s))
+        for time_s in _EARLY_TIMES_S
+    ]
     interval_ends = np.array(
-        [scan.interval(_WIDE_LIKELIHOOD_DROP)[2:] for scan in (search.any_force, *early)]
+        [
+            likelihood.interval(_WIDE_LIKELIHOOD_DROP)[2:]
+            for likelihood in (explanation_search.any_force, *early_likelihoods)
+        ]
     )
-    low, high = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
+    low_m, high_m = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
     return Estimated(
-        search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0], (high - low) / 4, (low, high)
+        explanation_search.any_force.interval(_WIDE_LIKELIHOOD_DROP)[0],
+        (high_m - low_m) / 4,
+        (low_m, high_m),
     )
 
 
-def _with_wide_interval(search: ExplanationSearch, estimate: Estimated) -> Estimated:
-    """Return the estimate of a position with an interval that contains those for any force."""
-    *_, low, high = search.any_force.interval()
-    low, high = min(low, estimate.interval_95[0]), max(high, estimate.interval_95[1])
-    return Estimated(estimate.value, max(estimate.std, (high - low) / 4), (low, high))
+def _with_wide_interval(explanation_search: ExplanationSearch, estimate: Estimated) -> Estimated:
+    """Return a touch position in m, with an interval that includes that for any force over time."""
+    *_, low_m, high_m = explanation_search.any_force.interval()
+    low_m, high_m = min(low_m, estimate.interval_95[0]), max(high_m, estimate.interval_95[1])
+    return Estimated(estimate.value, max(estimate.std, (high_m - low_m) / 4), (low_m, high_m))
 
 
 def _position_estimate(
-    search: ExplanationSearch, likely_explanations: list[Explanation]
+    explanation_search: ExplanationSearch, likely_explanations: list[Explanation]
 ) -> Estimated:
     """Return the position of the touch in m, with the additional uncertainty from bounces."""
-    estimate = _common_parameter(likely_explanations, 0)
-    near_tip = estimate.value > NEAR_TIP_FRACTION * search.tables.model.beam.length_m
+    position = _common_parameter(likely_explanations, 0)
+    is_near_tip = position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.beam.length_m
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
-        else _BOUNCE_STD_M[int(near_tip)]
+        else _BOUNCE_STD_M[int(is_near_tip)]
     )
-    low, high = (
-        estimate.value
-        + np.copysign(np.hypot(end - estimate.value, _NORMAL_QUANTILE_95 * additional_std_m), sign)
-        for end, sign in zip(estimate.interval_95, (-1.0, 1.0), strict=True)
+    low_m, high_m = (
+        position.value
+        + np.copysign(
+            np.hypot(end - position.value, _NORMAL_QUANTILE_95 * additional_std_m), interval_sign
+        )
+        for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
     )
-    length = search.tables.model.beam.length_m
+    length_m = explanation_search.tables.model.beam.length_m
     return Estimated(
-        estimate.value,
-        float(np.hypot(estimate.std, additional_std_m)),
-        (max(float(low), 0.0), min(float(high), length)),
+        position.value,
+        float(np.hypot(position.std, additional_std_m)),
+        (max(float(low_m), 0.0), min(float(high_m), length_m)),
     )
 
 
 def _force_estimate(
-    search: ExplanationSearch, best: Explanation, window: WhitenedWindow
+    explanation_search: ExplanationSearch,
+    best_explanation: Explanation,
+    sample_window: WhitenedWindow,
 ) -> tuple[Real, Real, Estimated]:
     """Return the contact force over time, its instants, and its peak with an interval.
 
@@ -166,70 +189,110 @@ def _force_estimate(
     spread over the posterior distribution.
     """
     rng = np.random.default_rng(2)
-    posterior = best.posterior
-    drawn = rng.choice(posterior.weights.size, 48, p=posterior.weights)
-    candidates = np.vstack([best.parameters, posterior.samples[drawn]])
-    step_s = search.tables.middle.step_s
-    if best.kind == "knock":
-        peaks = np.abs(candidates[:, 3])
-        phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(candidates[0, 2])
-        force = peaks[:1, None] * np.sin(np.pi * np.minimum(phase, 1.0))
-    elif best.kind == "two":
-        step_s = search.tables.coarse.step_s
-        force = np.abs(search.pairing().predict(candidates, window)[1])
-        peaks = force.max(axis=1)
+    posterior = best_explanation.posterior
+    drawn_indices = rng.choice(posterior.weights.size, 48, p=posterior.weights)
+    candidates = np.vstack([best_explanation.parameters, posterior.samples[drawn_indices]])
+    step_s = explanation_search.tables.middle.step_s
+    if best_explanation.kind == "knock":
+        peak_forces_n = np.abs(candidates[:, 3])
+        pulse_phase = np.arange(0.0, np.exp(candidates[0, 2]) + step_s, step_s) / np.exp(
+            candidates[0, 2]
+        )
+        force_history_n = peak_forces_n[:1, None] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
+    elif best_explanation.kind == "two":
+        step_s = explanation_search.tables.coarse.step_s
+        force_history_n = np.abs(explanation_search.pairing().predict(candidates, sample_window)[1])
+        peak_forces_n = force_history_n.max(axis=1)
     else:
-        contact = ObstacleContact(search.tables.middle, search.tables.x_m, search.motion)
-        side = None if best.kind == "rigid" else search.pressing_direction()
-        if best.kind == "yielding":
+        obstacle_contact = ObstacleContact(
+            explanation_search.tables.middle,
+            explanation_search.tables.x_m,
+            explanation_search.motion,
+        )
+        pressing_side = (
+            None if best_explanation.kind == "rigid" else explanation_search.pressing_direction()
+        )
+        if best_explanation.kind == "yielding":
             candidates = np.insert(candidates, 3, 0.0, axis=1)
-        force = np.abs(contact.predict(candidates, window, side)[1])
-        peaks = force.max(axis=1)
-    low, high = np.quantile(peaks[1:], (0.025, 0.975))
-    estimate = Estimated(float(peaks[1:].mean()), float(peaks[1:].std()), (float(low), float(high)))
-    return force[0], candidates[0, 1] + step_s * np.arange(force.shape[1]), estimate
+        force_history_n = np.abs(
+            obstacle_contact.predict(candidates, sample_window, pressing_side)[1]
+        )
+        peak_forces_n = force_history_n.max(axis=1)
+    low_n, high_n = np.quantile(peak_forces_n[1:], (0.025, 0.975))
+    peak_force = Estimated(
+        float(peak_forces_n[1:].mean()),
+        float(peak_forces_n[1:].std()),
+        (float(low_n), float(high_n)),
+    )
+    return (
+        force_history_n[0],
+        candidates[0, 1] + step_s * np.arange(force_history_n.shape[1]),
+        peak_force,
+    )
 
 
-def _is_about_as_likely(best: Explanation, other: Explanation) -> bool:
-    """Return whether another explanation is about as likely as the best one.
+def _is_about_as_likely(best_explanation: Explanation, other_explanation: Explanation) -> bool:
+    """Return whether another explanation of a touch is about as likely as the best one.
 
     An explanation with more parameters must be clearly better.
     """
-    if best.kind == "rigid" and other.kind in ("moving", "yielding"):
-        return other.chi2 < best.chi2 - CHANCE_CHI2_REDUCTION
-    if best.kind == "rigid" and other.kind == "two":
+    if best_explanation.kind == "rigid" and other_explanation.kind in ("moving", "yielding"):
+        return other_explanation.chi2 < best_explanation.chi2 - CHANCE_CHI2_REDUCTION
+    if best_explanation.kind == "rigid" and other_explanation.kind == "two":
         return False
-    return other is not best and other.chi2 < best.chi2 + DECISIVE_CHI2_DIFFERENCE
+    return (
+        other_explanation is not best_explanation
+        and other_explanation.chi2 < best_explanation.chi2 + DECISIVE_CHI2_DIFFERENCE
+    )
 
 
 def _common_parameter(
-    likely_explanations: list[Explanation], column: int, shift: float = 0.0
+    likely_explanations: list[Explanation], parameter_column: int, value_shift: float = 0.0
 ) -> Estimated:
-    """Return the estimate of a parameter that all likely explanations have in common.
+    """Return the estimate of a parameter that all likely explanations of a touch have.
 
-    `column` is the column of the parameter, `shift` is added to its value, and the interval
-    contains those of all explanations.
+    `parameter_column` is the column of the parameter in the posterior's samples, and `value_shift`
+    is added to its value. The interval contains the intervals of all explanations.
     """
     interval_ends = np.array(
-        [each.posterior.quantiles(column, (0.025, 0.975)) for each in likely_explanations]
+        [
+            explanation.posterior.quantiles(parameter_column, (0.025, 0.975))
+            for explanation in likely_explanations
+        ]
     )
-    low, high = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
-    mean, std = (
-        likely_explanations[0].posterior.mean(column),
-        likely_explanations[0].posterior.std(column),
+    low_end, high_end = float(interval_ends[:, 0].min()), float(interval_ends[:, 1].max())
+    posterior_mean, posterior_std = (
+        likely_explanations[0].posterior.mean(parameter_column),
+        likely_explanations[0].posterior.std(parameter_column),
     )
     if len(likely_explanations) > 1:
-        std = max(std, (mean - low) / _NORMAL_QUANTILE_95, (high - mean) / _NORMAL_QUANTILE_95)
-    return Estimated(mean + shift, std, (low + shift, high + shift))
+        posterior_std = max(
+            posterior_std,
+            (posterior_mean - low_end) / _NORMAL_QUANTILE_95,
+            (high_end - posterior_mean) / _NORMAL_QUANTILE_95,
+        )
+    return Estimated(
+        posterior_mean + value_shift, posterior_std, (low_end + value_shift, high_end + value_shift)
+    )
 
 
 def _stiffness_estimate(posterior: Posterior) -> Estimated | None:
-    """Return the estimate of the stiffness in N/m, or None if the data do not bound it.
+    """Return the obstacle's estimated stiffness in N/m, or None if the data do not bound it.
 
     The value is the exponential of the logarithm's median.
     """
-    low, middle, high = posterior.quantiles(2, (0.025, 0.5, 0.975))
-    if high > MAX_LN_STIFFNESS - 0.7 or low < MIN_LN_STIFFNESS + 0.3 or high - low > np.log(100):
+    low_ln_stiffness, median_ln_stiffness, high_ln_stiffness = posterior.quantiles(
+        2, (0.025, 0.5, 0.975)
+    )
+    if (
+        high_ln_stiffness > MAX_LN_STIFFNESS - 0.7
+        or low_ln_stiffness < MIN_LN_STIFFNESS + 0.3
+        or high_ln_stiffness - low_ln_stiffness > np.log(100)
+    ):
         return None
-    value = float(np.exp(middle))
-    return Estimated(value, value * posterior.std(2), (float(np.exp(low)), float(np.exp(high))))
+    stiffness_n_per_m = float(np.exp(median_ln_stiffness))
+    return Estimated(
+        stiffness_n_per_m,
+        stiffness_n_per_m * posterior.std(2),
+        (float(np.exp(low_ln_stiffness)), float(np.exp(high_ln_stiffness))),
+    )

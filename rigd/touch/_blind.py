@@ -22,7 +22,7 @@ _FORCE_STDS_N = np.array([0.1, 0.4, 1.6, 6.4])
 
 @dataclass(frozen=True, slots=True)
 class AnyForceLikelihood:
-    """Likelihood of a touch by any force, at each position along the beam."""
+    """Likelihood of a touch at each position along the beam, whatever its force over time is."""
 
     x_m: Real
     """Positions along the beam, shape (m,)."""
@@ -47,88 +47,111 @@ class AnyForceLikelihood:
             Difference of the log-likelihood between the likeliest position and the ends; 1.92 for
             an interval of 95 %.
         """
-        fine = np.linspace(self.x_m[0], self.x_m[-1], 4000)
-        log_likelihood = np.interp(fine, self.x_m, self.log_likelihood)
-        best = int(np.argmax(self.log_likelihood))
-        at = float(self.x_m[best])
-        if 0 < best < self.x_m.size - 1:
-            low, mid, high = self.log_likelihood[best - 1 : best + 2]
-            curvature = low - 2 * mid + high
+        fine_positions_m = np.linspace(self.x_m[0], self.x_m[-1], 4000)
+        log_likelihood = np.interp(fine_positions_m, self.x_m, self.log_likelihood)
+        best_index = int(np.argmax(self.log_likelihood))
+        best_m = float(self.x_m[best_index])
+        if 0 < best_index < self.x_m.size - 1:
+            left_value, best_value, right_value = self.log_likelihood[
+                best_index - 1 : best_index + 2
+            ]
+            curvature = left_value - 2 * best_value + right_value
             if curvature < 0:
-                spacing = self.x_m[1] - self.x_m[0]
-                at += float(np.clip(0.5 * (low - high) / curvature, -1, 1) * spacing)
-        likely_m = fine[log_likelihood >= log_likelihood.max() - drop]
-        weights = np.exp(log_likelihood - log_likelihood.max())
-        mean = np.sum(weights * fine) / np.sum(weights)
-        std = float(np.sqrt(np.sum(weights * (fine - mean) ** 2) / np.sum(weights)))
-        return at, std, min(float(likely_m[0]), at), max(float(likely_m[-1]), at)
+                spacing_m = self.x_m[1] - self.x_m[0]
+                best_m += float(
+                    np.clip(0.5 * (left_value - right_value) / curvature, -1, 1) * spacing_m
+                )
+        likely_m = fine_positions_m[log_likelihood >= log_likelihood.max() - drop]
+        likelihood_weights = np.exp(log_likelihood - log_likelihood.max())
+        mean_m = np.sum(likelihood_weights * fine_positions_m) / np.sum(likelihood_weights)
+        std_m = float(
+            np.sqrt(
+                np.sum(likelihood_weights * (fine_positions_m - mean_m) ** 2)
+                / np.sum(likelihood_weights)
+            )
+        )
+        return best_m, std_m, min(float(likely_m[0]), best_m), max(float(likely_m[-1]), best_m)
 
 
 class AnyForceEstimator:
-    """Computation of the likelihood of a touch by any force, prepared for one length of records.
+    """Estimator of the touch position without an assumption on the force over time.
 
     Parameters
     ----------
     kernels
         Contact kernels with two time steps a sample.
-    stride
+    position_stride
         Number of the kernels' positions from one scanned position to the next.
-    samples
+    sample_count
         Largest number of samples.
     """
 
     __slots__ = ("_effects", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, stride: int, samples: int) -> None:
-        self._x_m = kernels.x_m[::stride]
-        lag = 2 * np.arange(samples)[:, None] - np.arange(2 * samples)
+    def __init__(self, kernels: ContactKernels, position_stride: int, sample_count: int) -> None:
+        self._x_m = kernels.x_m[::position_stride]
+        lag_samples = 2 * np.arange(sample_count)[:, None] - np.arange(2 * sample_count)
         self._effects = [
-            np.where(lag >= 0, table[::stride][:, np.clip(lag, 0, table.shape[1] - 1)], 0.0)
-            for table in (kernels.torque, kernels.shear)
+            np.where(
+                lag_samples >= 0,
+                response_table[::position_stride][
+                    :, np.clip(lag_samples, 0, response_table.shape[1] - 1)
+                ],
+                0.0,
+            )
+            for response_table in (kernels.torque, kernels.shear)
         ]  # (positions, samples, forces)
 
-    def scan(self, window: WhitenedWindow) -> AnyForceLikelihood:
-        """Return the likelihood of a touch by any force at each position.
+    def scan(self, sample_window: WhitenedWindow) -> AnyForceLikelihood:
+        """Return the likelihood of a touch at each position along the beam, for any force.
 
         Parameters
         ----------
-        window
+        sample_window
             Whitened innovations of at most the prepared number of samples.
         """
-        count = window.end - window.first
-        noise = window.motion.noise
-        effects = np.concatenate(
+        sample_count = sample_window.end - sample_window.first
+        noise_stds = sample_window.motion.noise
+        force_effects = np.concatenate(
             [
-                each[:, :count, : 2 * count] / sigma
-                for each, sigma in zip(self._effects, noise, strict=False)
+                channel_effects[:, :sample_count, : 2 * sample_count] / noise_std
+                for channel_effects, noise_std in zip(self._effects, noise_stds, strict=False)
             ],
             axis=1,
         )
-        effects = window.whitening @ effects
-        data = window.data
-        n = data.size
-        force_covariance = effects @ effects.transpose(0, 2, 1)
-        corner = float(data @ data) + 1.0
+        force_effects = sample_window.whitening @ force_effects
+        whitened_data = sample_window.data
+        n = whitened_data.size
+        force_covariance = force_effects @ force_effects.transpose(0, 2, 1)
+        bordered_corner = float(whitened_data @ whitened_data) + 1.0
         log_likelihoods = np.empty((_FORCE_STDS_N.size, self._x_m.size))
-        quadratic = np.empty_like(log_likelihoods)
-        bordered = np.empty((self._x_m.size, n + 1, n + 1))
-        bordered[:, n, :n] = bordered[:, :n, n] = data
-        bordered[:, n, n] = corner
+        quadratic_forms = np.empty_like(log_likelihoods)
+        bordered_matrices = np.empty((self._x_m.size, n + 1, n + 1))
+        bordered_matrices[:, n, :n] = bordered_matrices[:, :n, n] = whitened_data
+        bordered_matrices[:, n, n] = bordered_corner
         for i, std_index in enumerate(_FORCE_STDS_N):
-            bordered[:, :n, :n] = std_index**2 * force_covariance + np.eye(n)
-            factor = np.linalg.cholesky(bordered)
-            diagonal = np.diagonal(factor, axis1=1, axis2=2)
-            quadratic[i] = corner - diagonal[:, n] ** 2
-            log_likelihoods[i] = -0.5 * quadratic[i] - np.log(diagonal[:, :n]).sum(axis=1)
-        std_index, position = np.unravel_index(np.argmax(log_likelihoods), log_likelihoods.shape)
-        variance = _FORCE_STDS_N[std_index] ** 2
-        covariance = variance * force_covariance[position] + np.eye(n)
-        force = variance * effects[position].T @ np.linalg.solve(covariance, data)
+            bordered_matrices[:, :n, :n] = std_index**2 * force_covariance + np.eye(n)
+            cholesky_factors = np.linalg.cholesky(bordered_matrices)
+            factor_diagonals = np.diagonal(cholesky_factors, axis1=1, axis2=2)
+            quadratic_forms[i] = bordered_corner - factor_diagonals[:, n] ** 2
+            log_likelihoods[i] = -0.5 * quadratic_forms[i] - np.log(factor_diagonals[:, :n]).sum(
+                axis=1
+            )
+        std_index, position_index = np.unravel_index(
+            np.argmax(log_likelihoods), log_likelihoods.shape
+        )
+        force_variance_n2 = _FORCE_STDS_N[std_index] ** 2
+        data_covariance = force_variance_n2 * force_covariance[position_index] + np.eye(n)
+        force_n = (
+            force_variance_n2
+            * force_effects[position_index].T
+            @ np.linalg.solve(data_covariance, whitened_data)
+        )
         return AnyForceLikelihood(
             x_m=self._x_m,
             log_likelihood=log_likelihoods.max(axis=0),
-            chi2=float(quadratic[std_index, position]),
+            chi2=float(quadratic_forms[std_index, position_index]),
             degrees=n,
-            force_n=force,
+            force_n=force_n,
             force_std_n=float(_FORCE_STDS_N[std_index]),
         )

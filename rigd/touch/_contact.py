@@ -55,70 +55,78 @@ def integrate_contact(
     ndarray, shape of `approach`
         Magnitude of the force in N, 0 without contact.
     """
-    shape = approach.shape
-    kernels, steps = kernel.shape
+    result_shape = approach.shape
+    kernel_count, step_count = kernel.shape
     # An obstacle that moves away is a shorter approach; one that yields is a softer beam.
     if np.any(rate_m_per_s):
-        obstacle_motion_m = np.multiply.outer(np.asarray(rate_m_per_s) * step_s, np.arange(steps))
+        obstacle_motion_m = np.multiply.outer(
+            np.asarray(rate_m_per_s) * step_s, np.arange(step_count)
+        )
         approach = approach - obstacle_motion_m.astype(approach.dtype)
     if np.any(mobility_m_per_n_s):
         yield_per_step = np.asarray(mobility_m_per_n_s, kernel.dtype) * step_s
         kernel = kernel + yield_per_step[..., None]
-    stiffness = stiffness_n_per_m.reshape(kernels, -1)
+    kernel_stiffness = stiffness_n_per_m.reshape(kernel_count, -1)
     # Force of a step without earlier ones: (n, k, g).
-    effective_stiffness = stiffness / (1 + stiffness * kernel[:, :1])
-    free_force_n = approach.reshape(kernels, -1, steps).transpose(2, 0, 1) * effective_stiffness
-    group_size = stiffness.shape[1]
-    force = np.zeros((kernels, steps, group_size), free_force_n.dtype)
+    effective_stiffness = kernel_stiffness / (1 + kernel_stiffness * kernel[:, :1])
+    free_force_n = (
+        approach.reshape(kernel_count, -1, step_count).transpose(2, 0, 1) * effective_stiffness
+    )
+    group_size = kernel_stiffness.shape[1]
+    forces_n = np.zeros((kernel_count, step_count, group_size), free_force_n.dtype)
     # The latest lag comes first, so that a product of two rows is the convolution.
     reversed_kernel = np.ascontiguousarray(kernel[:, ::-1])
-    row, column = reversed_kernel.strides
+    row_stride, column_stride = reversed_kernel.strides
     # Within a block each force is subtracted from the later steps. All views are made once.
-    width = _BLOCK if kernels * group_size < _MANY else _SHORT_BLOCK
-    block_forces, block_reductions = np.zeros((2, width, kernels * group_size), free_force_n.dtype)
-    block_lags = np.zeros((width - 1, kernels * group_size), free_force_n.dtype)
-    lags = kernel[:, 1:width].T[:, :, None] * effective_stiffness
-    block_lags[: len(lags)] = lags.reshape(len(lags), -1)
-    views = [
+    block_steps = _BLOCK if kernel_count * group_size < _MANY else _SHORT_BLOCK
+    block_forces, block_reductions = np.zeros(
+        (2, block_steps, kernel_count * group_size), free_force_n.dtype
+    )
+    block_lags = np.zeros((block_steps - 1, kernel_count * group_size), free_force_n.dtype)
+    kernel_lags = kernel[:, 1:block_steps].T[:, :, None] * effective_stiffness
+    block_lags[: len(kernel_lags)] = kernel_lags.reshape(len(kernel_lags), -1)
+    block_views = [
         (
             block_forces[i],
-            block_lags[: width - 1 - i],
-            block_reductions[: width - 1 - i],
+            block_lags[: block_steps - 1 - i],
+            block_reductions[: block_steps - 1 - i],
             block_forces[i + 1 :],
         )
-        for i in range(width)
+        for i in range(block_steps)
     ]
-    zeros = np.zeros(kernels * group_size, free_force_n.dtype)
-    first_contact_step = steps
-    for begin in range(1, steps, width):
-        end = min(begin + width, steps)
-        block_force_n = free_force_n[begin:end]
-        if first_contact_step < begin:
+    zero_forces = np.zeros(kernel_count * group_size, free_force_n.dtype)
+    first_contact_step = step_count
+    for block_begin in range(1, step_count, block_steps):
+        end = min(block_begin + block_steps, step_count)
+        block_force_n = free_force_n[block_begin:end]
+        if first_contact_step < block_begin:
             # Element (k, i, j): effect of the force touched + j at step begin + i.
-            effect = np.ndarray(
-                (kernels, end - begin, begin - first_contact_step),
+            earlier_block_effect = np.ndarray(
+                (kernel_count, end - block_begin, block_begin - first_contact_step),
                 reversed_kernel.dtype,
                 buffer=reversed_kernel,
-                offset=(steps - 1 - begin + first_contact_step) * column,
-                strides=(row, -column, column),
+                offset=(step_count - 1 - block_begin + first_contact_step) * column_stride,
+                strides=(row_stride, -column_stride, column_stride),
             )
-            earlier_force_n = force[:, first_contact_step:begin]
+            earlier_force_n = forces_n[:, first_contact_step:block_begin]
             if group_size == 1:
-                earlier_effect = np.vecdot(effect, earlier_force_n.transpose(0, 2, 1))[:, :, None]
+                earlier_effect = np.vecdot(
+                    earlier_block_effect, earlier_force_n.transpose(0, 2, 1)
+                )[:, :, None]
             else:
-                earlier_effect = np.ascontiguousarray(effect) @ earlier_force_n
+                earlier_effect = np.ascontiguousarray(earlier_block_effect) @ earlier_force_n
             block_force_n = block_force_n - earlier_effect.transpose(1, 0, 2) * effective_stiffness
         if not block_force_n.max() > 0:
             continue  # no candidate is in contact
-        first_contact_step = min(first_contact_step, begin)
-        block_forces[: end - begin] = block_force_n.reshape(end - begin, -1)
-        for now, lag, product, later in views:
-            np.maximum(now, zeros, out=now)
-            np.multiply(lag, now, out=product)
-            np.subtract(later, product, out=later)
-        block = block_forces[: end - begin].reshape(-1, kernels, group_size)
-        force[:, begin:end] = block.transpose(1, 0, 2)
-    return np.ascontiguousarray(force.transpose(0, 2, 1)).reshape(shape)
+        first_contact_step = min(first_contact_step, block_begin)
+        block_forces[: end - block_begin] = block_force_n.reshape(end - block_begin, -1)
+        for now, lag, lag_product, later_reductions in block_views:
+            np.maximum(now, zero_forces, out=now)
+            np.multiply(lag, now, out=lag_product)
+            np.subtract(later_reductions, lag_product, out=later_reductions)
+        block_slice = block_forces[: end - block_begin].reshape(-1, kernel_count, group_size)
+        forces_n[:, block_begin:end] = block_slice.transpose(1, 0, 2)
+    return np.ascontiguousarray(forces_n.transpose(0, 2, 1)).reshape(result_shape)
 
 
 def integrate_two_contacts(
@@ -147,7 +155,7 @@ def integrate_two_contacts(
     tuple of ndarray, shape (k, n)
         Magnitude of each force in N, 0 without contact.
     """
-    count, steps = cross_kernel.shape
+    pair_count, step_count = cross_kernel.shape
     # Force of a step without all others, (n, 2, k).
     effective_stiffness = np.stack(
         [
@@ -155,90 +163,104 @@ def integrate_two_contacts(
             for k, kernel in zip(stiffness_n_per_m, own_kernels, strict=True)
         ]
     )
-    free_force_n = np.stack([each.T for each in approach], axis=1) * effective_stiffness
+    free_force_n = (
+        np.stack([obstacle_approach.T for obstacle_approach in approach], axis=1)
+        * effective_stiffness
+    )
     # Reduction of one force by another, by the lag; axes: lag, reduced, reducing.
-    kernel = np.empty((steps, 2, 2, count))
+    kernel = np.empty((step_count, 2, 2, pair_count))
     kernel[:, 0, 0], kernel[:, 1, 1] = own_kernels[0].T, own_kernels[1].T
     kernel[:, 0, 1] = kernel[:, 1, 0] = cross_kernel.T
     kernel *= effective_stiffness[:, None]
-    by_second, by_first = kernel[0, 0, 1], kernel[0, 1, 0]
-    coupling = 1 / (1 - by_second * by_first)
+    effect_of_second, effect_of_first = kernel[0, 0, 1], kernel[0, 1, 0]
+    coupling_factor = 1 / (1 - effect_of_second * effect_of_first)
     # The latest lag comes first, so that a product of two rows is the convolution.
     reversed_kernel = np.ascontiguousarray(kernel[::-1].transpose(3, 1, 2, 0))
-    *outer, column = reversed_kernel.strides
-    force = np.zeros((count, 2, steps))
-    block_forces = np.empty((_BLOCK, 2, count))
-    product = np.empty((_BLOCK, 2, 2, count))
-    for begin in range(1, steps, _BLOCK):
-        end = min(begin + _BLOCK, steps)
-        block_force_n = block_forces[: end - begin]
-        block_force_n[:] = free_force_n[begin:end]
-        if begin > 1:
+    *outer_strides, column_stride = reversed_kernel.strides
+    forces_n = np.zeros((pair_count, 2, step_count))
+    block_forces = np.empty((_BLOCK, 2, pair_count))
+    product = np.empty((_BLOCK, 2, 2, pair_count))
+    for block_begin in range(1, step_count, _BLOCK):
+        end = min(block_begin + _BLOCK, step_count)
+        block_force_n = block_forces[: end - block_begin]
+        block_force_n[:] = free_force_n[block_begin:end]
+        if block_begin > 1:
             # Element (k, a, b, i, j): effect of the force of step 1 + j at b on a, step begin + i.
-            effect = np.ndarray(
-                (count, 2, 2, end - begin, begin - 1),
+            later_effect = np.ndarray(
+                (pair_count, 2, 2, end - block_begin, block_begin - 1),
                 buffer=reversed_kernel,
-                offset=(steps - begin) * column,
-                strides=(*outer, -column, column),
+                offset=(step_count - block_begin) * column_stride,
+                strides=(*outer_strides, -column_stride, column_stride),
             )
-            earlier_effect = np.vecdot(effect, force[:, None, :, None, 1:begin]).sum(axis=2)
+            earlier_effect = np.vecdot(later_effect, forces_n[:, None, :, None, 1:block_begin]).sum(
+                axis=2
+            )
             block_force_n -= earlier_effect.transpose(2, 1, 0)
         for i, now in enumerate(block_force_n):
-            first, second = now
+            first_force_n, second_force_n = now
             # The second force if both press; then the first one, which is right in any case.
-            pressing = np.maximum((second - by_first * first) * coupling, 0.0)
-            np.maximum(first - by_second * pressing, 0.0, out=first)
-            np.maximum(second - by_first * first, 0.0, out=second)
-            later = block_force_n[i + 1 :]
-            reductions = np.multiply(
-                kernel[1 : len(later) + 1], now[None, None], out=product[: len(later)]
+            pressing_forces = np.maximum(
+                (second_force_n - effect_of_first * first_force_n) * coupling_factor, 0.0
             )
-            later -= reductions[:, :, 0]
-            later -= reductions[:, :, 1]
-        force[..., begin:end] = block_force_n.transpose(2, 1, 0)
-    return force[:, 0], force[:, 1]
+            np.maximum(first_force_n - effect_of_second * pressing_forces, 0.0, out=first_force_n)
+            np.maximum(second_force_n - effect_of_first * first_force_n, 0.0, out=second_force_n)
+            later_reductions = block_force_n[i + 1 :]
+            reductions = np.multiply(
+                kernel[1 : len(later_reductions) + 1],
+                now[None, None],
+                out=product[: len(later_reductions)],
+            )
+            later_reductions -= reductions[:, :, 0]
+            later_reductions -= reductions[:, :, 1]
+        forces_n[..., block_begin:end] = block_force_n.transpose(2, 1, 0)
+    return forces_n[:, 0], forces_n[:, 1]
 
 
-def shift_rows(table: Real, begin: Real, count: int) -> Real:
+def shift_rows(value_table: Real, begin_columns: Real, column_count: int) -> Real:
     """Shift each row of a table by a fraction of columns, by cubic interpolation.
 
-    The result has the shape (k, count). Before the first column the values are 0, and after the
-    last column they are constant.
+    The result has the shape (k, column_count). Before the first column the values are 0,
+    and after the last column they are constant.
 
     Parameters
     ----------
-    table
+    value_table
         Rows of values, shape (k, n).
-    begin
+    begin_columns
         Column of each row's first value in the result, shape (k,); it may be between two columns.
-    count
+    column_count
         Number of values of the result, one column apart.
     """
-    first_column = np.floor(begin).astype(np.intp)
-    u = (begin - first_column)[:, None]
-    rows, columns = table.shape
+    first_column = np.floor(begin_columns).astype(np.intp)
+    u = (begin_columns - first_column)[:, None]
+    rows, columns = value_table.shape
     first_column = np.clip(
-        first_column, -count - 2, columns + 1
+        first_column, -column_count - 2, columns + 1
     )  # farther off the result is the same
     padding_before = max(0, 1 - int(first_column.min()))
-    padding_after = max(0, int(first_column.max()) + count + 2 - columns)
-    padded = np.empty((rows, padding_before + columns + padding_after))
-    padded[:, :padding_before], padded[:, padding_before : padding_before + columns] = 0.0, table
-    padded[:, padding_before + columns :] = table[:, -1:]
-    # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
-    step, row = padded.strides[1], padded.strides[0]
-    blocks = np.ndarray(
-        (rows, padded.shape[1] - count - 2, count + 3), buffer=padded, strides=(row, step, step)
+    padding_after = max(0, int(first_column.max()) + column_count + 2 - columns)
+    padded_table = np.empty((rows, padding_before + columns + padding_after))
+    padded_table[:, :padding_before], padded_table[:, padding_before : padding_before + columns] = (
+        0.0,
+        value_table,
     )
-    neighbours = blocks[np.arange(rows), first_column - 1 + padding_before]
-    value = neighbours[:, :count] * (-u * (u - 1) * (u - 2) / 6)
-    value += neighbours[:, 1 : count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
-    value += neighbours[:, 2 : count + 2] * (-(u + 1) * u * (u - 2) / 2)
-    value += neighbours[:, 3:] * ((u + 1) * u * (u - 1) / 6)
-    return value
+    padded_table[:, padding_before + columns :] = value_table[:, -1:]
+    # Row k of the result: held[k, begin : begin + count + 3], copied as one block.
+    column_stride, row_stride = padded_table.strides[1], padded_table.strides[0]
+    column_blocks = np.ndarray(
+        (rows, padded_table.shape[1] - column_count - 2, column_count + 3),
+        buffer=padded_table,
+        strides=(row_stride, column_stride, column_stride),
+    )
+    neighbours = column_blocks[np.arange(rows), first_column - 1 + padding_before]
+    shifted_rows = neighbours[:, :column_count] * (-u * (u - 1) * (u - 2) / 6)
+    shifted_rows += neighbours[:, 1 : column_count + 1] * ((u + 1) * (u - 1) * (u - 2) / 2)
+    shifted_rows += neighbours[:, 2 : column_count + 2] * (-(u + 1) * u * (u - 2) / 2)
+    shifted_rows += neighbours[:, 3:] * ((u + 1) * u * (u - 1) / 6)
+    return shifted_rows
 
 
-def contact_responses(kernels: tuple[Real, ...], force: Real, every: int, samples: int) -> Real:
+def contact_responses(kernels: tuple[Real, ...], forces_n: Real, every: int, samples: int) -> Real:
     """Return the responses to a force at some of its time steps, shape (k, kernels, samples).
 
     They are the convolution of the force with the kernels.
@@ -247,33 +269,39 @@ def contact_responses(kernels: tuple[Real, ...], force: Real, every: int, sample
     ----------
     kernels
         Responses to a hat of force, each of shape (k, n) or (1, n), which are 0 from column n on.
-    force
+    forces_n
         Force at each step, shape (k, (samples - 1) · every + 1).
     every
         Number of steps from one sample to the next; the first sample is at the first step.
     samples
         Number of samples.
     """
-    candidates, steps = force.shape
-    tables = np.stack(kernels, axis=1)
-    length = min(tables.shape[2], steps)
-    if len(tables) == 1 and candidates > _SAMPLES:  # one matrix for all
-        lag = every * np.arange(samples) - np.arange(steps)[:, None]
-        table = np.where((lag >= 0) & (lag < length), tables[0][:, np.clip(lag, 0, length - 1)], 0)
-        return (force @ table).transpose(1, 0, 2)
-    # The latest force first, and zeros before the first one: each sample uses one block.
-    reversed_force = np.zeros((candidates, steps + length))
-    reversed_force[:, :steps] = force[:, ::-1]
-    row, column = reversed_force.strides
-    summed = np.empty((candidates, len(kernels), samples))
-    for first in range(0, samples, _SAMPLES):
-        end = min(first + _SAMPLES, samples)
-        history_steps = min(length, (end - 1) * every + 1)
-        view = np.ndarray(
-            (candidates, 1, end - first, history_steps),
-            buffer=reversed_force,
-            offset=(steps - 1 - first * every) * column,
-            strides=(row, 0, -every * column, column),
+    candidate_count, step_count = forces_n.shape
+    kernel_tables = np.stack(kernels, axis=1)
+    kernel_steps = min(kernel_tables.shape[2], step_count)
+    if len(kernel_tables) == 1 and candidate_count > _SAMPLES:  # one matrix for all
+        lag_steps = every * np.arange(samples) - np.arange(step_count)[:, None]
+        lag_table = np.where(
+            (lag_steps >= 0) & (lag_steps < kernel_steps),
+            kernel_tables[0][:, np.clip(lag_steps, 0, kernel_steps - 1)],
+            0,
         )
-        summed[:, :, first:end] = np.vecdot(tables[:, :, None, :history_steps], view)
-    return summed
+        return (forces_n @ lag_table).transpose(1, 0, 2)
+    # The latest force first, and zeros before the first one: each sample uses one block.
+    reversed_force = np.zeros((candidate_count, step_count + kernel_steps))
+    reversed_force[:, :step_count] = forces_n[:, ::-1]
+    row_stride, column_stride = reversed_force.strides
+    summed_responses = np.empty((candidate_count, len(kernels), samples))
+    for first_index in range(0, samples, _SAMPLES):
+        end = min(first_index + _SAMPLES, samples)
+        history_steps = min(kernel_steps, (end - 1) * every + 1)
+        history_view = np.ndarray(
+            (candidate_count, 1, end - first_index, history_steps),
+            buffer=reversed_force,
+            offset=(step_count - 1 - first_index * every) * column_stride,
+            strides=(row_stride, 0, -every * column_stride, column_stride),
+        )
+        summed_responses[:, :, first_index:end] = np.vecdot(
+            kernel_tables[:, :, None, :history_steps], history_view
+        )
+    return summed_responses

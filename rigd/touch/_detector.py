@@ -38,7 +38,7 @@ _RECENT_WEIGHT: Final = 1 / 600
 
 @dataclass(frozen=True, slots=True)
 class DetectorSettings:
-    """Settings of the touch detector's sensitivity."""
+    """Settings of the touch detector: false alarms an hour and tolerance of model errors."""
 
     false_alarms_per_hour: float = 0.02
     """Expected number of false alarms in an hour of white noise."""
@@ -46,7 +46,7 @@ class DetectorSettings:
     """Assumed error of the model, as a fraction of the predicted torque and shear."""
 
     def threshold(self, rate_hz: float, signatures: int) -> float:
-        """Return the detection threshold in standard deviations, for the stated false alarms.
+        """Return the detection threshold in standard deviations, for the false alarms an hour.
 
         Parameters
         ----------
@@ -66,7 +66,7 @@ class DetectorSettings:
 
 
 class TouchDetector:
-    """Detector of a touch, which processes the readings of a record tick by tick.
+    """Detector of the beam's touch of an obstacle, from the readings of each tick.
 
     Until the first `arm` it measures the innovations of the beam at rest. Afterwards innovations
     are compared with their standard deviations, not with the noise for which the model was
@@ -121,9 +121,12 @@ class TouchDetector:
         self._compare = np.asfortranarray(signatures, np.float32).dot
         self._compared = np.empty(len(signatures), np.float32)
         # The last innovations are stored twice in a ring, so that they are always contiguous.
-        width = signatures.shape[1]
-        self._last = np.zeros(2 * width, np.float32)
-        self._windows = [self._last[start : start + width] for start in range(2, width + 2, 2)]
+        signature_width = signatures.shape[1]
+        self._last = np.zeros(2 * signature_width, np.float32)
+        self._windows = [
+            self._last[window_start : window_start + signature_width]
+            for window_start in range(2, signature_width + 2, 2)
+        ]
         self._slot = 0
         self._mean_squares = [1.0] * len(self._windows)
         self._recent = 1.0
@@ -133,8 +136,8 @@ class TouchDetector:
     def arm(self) -> None:
         """Start to detect touches with the next tick."""
         if self._ticks:
-            torque, shear = (sqrt(square / self._ticks) for square in self._squares)
-            self.noise = torque or 1.0, shear or 1.0
+            torque_std, shear_std = (sqrt(square_sum / self._ticks) for square_sum in self._squares)
+            self.noise = torque_std or 1.0, shear_std or 1.0
         self._ticks = 0
         self._measuring = False
         self._armed = True
@@ -144,12 +147,12 @@ class TouchDetector:
         self._recent = 1.0
 
     def disarm(self) -> None:
-        """Stop detecting touches, while the model continues to follow the beam's motion."""
+        """Stop detecting touches; the beam model still follows the readings of each tick."""
         self._armed = False
         self.level = 0.0
 
     def contact_force_n(self, shear_n: float) -> float:
-        """Return the approximate contact force in N at the last tick.
+        """Return the approximate force in N between beam and obstacle at the last tick.
 
         It is the measured base shear minus the shear predicted for the free beam.
 
@@ -170,15 +173,15 @@ class TouchDetector:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> bool:
-        """Process the readings of a tick, and return whether they show a touch.
+        """Process the readings of a tick; return True if they show that the beam touches.
 
         Parameters
         ----------
         angle_rad, torque_nm, shear_n, missed, angle_stale, wrench_stale
             See `InnovationFilter.step`.
         """
-        filter_ = self._filter
-        filter_.step(
+        innovation_filter = self._filter
+        innovation_filter.step(
             angle_rad,
             torque_nm,
             shear_n,
@@ -186,31 +189,37 @@ class TouchDetector:
             angle_stale=angle_stale,
             wrench_stale=wrench_stale,
         )
-        torque, shear = filter_.whitened
+        torque_innovation, shear_innovation = innovation_filter.whitened
         if not self._armed:
             if self._measuring:
-                self._squares[0] += torque * torque
-                self._squares[1] += shear * shear
+                self._squares[0] += torque_innovation * torque_innovation
+                self._squares[1] += shear_innovation * shear_innovation
                 self._ticks += 1
             return False
         torque_noise, shear_noise = self.noise
-        last, slot = self._last, self._slot
-        half = last.size >> 1
-        last[2 * slot] = last[2 * slot + half] = torque / torque_noise
-        last[2 * slot + 1] = last[2 * slot + 1 + half] = shear / shear_noise
-        compared, mean_squares = self._compared, self._mean_squares
-        self._compare(self._windows[slot], compared)
+        recent_innovations, window_slot = self._last, self._slot
+        half_length = recent_innovations.size >> 1
+        recent_innovations[2 * window_slot] = recent_innovations[2 * window_slot + half_length] = (
+            torque_innovation / torque_noise
+        )
+        recent_innovations[2 * window_slot + 1] = recent_innovations[
+            2 * window_slot + 1 + half_length
+        ] = shear_innovation / shear_noise
+        correlations, mean_squares = self._compared, self._mean_squares
+        self._compare(self._windows[window_slot], correlations)
         # A touch must not raise its own threshold: comparisons that may include it wait.
-        self._recent += _RECENT_WEIGHT * (mean_squares[slot] - self._recent)
-        mean_squares[slot] = float(compared.dot(compared)) / compared.size
-        self._slot = slot + 1 if slot + 1 < len(self._windows) else 0
-        u, v = filter_.predicted
+        self._recent += _RECENT_WEIGHT * (mean_squares[window_slot] - self._recent)
+        mean_squares[window_slot] = float(correlations.dot(correlations)) / correlations.size
+        self._slot = window_slot + 1 if window_slot + 1 < len(self._windows) else 0
+        u, v = innovation_filter.predicted
         u /= torque_noise
         v /= shear_noise
         # Finding their indices takes a third of the time of finding the values.
-        largest = max(compared[compared.argmax()], -compared[compared.argmin()])
-        error2 = self._tolerance2 * (u * u + v * v)
+        largest_correlation = max(
+            correlations[correlations.argmax()], -correlations[correlations.argmin()]
+        )
+        squared_error = self._tolerance2 * (u * u + v * v)
         # Not its root: a growing error is larger than in the moments before.
-        excess = max(1.0, self._recent) * sqrt(1.0 + error2)
-        self.level = float(largest) / (self._threshold * excess)
+        threshold_factor = max(1.0, self._recent) * sqrt(1.0 + squared_error)
+        self.level = float(largest_correlation) / (self._threshold * threshold_factor)
         return self.level > 1.0

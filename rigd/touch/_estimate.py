@@ -20,19 +20,19 @@ _POOR_MISFIT = 3.0
 earlier."""
 
 
-def estimate_touch(record: TouchRecord, model: TouchModel) -> TouchEstimate:
+def estimate_touch(touch_record: TouchRecord, model: TouchModel) -> TouchEstimate:
     """Estimate position, instant, force and stiffness of one touch from its record.
 
     For several touches with one model, prepare a `TouchEstimator`.
 
     Parameters
     ----------
-    record
+    touch_record
         Samples from 0.3 s or more before the touch.
     model
         Model of the beam.
     """
-    return TouchEstimator(model, record.rate_hz).estimate(record)
+    return TouchEstimator(model, touch_record.rate_hz).estimate(touch_record)
 
 
 class TouchEstimator:
@@ -52,56 +52,56 @@ class TouchEstimator:
         self.model = model
         self._tables = TouchTables(model, rate_hz)
 
-    def estimate(self, record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
+    def estimate(self, touch_record: TouchRecord, *, scan: bool = True) -> TouchEstimate:
         """Return the estimate of one touch from the samples so far.
 
         Parameters
         ----------
-        record
+        touch_record
             Samples from 0.3 s or more before the touch. More samples after the detection, up to
             0.2 s, improve the estimate.
         scan
             Whether the estimate contains the likelihood of all positions; otherwise it is empty.
         """
-        return self.follow().update(record, scan=scan)
+        return self.follow().update(touch_record, scan=scan)
 
     def follow(self) -> "GrowingEstimate":
-        """Return an empty estimate of one touch, to be updated while its record grows."""
+        """Return the estimator of one touch whose record still grows."""
         return GrowingEstimate(self._tables)
 
 
 class GrowingEstimate:
-    """Estimation of one touch while its record grows; each estimate starts from the previous one.
+    """Estimator of one touch from a growing record; each estimate starts from the last one.
 
     All records begin with the same sample.
 
     Parameters
     ----------
-    tables
+    touch_tables
         Precomputed quantities of the model at the record's rate.
     """
 
     __slots__ = ("_explaining_delay_s", "_searches", "_tables")
 
-    def __init__(self, tables: TouchTables) -> None:
-        self._tables = tables
+    def __init__(self, touch_tables: TouchTables) -> None:
+        self._tables = touch_tables
         self._searches: dict[float, ExplanationSearch] = {}
         self._explaining_delay_s: float | None = None
 
-    def preview(self, record: TouchRecord) -> None:
+    def preview(self, touch_record: TouchRecord) -> None:
         """Search the likely positions of the touch in advance, so that the first estimate is fast.
 
         Parameters
         ----------
-        record
+        touch_record
             Samples until `PREVIEW_S` after the detection, or some more.
         """
         for detection_delay_s in DETECTION_DELAYS_S[
             :-1
         ]:  # the last one takes long, and is hardly ever needed
-            if not self._has_enough_samples(record, detection_delay_s):
+            if not self._has_enough_samples(touch_record, detection_delay_s):
                 return
-            if not self._search(record, detection_delay_s).begins_before_window:
+            if not self._search(touch_record, detection_delay_s).begins_before_window:
                 return
 
     def update(
@@ -119,7 +119,7 @@ class GrowingEstimate:
             Whether this is the first estimate. It then tries one and two obstacles at rest only,
             because other kinds take a second, and reports any other touch as of unknown kind.
         """
-        result = None
+        latest_result = None
         searched_from = record.angle_rad.size
         # The start that explained the beginning comes first.
         for detection_delay_s in sorted(
@@ -127,61 +127,66 @@ class GrowingEstimate:
         ):
             if not self._has_enough_samples(record, detection_delay_s):
                 continue
-            search = self._search(record, detection_delay_s)
+            explanation_search = self._search(record, detection_delay_s)
             if detection_delay_s != self._explaining_delay_s and (
                 # After an unexplained one, only if the touch may have begun before.
-                search.likely_first_sample >= searched_from
+                explanation_search.likely_first_sample >= searched_from
                 or self._began_earlier(record, detection_delay_s)
             ):
                 continue
-            estimate = estimate_from_explanations(search, search.explain(first=first), scan=scan)
-            if result is None or estimate.explained:
-                result = estimate
-            if estimate.explained:
+            touch_estimate = estimate_from_explanations(
+                explanation_search, explanation_search.explain(first=first), scan=scan
+            )
+            if latest_result is None or touch_estimate.explained:
+                latest_result = touch_estimate
+            if touch_estimate.explained:
                 self._explaining_delay_s = detection_delay_s
-            if estimate.explained or first:
+            if touch_estimate.explained or first:
                 break
-            searched_from = search.first
-        return result or self._empty_estimate(record)
+            searched_from = explanation_search.first
+        return latest_result or self._empty_estimate(record)
 
-    def _has_enough_samples(self, record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether enough samples precede a touch `detection_delay_s` before detection."""
+    def _has_enough_samples(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
+        """Return whether at least 100 samples precede a touch this long before its detection."""
         return (
-            record.detected - round(detection_delay_s * self._tables.rate_hz) >= _MIN_SAMPLES_BEFORE
+            touch_record.detected - round(detection_delay_s * self._tables.rate_hz)
+            >= _MIN_SAMPLES_BEFORE
         )
 
-    def _search(self, record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
+    def _search(self, touch_record: TouchRecord, detection_delay_s: float) -> ExplanationSearch:
         """Return the search for explanations of a record, for one time from touch to detection.
 
         It starts from the results with the previous, shorter record.
         """
         previous_search = self._searches.get(detection_delay_s)
-        if previous_search is None or previous_search.given is not record:
+        if previous_search is None or previous_search.given is not touch_record:
             self._searches[detection_delay_s] = ExplanationSearch(
-                self._tables, record, detection_delay_s, previous_search
+                self._tables, touch_record, detection_delay_s, previous_search
             )
         return self._searches[detection_delay_s]
 
-    def _began_earlier(self, record: TouchRecord, detection_delay_s: float) -> bool:
-        """Return whether the touch seems to begin before the samples that may contain it."""
+    def _began_earlier(self, touch_record: TouchRecord, detection_delay_s: float) -> bool:
+        """Return whether a touch seems to begin before `detection_delay_s` ahead of detection."""
         if detection_delay_s == DETECTION_DELAYS_S[-1]:
             return False
-        search = self._search(record, detection_delay_s)
-        if search.begins_before_window:
+        explanation_search = self._search(touch_record, detection_delay_s)
+        if explanation_search.begins_before_window:
             return True
         longer_delay_s = DETECTION_DELAYS_S[DETECTION_DELAYS_S.index(detection_delay_s) + 1]
-        if search.misfit < _POOR_MISFIT or not self._has_enough_samples(record, longer_delay_s):
+        if explanation_search.misfit < _POOR_MISFIT or not self._has_enough_samples(
+            touch_record, longer_delay_s
+        ):
             return False
-        longer_search = self._search(record, longer_delay_s)
+        longer_search = self._search(touch_record, longer_delay_s)
         return (
-            longer_search.likely_first_sample < search.first
-            and longer_search.misfit < 0.5 * search.misfit
+            longer_search.likely_first_sample < explanation_search.first
+            and longer_search.misfit < 0.5 * explanation_search.misfit
         )
 
-    def _empty_estimate(self, record: TouchRecord) -> TouchEstimate:
+    def _empty_estimate(self, touch_record: TouchRecord) -> TouchEstimate:
         """Return the estimate without any result, for a record with too few samples."""
-        empty = np.zeros(0)
-        channels = 1 if record.shear_n is None else 2
+        empty_array = np.zeros(0)
+        channel_count = 1 if touch_record.shear_n is None else 2
         return TouchEstimate(
             x_m=None,
             time_s=None,
@@ -189,13 +194,13 @@ class GrowingEstimate:
             stiffness_n_per_m=None,
             kind="unknown",
             model=self._tables.model.source,
-            channels=channels,
-            samples=record.angle_rad.size - record.detected,
+            channels=channel_count,
+            samples=touch_record.angle_rad.size - touch_record.detected,
             chi2_per_degree=np.nan,
-            positions_m=empty,
-            log_likelihood=empty,
-            innovations=np.zeros((channels, 0)),
-            innovation_times_s=empty,
-            force_history_n=empty,
-            force_times_s=empty,
+            positions_m=empty_array,
+            log_likelihood=empty_array,
+            innovations=np.zeros((channel_count, 0)),
+            innovation_times_s=empty_array,
+            force_history_n=empty_array,
+            force_times_s=empty_array,
         )

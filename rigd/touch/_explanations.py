@@ -94,7 +94,7 @@ _STIFFNESSES = np.array([300.0, 3000.0, 30000.0])
 
 @dataclass(frozen=True, slots=True)
 class Explanation:
-    """Best explanation of a touch's record by obstacles of one kind."""
+    """Explanation of a touch's record by one kind of obstacle, with its parameters and misfit."""
 
     kind: str
     """Kind of obstacle: rigid, moving, yielding, two or knock."""
@@ -121,13 +121,13 @@ class ExplainedRecord:
 
 
 class ExplanationSearch:
-    """Search for the obstacles that explain the record of one touch.
+    """Search for the kinds and parameters of obstacles that explain the record of one touch.
 
     Parameters
     ----------
-    tables
+    touch_tables
         Precomputed tables of the model at the record's rate.
-    record
+    touch_record
         Samples from 0.3 s or more before the touch.
     detection_delay_s
         Longest time in s from the touch to its detection.
@@ -138,35 +138,37 @@ class ExplanationSearch:
 
     def __init__(
         self,
-        tables: TouchTables,
-        record: TouchRecord,
+        touch_tables: TouchTables,
+        touch_record: TouchRecord,
         detection_delay_s: float,
         previous_search: "ExplanationSearch | None" = None,
     ) -> None:
-        rate = tables.rate_hz
-        self.tables, self.rate, self.given = tables, rate, record
-        self.begin = max(0, record.detected - round(HISTORY_S * rate))
-        end = min(record.angle_rad.size, record.detected + round(FINAL_S * rate))
+        rate_hz = touch_tables.rate_hz
+        self.tables, self.rate, self.given = touch_tables, rate_hz, touch_record
+        self.begin = max(0, touch_record.detected - round(HISTORY_S * rate_hz))
+        record_end = min(
+            touch_record.angle_rad.size, touch_record.detected + round(FINAL_S * rate_hz)
+        )
         self.record = TouchRecord(
-            rate,
-            record.angle_rad[self.begin : end],
-            record.torque_nm[self.begin : end],
-            None if record.shear_n is None else record.shear_n[self.begin : end],
-            record.detected - self.begin,
+            rate_hz,
+            touch_record.angle_rad[self.begin : record_end],
+            touch_record.torque_nm[self.begin : record_end],
+            None if touch_record.shear_n is None else touch_record.shear_n[self.begin : record_end],
+            touch_record.detected - self.begin,
         )
         self.detected = self.record.detected
-        self.quiet = self.detected - round(detection_delay_s * rate)
-        self.motion = tables.free.motion(self.record, self.quiet, self.quiet - 4)
+        self.quiet = self.detected - round(detection_delay_s * rate_hz)
+        self.motion = touch_tables.free.motion(self.record, self.quiet, self.quiet - 4)
         self.available = self.record.angle_rad.size - self.detected
-        self.edges = (float(tables.x_m[0]) + 0.002, float(tables.x_m[-1]))
+        self.edges = (float(touch_tables.x_m[0]) + 0.002, float(touch_tables.x_m[-1]))
         self.deviations: Real | None = None
         self._uncertainties_s = 0.0
-        whole_grid = previous_search is not None and previous_search.available >= round(
-            GRID_COMPARISON_S * rate
+        covers_grid = previous_search is not None and previous_search.available >= round(
+            GRID_COMPARISON_S * rate_hz
         )
         self._grid_candidates: Real = (
             previous_search._grid_candidates
-            if previous_search and whole_grid
+            if previous_search and covers_grid
             else self._best_of_grid()
         )
         self._at_rest: tuple[Explanation, float] | None
@@ -185,8 +187,8 @@ class ExplanationSearch:
     @property
     def likely_first_sample(self) -> int:
         """Index of the sample before which the likeliest touch of the grid search begins."""
-        after_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
-        return self.first + round(after_s * self.rate)
+        after_quiet_s = float(self.starts[0, 1] - self.motion.t[self.quiet])
+        return self.first + round(after_quiet_s * self.rate)
 
     @property
     def misfit(self) -> float:
@@ -198,24 +200,26 @@ class ExplanationSearch:
 
         With `first` set, other kinds than obstacles at rest are not tried, because that takes long.
         """
-        at_rest, window, two_obstacles, later_samples_contradict = self._explain_in_stages()
-        explanations = [at_rest]
+        resting_explanation, sample_window, two_obstacles, later_samples_contradict = (
+            self._explain_in_stages()
+        )
+        explanations = [resting_explanation]
         other_kinds_untried = False
         if two_obstacles is None:
             needs_other_kinds = not self.fits(
-                at_rest, window, POOR_FIT_STDS
-            ) or self._may_move_or_yield(at_rest, window)
+                resting_explanation, sample_window, POOR_FIT_STDS
+            ) or self._may_move_or_yield(resting_explanation, sample_window)
             if needs_other_kinds and first:
                 other_kinds_untried = True
             elif needs_other_kinds:
-                explanations += self._explain_by_other_kinds(window)
-            if self.fits(at_rest, window):
-                two_obstacles = self._explain_by_two(at_rest, window)
+                explanations += self._explain_by_other_kinds(sample_window)
+            if self.fits(resting_explanation, sample_window):
+                two_obstacles = self._explain_by_two(resting_explanation, sample_window)
         if two_obstacles is not None:
             explanations.append(two_obstacles)
         return ExplainedRecord(
             explanations,
-            window,
+            sample_window,
             later_samples_contradict=later_samples_contradict,
             other_kinds_untried=other_kinds_untried,
         )
@@ -229,69 +233,97 @@ class ExplanationSearch:
         following samples contradict the first explanation.
         """
         available_s = self.available / self.rate
-        stages = [seconds for seconds in _STAGES_S if _MIN_STAGE_GROWTH * seconds <= available_s]
-        stages.append(available_s)
+        stage_ends_s = [
+            stage_end_s
+            for stage_end_s in _STAGES_S
+            if _MIN_STAGE_GROWTH * stage_end_s <= available_s
+        ]
+        stage_ends_s.append(available_s)
         previous_stage: tuple[Explanation, WhitenedWindow] | None = None
         if self._at_rest is None:
-            starts = self._add_neighbours(_distinct_minima(self._first_minima))
+            start_candidates = self._add_neighbours(_distinct_minima(self._first_minima))
         else:
             at_rest, explained_s = self._at_rest
-            stages = [seconds for seconds in stages if seconds > explained_s]
-            starts = self._next_candidates(at_rest)
-            self._include_uncertainties(starts, max([explained_s, *stages[:1]]))
-            window = self.window(explained_s)
-            [chi2] = chi2_of(self.predictor(starts[:1]), window, starts[:1])
-            previous_stage = replace(at_rest, chi2=float(chi2)), window
+            stage_ends_s = [
+                stage_end_s for stage_end_s in stage_ends_s if stage_end_s > explained_s
+            ]
+            start_candidates = self._next_candidates(at_rest)
+            self._include_uncertainties(start_candidates, max([explained_s, *stage_ends_s[:1]]))
+            stage_window = self.window(explained_s)
+            [previous_chi2] = chi2_of(
+                self.predictor(start_candidates[:1]), stage_window, start_candidates[:1]
+            )
+            previous_stage = replace(at_rest, chi2=float(previous_chi2)), stage_window
             if self._is_sufficient(*previous_stage, explained_s):
-                stages = []
-        for seconds in stages:
-            self._include_uncertainties(starts, seconds)
-            window = self.window(seconds)
+                stage_ends_s = []
+        for stage_end_s in stage_ends_s:
+            self._include_uncertainties(start_candidates, stage_end_s)
+            stage_window = self.window(stage_end_s)
             at_rest = self.explain_by_kind(
-                "rigid", self.predictor(starts), window, starts, self.space(3)
+                "rigid",
+                self.predictor(start_candidates),
+                stage_window,
+                start_candidates,
+                self.space(3),
             )
             if previous_stage is not None and self._later_samples_fit_worse(
-                at_rest, window, *previous_stage
+                at_rest, stage_window, *previous_stage
             ):
-                two_obstacles = self._explain_by_two(at_rest, window)
-                if two_obstacles is not None and self.fits(two_obstacles, window, POOR_FIT_STDS):
-                    return at_rest, window, two_obstacles, False
+                two_obstacles = self._explain_by_two(at_rest, stage_window)
+                if two_obstacles is not None and self.fits(
+                    two_obstacles, stage_window, POOR_FIT_STDS
+                ):
+                    return at_rest, stage_window, two_obstacles, False
                 # In still later bounces the search may miss the minimum: they decide no kind.
-                contradicts = seconds <= _UNCERTAINTIES_S and self._may_move_or_yield(
-                    at_rest, window
+                is_contradicted = stage_end_s <= _UNCERTAINTIES_S and self._may_move_or_yield(
+                    at_rest, stage_window
                 )
-                return *previous_stage, None, contradicts
-            previous_stage = at_rest, window
-            self._at_rest = at_rest, seconds
-            if self._is_sufficient(at_rest, window, seconds):
+                return *previous_stage, None, is_contradicted
+            previous_stage = at_rest, stage_window
+            self._at_rest = at_rest, stage_end_s
+            if self._is_sufficient(at_rest, stage_window, stage_end_s):
                 break
-            starts = self._next_candidates(at_rest)
+            start_candidates = self._next_candidates(at_rest)
         assert previous_stage is not None  # there is at least one stage, or an earlier one
         return *previous_stage, None, False
 
-    def _is_sufficient(self, at_rest: Explanation, window: WhitenedWindow, seconds: float) -> bool:
-        """Return whether a longer part of the record would not improve the estimate."""
-        x_m = at_rest.posterior.mean(0)
+    def _is_sufficient(
+        self,
+        resting_explanation: Explanation,
+        sample_window: WhitenedWindow,
+        after_detection_s: float,
+    ) -> bool:
+        """Return whether a longer part of the record would not improve a touch's estimate."""
+        x_m = resting_explanation.posterior.mean(0)
         is_precise = (
-            at_rest.posterior.std(0) < _PRECISE_STD_M or x_m > _TIP_FRACTION * self.edges[1]
+            resting_explanation.posterior.std(0) < _PRECISE_STD_M
+            or x_m > _TIP_FRACTION * self.edges[1]
         )
-        return seconds > FIRST_S and bool(is_precise or not self.fits(at_rest, window))
+        return after_detection_s > FIRST_S and bool(
+            is_precise or not self.fits(resting_explanation, sample_window)
+        )
 
-    def _include_uncertainties(self, likeliest: Real, seconds: float) -> None:
-        """Compute the effects of all uncertainties up to `seconds` after the detection.
+    def _include_uncertainties(self, likely_obstacle: Real, after_detection_s: float) -> None:
+        """Compute the effects of all uncertainties up to `after_detection_s` after the detection.
 
-        They are computed for the first candidate of `likeliest`, unless this was done before.
+        They are computed for the first candidate of `likely_obstacle`, unless this was done before.
         """
-        if self._uncertainties_s < seconds:
-            self._uncertainties_s = min(max(seconds, _UNCERTAINTIES_S), self.available / self.rate)
-            whole = WhitenedWindow.from_motion(
+        if self._uncertainties_s < after_detection_s:
+            self._uncertainties_s = min(
+                max(after_detection_s, _UNCERTAINTIES_S), self.available / self.rate
+            )
+            whole_window = WhitenedWindow.from_motion(
                 self.motion, self.quiet, self.end(self._uncertainties_s)
             )
-            self.deviations = uncertainty_effects(self.tables, self.record, likeliest[:1], whole)
+            self.deviations = uncertainty_effects(
+                self.tables, self.record, likely_obstacle[:1], whole_window
+            )
 
-    def _next_candidates(self, at_rest: Explanation) -> Real:
-        """Return candidates for a longer part of the record, from the result for a shorter part."""
-        return np.vstack([at_rest.parameters, self._draw_candidates(at_rest.posterior)])
+    def _next_candidates(self, resting_explanation: Explanation) -> Real:
+        """Return candidate obstacles for a longer part of the record, from a shorter part."""
+        return np.vstack(
+            [resting_explanation.parameters, self._draw_candidates(resting_explanation.posterior)]
+        )
 
     @cached_property
     def any_force(self) -> AnyForceLikelihood:
@@ -303,26 +335,30 @@ class ExplanationSearch:
 
     # Data for the comparison of candidates
 
-    def window(self, seconds: float) -> WhitenedWindow:
-        """Return the whitened innovations from before the touch to a time after the detection."""
+    def window(self, after_detection_s: float) -> WhitenedWindow:
+        """Return the whitened innovations from before a touch to a time after its detection."""
         return WhitenedWindow.from_motion(
-            self.motion, self.quiet, self.end(seconds), self.deviations
+            self.motion, self.quiet, self.end(after_detection_s), self.deviations
         )
 
-    def end(self, seconds: float) -> int:
+    def end(self, after_detection_s: float) -> int:
         """Return the index of the sample at a time after the detection, or the record's end."""
-        return self.detected + min(self.available, round(seconds * self.rate))
+        return self.detected + min(self.available, round(after_detection_s * self.rate))
 
-    def space(self, width: int) -> ParameterRanges:
-        """Return the ranges of the first `width` parameters of `OBSTACLE_PARAMETERS`."""
+    def space(self, parameter_count: int) -> ParameterRanges:
+        """Return the allowed ranges of the first `parameter_count` of the `OBSTACLE_PARAMETERS`."""
         t = self.motion.t
         return ParameterRanges(
-            low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[:width],
-            high=np.array([self.edges[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0])[:width],
-            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:width],
-            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:width],
-            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:width],
-            largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:width],
+            low=np.array([self.edges[0], t[self.quiet + 1], MIN_LN_STIFFNESS, -3.0, 0.0])[
+                :parameter_count
+            ],
+            high=np.array([self.edges[1], t[self.detected], MAX_LN_STIFFNESS, 3.0, 50.0])[
+                :parameter_count
+            ],
+            difference=np.array([2e-4, 2e-5, 2e-2, 2e-3, 2e-3])[:parameter_count],
+            scale=np.array([3e-3, 1e-3, 1.0, 0.1, 0.1])[:parameter_count],
+            smallest_std=np.array([1.5e-4, 1e-5, 2e-2, 5e-3, 5e-3])[:parameter_count],
+            largest_std=np.array([0.02, 2e-3, 1.0, 0.3, 0.3])[:parameter_count],
         )
 
     def predictor(self, rows: Real, *, first: bool = False) -> Prediction:
@@ -332,26 +368,28 @@ class ExplanationSearch:
         they are twice as long elsewhere, for a first search.
         """
         tables = self.tables
-        tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
-        kernels = tables.finest if tip else tables.coarse if first else tables.middle
-        contact = ObstacleContact(kernels, tables.x_m, self.motion)
-        return lambda candidates, window: contact.predict(candidates, window)[0]
+        is_near_tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
+        kernels = tables.finest if is_near_tip else tables.coarse if first else tables.middle
+        obstacle_contact = ObstacleContact(kernels, tables.x_m, self.motion)
+        return lambda candidates, window: obstacle_contact.predict(candidates, window)[0]
 
     # Springy obstacle at rest
 
     def _best_of_grid(self) -> Real:
-        """Return the four likeliest candidates of the grid for each position."""
-        window = self.window(GRID_COMPARISON_S)
-        grid = self.tables.starts(window.end - window.first)
-        starts, chi2 = grid.integrate(self.motion, window, self.detected)
-        starts = starts[np.lexsort((chi2, starts[:, 0]))]
-        count = starts.shape[0] // np.unique(starts[:, 0]).size
-        best: Real = starts.reshape(-1, count, 3)[:, :4].reshape(-1, 3)
-        return best
+        """Return the grid's four likeliest obstacle parameters (k, 3) for each position."""
+        grid_window = self.window(GRID_COMPARISON_S)
+        candidate_grid = self.tables.starts(grid_window.end - grid_window.first)
+        grid_candidates, chi2 = candidate_grid.integrate(self.motion, grid_window, self.detected)
+        grid_candidates = grid_candidates[np.lexsort((chi2, grid_candidates[:, 0]))]
+        candidates_per_position = grid_candidates.shape[0] // np.unique(grid_candidates[:, 0]).size
+        best_candidates: Real = grid_candidates.reshape(-1, candidates_per_position, 3)[
+            :, :4
+        ].reshape(-1, 3)
+        return best_candidates
 
     @cached_property
     def _first_samples(self) -> WhitenedWindow:
-        """Whitened innovations with which the grid's candidates are compared.
+        """Whitened innovations of the first samples, with which the grid's candidates are compared.
 
         The effects of uncertainties through the contact are not included yet.
         """
@@ -360,9 +398,9 @@ class ExplanationSearch:
     @cached_property
     def starts(self) -> Real:
         """The 12 likeliest obstacles at rest of the grid, compared over more samples."""
-        coarse = ObstacleContact(self.tables.coarse, self.tables.x_m, self.motion)
+        coarse_contact = ObstacleContact(self.tables.coarse, self.tables.x_m, self.motion)
         chi2 = chi2_of(
-            lambda rows, window: coarse.predict(rows, window)[0],
+            lambda rows, window: coarse_contact.predict(rows, window)[0],
             self._first_samples,
             self._grid_candidates,
         )
@@ -370,105 +408,128 @@ class ExplanationSearch:
 
     @cached_property
     def _first_minima(self) -> Minima:
-        """Minima that least squares found from the likeliest candidates, in longer time steps."""
-        predict = self.predictor(self.starts, first=True)
-        return find_minima(predict, self._first_samples, self.starts, self.space(3), rounds=7)
+        """Local minima of the squared residuals near the grid's likeliest obstacles at rest."""
+        predict_effect = self.predictor(self.starts, first=True)
+        return find_minima(
+            predict_effect, self._first_samples, self.starts, self.space(3), rounds=7
+        )
 
-    def _add_neighbours(self, starts: Real) -> Real:
-        """Return candidates, with further ones nearby if they are close to the beam's tip.
+    def _add_neighbours(self, candidates: Real) -> Real:
+        """Return the candidate obstacles, with further ones nearby if they are close to the tip.
 
         Minima are close together there.
         """
-        if np.median(starts[:, 0]) <= NEAR_TIP_FRACTION * self.tables.model.beam.length_m:
-            return starts
-        nearby = np.repeat(starts[None, :2], _NEARBY_OFFSETS_M.size, axis=0)
-        nearby[:, :, 0] = np.clip(nearby[:, :, 0] + _NEARBY_OFFSETS_M[:, None], *self.edges)
-        return np.vstack([starts, nearby.reshape(-1, starts.shape[1])])
+        if np.median(candidates[:, 0]) <= NEAR_TIP_FRACTION * self.tables.model.beam.length_m:
+            return candidates
+        nearby_candidates = np.repeat(candidates[None, :2], _NEARBY_OFFSETS_M.size, axis=0)
+        nearby_candidates[:, :, 0] = np.clip(
+            nearby_candidates[:, :, 0] + _NEARBY_OFFSETS_M[:, None], *self.edges
+        )
+        return np.vstack([candidates, nearby_candidates.reshape(-1, candidates.shape[1])])
 
     def _draw_candidates(self, posterior: Posterior) -> Real:
-        """Return random candidates for a longer window, from the posterior of a shorter window."""
+        """Return random obstacle parameters (k, p) from the posterior of a shorter window."""
         rng = np.random.default_rng(1)
-        chosen = posterior.samples[
+        drawn_candidates = posterior.samples[
             rng.choice(posterior.weights.size, _RANDOM_CANDIDATES, p=posterior.weights)
         ]
-        width = chosen.shape[1]
-        space = self.space(width)
-        spread = np.array([max(posterior.std(i), space.smallest_std[i]) for i in range(width)])
+        parameter_count = drawn_candidates.shape[1]
+        parameter_ranges = self.space(parameter_count)
+        random_spread = np.array(
+            [
+                max(posterior.std(i), parameter_ranges.smallest_std[i])
+                for i in range(parameter_count)
+            ]
+        )
         return np.clip(
-            chosen + 0.5 * spread * rng.standard_normal(chosen.shape), space.low, space.high
+            drawn_candidates + 0.5 * random_spread * rng.standard_normal(drawn_candidates.shape),
+            parameter_ranges.low,
+            parameter_ranges.high,
         )
 
     def explain_by_kind(
         self,
         kind: str,
-        predict: Prediction,
-        window: WhitenedWindow,
-        starts: Real,
-        space: ParameterRanges,
+        predict_effect: Prediction,
+        sample_window: WhitenedWindow,
+        start_candidates: Real,
+        parameter_ranges: ParameterRanges,
     ) -> Explanation:
         """Return the explanation by one kind of obstacle: search for minima, and sample around."""
-        if starts.shape[0] > 12:
-            starts = starts[np.argsort(chi2_of(predict, window, starts))[:12]]
-        minima = find_minima(predict, window, starts, space, rounds=9)
-        return self._explain_from_minima(kind, predict, window, minima, space)
+        if start_candidates.shape[0] > 12:
+            start_candidates = start_candidates[
+                np.argsort(chi2_of(predict_effect, sample_window, start_candidates))[:12]
+            ]
+        minima = find_minima(
+            predict_effect, sample_window, start_candidates, parameter_ranges, rounds=9
+        )
+        return self._explain_from_minima(
+            kind, predict_effect, sample_window, minima, parameter_ranges
+        )
 
     def _explain_from_minima(
         self,
         kind: str,
-        predict: Prediction,
-        window: WhitenedWindow,
-        minima: Minima,
-        space: ParameterRanges,
+        predict_effect: Prediction,
+        sample_window: WhitenedWindow,
+        local_minima: Minima,
+        parameter_ranges: ParameterRanges,
         variance_factor: float = 1.0,
     ) -> Explanation:
-        """Return an explanation with samples of the posterior around the minima in `minima`.
+        """Return an explanation with samples of the posterior around the minima in `local_minima`.
 
         `variance_factor` is a factor on the variance of the residuals.
         """
-        width = minima.parameters.shape[1]
-        near_best = np.flatnonzero(minima.chi2 < minima.chi2.min() + 30)
+        parameter_count = local_minima.parameters.shape[1]
+        near_best_indices = np.flatnonzero(local_minima.chi2 < local_minima.chi2.min() + 30)
         covariances = np.array(
             [
                 np.linalg.inv(
-                    minima.jacobian[k].T @ minima.jacobian[k] + np.diag(1 / space.largest_std**2)
+                    local_minima.jacobian[k].T @ local_minima.jacobian[k]
+                    + np.diag(1 / parameter_ranges.largest_std**2)
                 )
-                + np.diag(space.smallest_std**2)
-                for k in near_best
+                + np.diag(parameter_ranges.smallest_std**2)
+                for k in near_best_indices
             ]
         )
-        degrees = max(window.data.size - width, 1)
+        degrees = max(sample_window.data.size - parameter_count, 1)
         posterior = sample_posterior(
-            lambda rows: chi2_of(predict, window, rows),
-            minima.parameters[near_best],
+            lambda rows: chi2_of(predict_effect, sample_window, rows),
+            local_minima.parameters[near_best_indices],
             covariances,
-            (space.low, space.high),
-            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, minima.chi2.min() / degrees),
+            (parameter_ranges.low, parameter_ranges.high),
+            scale=variance_factor * max(_MIN_RESIDUAL_VARIANCE, local_minima.chi2.min() / degrees),
             count=120,
             rounds=5,
             enough_samples=150.0,
-            smallest_std=space.smallest_std,
+            smallest_std=parameter_ranges.smallest_std,
         )
-        best = int(np.argmin(posterior.chi2))
-        return Explanation(kind, posterior, posterior.samples[best], float(posterior.chi2[best]))
+        best_index = int(np.argmin(posterior.chi2))
+        return Explanation(
+            kind, posterior, posterior.samples[best_index], float(posterior.chi2[best_index])
+        )
 
     # Other kinds
 
     def fits(
-        self, explanation: Explanation, window: WhitenedWindow, max_stds: float = _MAX_MISFIT_STDS
+        self,
+        explanation: Explanation,
+        sample_window: WhitenedWindow,
+        max_stds: float = _MAX_MISFIT_STDS,
     ) -> bool:
-        """Return whether an explanation's residuals are no larger than noise.
+        """Return whether the residuals of a touch's explanation are no larger than noise.
 
         `max_stds` is the number of standard deviations by which they may exceed their expectation.
         """
-        return bool(explanation.chi2 < self.max_chi2(window.data.size, max_stds))
+        return bool(explanation.chi2 < self.max_chi2(sample_window.data.size, max_stds))
 
-    def max_chi2(self, degrees: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
+    def max_chi2(self, expected_chi2: int, max_stds: float = _MAX_MISFIT_STDS) -> float:
         """Return the largest sum of squared residuals that noise explains.
 
-        `degrees` is its expectation, and `max_stds` the allowed number of standard deviations.
+        `expected_chi2` is its expectation, and `max_stds` the allowed standard deviations.
         """
-        of_noise = 2 * degrees**2 / (self.quiet * self.motion.noise.size)
-        return float(degrees + max_stds * np.sqrt(2 * degrees + of_noise))
+        noise_variance = 2 * expected_chi2**2 / (self.quiet * self.motion.noise.size)
+        return float(expected_chi2 + max_stds * np.sqrt(2 * expected_chi2 + noise_variance))
 
     def _later_samples_fit_worse(
         self,
@@ -477,90 +538,144 @@ class ExplanationSearch:
         shorter_explanation: Explanation,
         shorter_window: WhitenedWindow,
     ) -> bool:
-        """Return whether a shorter window is explained, but not the samples of a longer one."""
+        """Return whether a shorter window is explained, but not the samples added to it."""
         added_samples = longer_window.data.size - shorter_window.data.size
         added_chi2 = longer_explanation.chi2 - shorter_explanation.chi2
         return self.fits(shorter_explanation, shorter_window) and added_chi2 > self.max_chi2(
             added_samples, _MAX_LATER_MISFIT_STDS
         )
 
-    def _may_move_or_yield(self, at_rest: Explanation, window: WhitenedWindow) -> bool:
+    def _may_move_or_yield(
+        self, resting_explanation: Explanation, sample_window: WhitenedWindow
+    ) -> bool:
         """Return whether a moving or yielding obstacle is clearly likelier than one at rest."""
-        extra = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
-        starts = np.hstack([np.tile(at_rest.parameters, (len(extra), 1)), extra])
-        free = np.hstack([np.ones((len(extra), at_rest.parameters.size), dtype=bool), extra != 0])
-        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        side = contact.pressing_direction(at_rest.parameters)
+        motion_parameters = np.array([[-0.05, 0.0], [0.05, 0.0], [0.0, 0.02]])
+        start_candidates = np.hstack(
+            [
+                np.tile(resting_explanation.parameters, (len(motion_parameters), 1)),
+                motion_parameters,
+            ]
+        )
+        is_free = np.hstack(
+            [
+                np.ones((len(motion_parameters), resting_explanation.parameters.size), dtype=bool),
+                motion_parameters != 0,
+            ]
+        )
+        obstacle_contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        pressing_side = obstacle_contact.pressing_direction(resting_explanation.parameters)
         minima = find_minima(
-            lambda candidates, window: contact.predict(candidates, window, side)[0],
-            window,
-            starts,
+            lambda candidates, sample_window: obstacle_contact.predict(
+                candidates, sample_window, pressing_side
+            )[0],
+            sample_window,
+            start_candidates,
             self.space(5),
             rounds=5,
-            free=free,
+            free=is_free,
         )
-        return bool(minima.chi2.min() < at_rest.chi2 - CHANCE_CHI2_REDUCTION)
+        return bool(minima.chi2.min() < resting_explanation.chi2 - CHANCE_CHI2_REDUCTION)
 
-    def _explain_by_other_kinds(self, window: WhitenedWindow) -> list[Explanation]:
+    def _explain_by_other_kinds(self, sample_window: WhitenedWindow) -> list[Explanation]:
         """Return the explanations of the window by a moving or yielding obstacle, and a knock."""
-        any_force, side = self.any_force, self.pressing_direction()
+        any_force, pressing_side = self.any_force, self.pressing_direction()
         likeliest_positions = any_force.x_m[np.argsort(-any_force.log_likelihood)[:24]]
-        instants = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
+        touch_instants_s = self.motion.t[self.quiet + 2 : self.detected + 1 : 2]
         explanations = []
-        for kind, extra in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
-            grid = np.meshgrid(
-                likeliest_positions, instants, np.log(_STIFFNESSES), extra, indexing="ij"
+        for obstacle_kind, motion_values in (("moving", _RATES_M_PER_S), ("yielding", _MOBILITIES)):
+            start_grid = np.meshgrid(
+                likeliest_positions,
+                touch_instants_s,
+                np.log(_STIFFNESSES),
+                motion_values,
+                indexing="ij",
             )
-            starts = np.stack([each.ravel() for each in grid], axis=1)
-            coarse = self._moving_predictor(kind, self.tables.coarse, side)
-            for span, count in ((GRID_COMPARISON_S, 80), (FIRST_S, 10)):
-                chi2 = chi2_of(coarse, self.window(span), starts)
-                starts = starts[np.argsort(chi2)[:count]]
-            predict, space = (
-                self._moving_predictor(kind, self.tables.middle, side),
-                self._moving_space(kind),
+            start_candidates = np.stack([minima_part.ravel() for minima_part in start_grid], axis=1)
+            coarse_predictor = self._moving_predictor(
+                obstacle_kind, self.tables.coarse, pressing_side
             )
-            if window.end > self.end(FIRST_S):
-                early_minima = find_minima(predict, self.window(FIRST_S), starts, space, rounds=6)
-                starts = early_minima.parameters
-            explanations.append(self.explain_by_kind(kind, predict, window, starts, space))
-        contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
-        knock = KnockResponse(contact, self.tables.middle, 2)
-        starts = knock.starts(self.window(FIRST_S), self.detected, 10)
-        ranges = self.space(3)
-        space = knock.space(self.edges, (ranges.low[1], ranges.high[1]))
-        explanations.append(self.explain_by_kind("knock", knock.predict, window, starts, space))
+            for column_span, candidate_count in ((GRID_COMPARISON_S, 80), (FIRST_S, 10)):
+                chi2 = chi2_of(coarse_predictor, self.window(column_span), start_candidates)
+                start_candidates = start_candidates[np.argsort(chi2)[:candidate_count]]
+            predict_effect, parameter_ranges = (
+                self._moving_predictor(obstacle_kind, self.tables.middle, pressing_side),
+                self._moving_space(obstacle_kind),
+            )
+            if sample_window.end > self.end(FIRST_S):
+                early_minima = find_minima(
+                    predict_effect,
+                    self.window(FIRST_S),
+                    start_candidates,
+                    parameter_ranges,
+                    rounds=6,
+                )
+                start_candidates = early_minima.parameters
+            explanations.append(
+                self.explain_by_kind(
+                    obstacle_kind, predict_effect, sample_window, start_candidates, parameter_ranges
+                )
+            )
+        obstacle_contact = ObstacleContact(self.tables.middle, self.tables.x_m, self.motion)
+        knock_response = KnockResponse(obstacle_contact, self.tables.middle, 2)
+        start_candidates = knock_response.starts(self.window(FIRST_S), self.detected, 10)
+        obstacle_ranges = self.space(3)
+        parameter_ranges = knock_response.space(
+            self.edges, (obstacle_ranges.low[1], obstacle_ranges.high[1])
+        )
+        explanations.append(
+            self.explain_by_kind(
+                "knock", knock_response.predict, sample_window, start_candidates, parameter_ranges
+            )
+        )
         return explanations
 
     def pairing(self) -> TwoObstacleContact:
-        """Return the integration of the contact with two obstacles for this record."""
+        """Return the model of the contact with two obstacles for this record."""
         tables = self.tables
-        contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
-        return TwoObstacleContact(contact, tables.coarse, tables.crossing)
+        obstacle_contact = ObstacleContact(tables.coarse, tables.x_m, self.motion)
+        return TwoObstacleContact(obstacle_contact, tables.coarse, tables.crossing)
 
-    def _explain_by_two(self, at_rest: Explanation, window: WhitenedWindow) -> Explanation | None:
+    def _explain_by_two(
+        self, resting_explanation: Explanation, sample_window: WhitenedWindow
+    ) -> Explanation | None:
         """Return the explanation by two obstacles, or None if one obstacle explains as much."""
-        pairing = self.pairing()
-        space = pairing.space(self.space(3))
+        two_contacts = self.pairing()
+        parameter_ranges = two_contacts.space(self.space(3))
         # The first samples show in less time whether more iterations are worthwhile.
-        early = self.window(_UNCERTAINTIES_S) if window.end > self.end(_UNCERTAINTIES_S) else window
-        starts = pairing.starts(at_rest.parameters, early, space, 2)
-        minima = find_minima(pairing.predict_channels, early, starts, space, rounds=4)
-        single_obstacle = at_rest.parameters[None]
+        early_window = (
+            self.window(_UNCERTAINTIES_S)
+            if sample_window.end > self.end(_UNCERTAINTIES_S)
+            else sample_window
+        )
+        start_pairs = two_contacts.starts(
+            resting_explanation.parameters, early_window, parameter_ranges, 2
+        )
+        minima = find_minima(
+            two_contacts.predict_channels, early_window, start_pairs, parameter_ranges, rounds=4
+        )
+        single_obstacle = resting_explanation.parameters[None]
         if (
             minima.chi2.min()
-            > chi2_of(self.predictor(single_obstacle), early, single_obstacle)[0] - _MIN_EARLY_GAIN
+            > chi2_of(self.predictor(single_obstacle), early_window, single_obstacle)[0]
+            - _MIN_EARLY_GAIN
         ):
             return None
         likeliest = minima.parameters[np.argsort(minima.chi2)[:3]]
-        starts = np.vstack([likeliest, pairing.in_reverse_order(likeliest[:1])])
-        minima = find_minima(pairing.predict_channels, window, starts, space, rounds=8)
-        gain = at_rest.chi2 - minima.chi2.min()
-        if gain < _MIN_TWO_OBSTACLES_GAIN:
+        start_pairs = np.vstack([likeliest, two_contacts.in_reverse_order(likeliest[:1])])
+        minima = find_minima(
+            two_contacts.predict_channels, sample_window, start_pairs, parameter_ranges, rounds=8
+        )
+        chi2_gain = resting_explanation.chi2 - minima.chi2.min()
+        if chi2_gain < _MIN_TWO_OBSTACLES_GAIN:
             return None
-        variance_factor = _TWO_OBSTACLES_VARIANCE if gain > DECISIVE_CHI2_DIFFERENCE else 1.0
+        variance_factor = _TWO_OBSTACLES_VARIANCE if chi2_gain > DECISIVE_CHI2_DIFFERENCE else 1.0
         return self._explain_from_minima(
-            "two", pairing.predict_channels, window, minima, space, variance_factor
+            "two",
+            two_contacts.predict_channels,
+            sample_window,
+            minima,
+            parameter_ranges,
+            variance_factor,
         )
 
     def pressing_direction(self) -> float:
@@ -570,39 +685,46 @@ class ExplanationSearch:
         """
         return -1.0 if self.any_force.force_n.sum() > 0 else 1.0
 
-    def _moving_predictor(self, kind: str, kernels: ContactKernels, side: float) -> Prediction:
+    def _moving_predictor(
+        self, kind: str, kernels: ContactKernels, pressing_side: float
+    ) -> Prediction:
         """Return the function that predicts the effect of moving or yielding obstacles.
 
         Their fourth parameter is the speed or the mobility.
         """
-        contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
+        obstacle_contact = ObstacleContact(kernels, self.tables.x_m, self.motion)
 
-        def predict(candidates: Real, window: WhitenedWindow) -> Real:
+        def predict(candidates: Real, sample_window: WhitenedWindow) -> Real:
             if kind == "yielding":
                 candidates = np.insert(candidates, 3, 0.0, axis=1)
-            return contact.predict(candidates, window, side)[0]
+            return obstacle_contact.predict(candidates, sample_window, pressing_side)[0]
 
         return predict
 
     def _moving_space(self, kind: str) -> ParameterRanges:
         """Return the ranges of the four parameters of a moving or yielding obstacle."""
         ranges = self.space(5)
-        columns = [0, 1, 2, 3 if kind == "moving" else 4]
+        parameter_columns = [0, 1, 2, 3 if kind == "moving" else 4]
         return ParameterRanges(
-            ranges.low[columns],
-            ranges.high[columns],
-            ranges.difference[columns],
-            ranges.scale[columns],
-            ranges.smallest_std[columns],
-            ranges.largest_std[columns],
+            ranges.low[parameter_columns],
+            ranges.high[parameter_columns],
+            ranges.difference[parameter_columns],
+            ranges.scale[parameter_columns],
+            ranges.smallest_std[parameter_columns],
+            ranges.largest_std[parameter_columns],
         )
 
 
-def _distinct_minima(minima: Minima) -> Real:
-    """Return the parameters of minima that are not close to a better minimum, the best first."""
-    order = np.argsort(minima.chi2)
-    distinct: list[Real] = []
-    for row in minima.parameters[order[minima.chi2[order] < 2 * minima.chi2.min() + 60]]:
-        if all(np.any(np.abs(row - other)[:2] > (5e-4, 4e-5)) for other in distinct):
-            distinct.append(row)
-    return np.array(distinct)
+def _distinct_minima(local_minima: Minima) -> Real:
+    """Return the parameters of minima that are not close to a better minimum, best first."""
+    minimum_order = np.argsort(local_minima.chi2)
+    distinct_minima: list[Real] = []
+    for row in local_minima.parameters[
+        minimum_order[local_minima.chi2[minimum_order] < 2 * local_minima.chi2.min() + 60]
+    ]:
+        if all(
+            np.any(np.abs(row - other_minimum)[:2] > (5e-4, 4e-5))
+            for other_minimum in distinct_minima
+        ):
+            distinct_minima.append(row)
+    return np.array(distinct_minima)

@@ -65,14 +65,14 @@ class TouchRecord:
         samples
             Number of samples.
         """
-        shear = None if self.shear_n is None else self.shear_n[:samples]
+        shear_n = None if self.shear_n is None else self.shear_n[:samples]
         return TouchRecord(
-            self.rate_hz, self.angle_rad[:samples], self.torque_nm[:samples], shear, self.detected
+            self.rate_hz, self.angle_rad[:samples], self.torque_nm[:samples], shear_n, self.detected
         )
 
 
 class FreeBeam:
-    """Responses of the free beam to its angle, prepared for records of one length.
+    """Responses of a beam without contact to the motor's angle, for records of one length.
 
     Parameters
     ----------
@@ -82,7 +82,7 @@ class FreeBeam:
         Positions at which the displacement is computed, shape (m,).
     rate_hz
         Samples a second.
-    samples
+    sample_count
         Largest number of samples in a record.
     """
 
@@ -100,36 +100,36 @@ class FreeBeam:
         "x_m",
     )
 
-    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, samples: int) -> None:
+    def __init__(self, model: TouchModel, x_m: Real, rate_hz: float, sample_count: int) -> None:
         from scipy.fft import next_fast_len
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
-        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * samples + 0.1 * rate_hz), real=True)
+        n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * sample_count + 0.1 * rate_hz), real=True)
         self.line = LaplaceLine(n, 1 / (STEPS_PER_SAMPLE * rate_hz), _BAND_FRACTION)
         s = self.line.s
-        self._grid = grid = PointForceGrid(s, model.beam, model.damping)
+        self._grid = force_grid = PointForceGrid(s, model.beam, model.damping)
         filter_response = model.sensor_filter.response(s)
         filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
-        inertia = model.tool_inertia_kg_m2 * s * s
-        self._torque: Complex = filter_response * (grid.torque_per_angle() + inertia)
-        self._shear: Complex = filter_response * grid.shear_per_angle()
+        tool_inertia = model.tool_inertia_kg_m2 * s * s
+        self._torque: Complex = filter_response * (force_grid.torque_per_angle() + tool_inertia)
+        self._shear: Complex = filter_response * force_grid.shear_per_angle()
         self.modes = FreeVibration.from_model(model, np.empty(0))
         self._set_positions(x_m)
-        unit = np.zeros(3 * SPLINE_FADE_SAMPLES)
-        unit[SPLINE_FADE_SAMPLES] = 1.0
-        self._sample = self.line.to_laplace(_interpolate_angle(unit, rate_hz, self.line)[0])
+        unit_sample = np.zeros(3 * SPLINE_FADE_SAMPLES)
+        unit_sample[SPLINE_FADE_SAMPLES] = 1.0
+        self._sample = self.line.to_laplace(_interpolate_angle(unit_sample, rate_hz, self.line)[0])
 
     def at_positions(self, x_m: Real) -> "FreeBeam":
-        """Return the free beam with other positions of the displacement.
+        """Return a copy that computes the displacement at other positions along the beam.
 
         Parameters
         ----------
         x_m
             Positions at which the displacement is computed, shape (m,).
         """
-        other = copy(self)
-        other._set_positions(x_m)
-        return other
+        moved_beam = copy(self)
+        moved_beam._set_positions(x_m)
+        return moved_beam
 
     def _set_positions(self, x_m: Real) -> None:
         """Set the positions at which the displacement is computed.
@@ -143,14 +143,14 @@ class FreeBeam:
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
         self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
 
-    def displacement_per_sample(self, index: int, samples: int) -> Real:
+    def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:
         """Return the displacement at a position that one sample of the angle causes, in m/rad.
 
         Parameters
         ----------
-        index
+        position_index
             Index of the position.
-        samples
+        sample_count
             Number of samples after the sample of the angle.
 
         Returns
@@ -159,81 +159,85 @@ class FreeBeam:
             Displacement on the fine time steps, from `SPLINE_FADE_SAMPLES` samples before the
             sample of the angle, because the spline through the samples acts ahead of each sample.
         """
-        response = (self._between[index] @ self._displacement) * self._sample
-        return self.line.to_time(response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + samples))
+        laplace_response = (self._between[position_index] @ self._displacement) * self._sample
+        return self.line.to_time(
+            laplace_response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + sample_count)
+        )
 
     def motion(
         self,
-        record: TouchRecord,
-        quiet: int,
-        first: int,
+        touch_record: TouchRecord,
+        quiet_samples: int,
+        first_sample: int,
         angle_transform: "AngleTransform | None" = None,
     ) -> "FreeMotion":
-        """Return the innovations of a record, and the motion of the beam without a touch.
+        """Return the motion of a beam without contact, and a record's deviations from it.
 
         Parameters
         ----------
-        record
+        touch_record
             Samples around the touch.
-        quiet
+        quiet_samples
             Number of samples that are certainly before the touch.
-        first
+        first_sample
             Index of the sample from which the displacement is computed.
         angle_transform
             Transform of the record's angle, if it is known from another beam; None: it is computed.
         """
-        n = record.angle_rad.size
-        rate = self.rate_hz
+        n = touch_record.angle_rad.size
+        rate_hz = self.rate_hz
         angle_transform = angle_transform or AngleTransform.from_samples(
-            record.angle_rad, rate, self.line
+            touch_record.angle_rad, rate_hz, self.line
         )
-        spectrum, start, speed = (
+        spectrum, start_rad, speed_rad_s = (
             angle_transform.spectrum,
             angle_transform.start_rad,
             angle_transform.speed_rad_s,
         )
-        channels = [(record.torque_nm, self._torque)]
-        if record.shear_n is not None:
-            channels.append((record.shear_n, self._shear))
-        t = np.arange(n) / rate
+        measured_channels = [(touch_record.torque_nm, self._torque)]
+        if touch_record.shear_n is not None:
+            measured_channels.append((touch_record.shear_n, self._shear))
+        t = np.arange(n) / rate_hz
         delay_s = self.model.wrench_delay_s - self.model.angle_delay_s
         vibration_columns = self.modes.channels(t - delay_s)
-        innovations, designs = [], []
-        for i, (measured, transfer) in enumerate(channels):
-            free_reading = self.line.to_time(transfer * spectrum, STEPS_PER_SAMPLE * n)[
+        innovations, design_matrices = [], []
+        for i, (measured_samples, transfer_function) in enumerate(measured_channels):
+            free_reading = self.line.to_time(transfer_function * spectrum, STEPS_PER_SAMPLE * n)[
                 ::STEPS_PER_SAMPLE
             ]
-            innovations.append(measured - free_reading)
-            drift = np.zeros((n, 2 * len(channels)))
-            drift[:, 2 * i] = 1.0
-            drift[:, 2 * i + 1] = t - t[quiet // 2]
-            designs.append(np.hstack([vibration_columns[i], drift]))
-        fitted = _FreeMotionFit.fit(innovations, designs, quiet)
-        steps = STEPS_PER_SAMPLE * n
-        at_nodes = self.line.to_time(self._displacement * spectrum, steps)
-        displacement_m = self._between @ at_nodes[:, STEPS_PER_SAMPLE * first :]
-        fine = np.arange(STEPS_PER_SAMPLE * first, steps) / (STEPS_PER_SAMPLE * rate)
-        displacement_m += self.x_m[:, None] * (start + speed * fine)
-        amplitudes = fitted.values[: self.modes.shapes.shape[0] * 2]
-        displacement_m += self.modes.displacement(fine, amplitudes)
+            innovations.append(measured_samples - free_reading)
+            offset_and_drift = np.zeros((n, 2 * len(measured_channels)))
+            offset_and_drift[:, 2 * i] = 1.0
+            offset_and_drift[:, 2 * i + 1] = t - t[quiet_samples // 2]
+            design_matrices.append(np.hstack([vibration_columns[i], offset_and_drift]))
+        motion_fit = _FreeMotionFit.fit(innovations, design_matrices, quiet_samples)
+        step_count = STEPS_PER_SAMPLE * n
+        node_displacement_m = self.line.to_time(self._displacement * spectrum, step_count)
+        displacement_m = self._between @ node_displacement_m[:, STEPS_PER_SAMPLE * first_sample :]
+        step_times_s = np.arange(STEPS_PER_SAMPLE * first_sample, step_count) / (
+            STEPS_PER_SAMPLE * rate_hz
+        )
+        displacement_m += self.x_m[:, None] * (start_rad + speed_rad_s * step_times_s)
+        vibration_amplitudes = motion_fit.values[: self.modes.shapes.shape[0] * 2]
+        displacement_m += self.modes.displacement(step_times_s, vibration_amplitudes)
         return FreeMotion(
             t=t - self.model.wrench_delay_s,
-            innovations=np.array(fitted.innovations),
-            noise=np.array(fitted.noise),
-            design=np.array(designs),
-            spread=np.linalg.cholesky(fitted.covariance).astype(np.float64),
+            innovations=np.array(motion_fit.innovations),
+            noise=np.array(motion_fit.noise),
+            design=np.array(design_matrices),
+            spread=np.linalg.cholesky(motion_fit.covariance).astype(np.float64),
             angle_transform=angle_transform,
             ringing=self.modes,
-            angle_noise_rad=_angle_noise(record.angle_rad[:quiet]),
+            angle_noise_rad=_angle_noise(touch_record.angle_rad[:quiet_samples]),
             displacement_m=displacement_m,
-            first_s=first / rate - self.model.angle_delay_s,
-            step_s=1 / (STEPS_PER_SAMPLE * rate),
+            first_s=first_sample / rate_hz - self.model.angle_delay_s,
+            step_s=1 / (STEPS_PER_SAMPLE * rate_hz),
         )
 
 
 @dataclass(frozen=True, slots=True)
 class FreeMotion:
-    """Innovations of a record, and the motion of the beam without a touch."""
+    """Motion that a beam without contact would have, and a record's deviations from it."""
 
     t: Real
     """Instants of the samples of torque and shear, corrected for their delays, shape (n,)."""
@@ -260,12 +264,12 @@ class FreeMotion:
     """Time between two steps of the displacement."""
 
 
-def _angle_noise(angle: Real) -> float:
-    """Return the standard deviation of the angle's noise in rad, including encoder steps.
+def _angle_noise(angle_rad: Real) -> float:
+    """Return the standard deviation of an angle's noise in rad, including encoder steps.
 
     Fourth differences of the samples remove the motion.
     """
-    return float(np.sqrt(np.mean(np.diff(angle, 4) ** 2) / 70))
+    return float(np.sqrt(np.mean(np.diff(angle_rad, 4) ** 2) / 70))
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,32 +284,44 @@ class AngleTransform:
     """Speed at the record's beginning."""
 
     @classmethod
-    def from_samples(cls, angle_rad: Real, rate_hz: float, line: LaplaceLine) -> "AngleTransform":
+    def from_samples(
+        cls, angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+    ) -> "AngleTransform":
         """Return the transform of an angle's samples at the frequencies of a Laplace line."""
-        rest, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, line)
-        return cls(line.to_laplace(rest), start_rad, speed_rad_s)
+        remaining_angle, start_rad, speed_rad_s = _interpolate_angle(
+            angle_rad, rate_hz, laplace_line
+        )
+        return cls(laplace_line.to_laplace(remaining_angle), start_rad, speed_rad_s)
 
 
-def _interpolate_angle(angle: Real, rate_hz: float, line: LaplaceLine) -> tuple[Real, float, float]:
-    """Interpolate an angle to the line's time steps, and subtract a motion at constant speed.
+def _interpolate_angle(
+    angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+) -> tuple[Real, float, float]:
+    """Interpolate an angle to the time steps of a transform, and subtract constant speed.
 
     Return the remaining angle, and angle and speed at the record's beginning.
     """
     from scipy.interpolate import CubicSpline
 
-    t = np.arange(angle.size) / rate_hz
+    t = np.arange(angle_rad.size) / rate_hz
     window_samples = max(4, round(_SPEED_WINDOW_S * rate_hz))
-    curve = np.polyfit(t[:window_samples], angle[:window_samples], 2)
-    start, speed = float(curve[2]), float(curve[1])
-    relative = angle - start - speed * t
-    spline = CubicSpline(t, relative)
-    fine = np.arange(STEPS_PER_SAMPLE * angle.size) * line.step_s
-    record_steps_s = fine[fine <= t[-1]]
-    after = np.arange(1, line.n - record_steps_s.size + 1) * line.step_s
-    end = np.polyfit(t[-6:] - t[-1], relative[-6:], 1)[0]
-    ending = relative[-1] + end * _SETTLING_S * (1 - np.exp(-after / _SETTLING_S))
-    fade = 0.5 + 0.5 * np.cos(np.pi * np.minimum(after / after[-1], 1.0))
-    return np.concatenate([spline(record_steps_s), ending * fade]), start, speed
+    polynomial = np.polyfit(t[:window_samples], angle_rad[:window_samples], 2)
+    start_rad, speed_rad_s = float(polynomial[2]), float(polynomial[1])
+    relative_angle_rad = angle_rad - start_rad - speed_rad_s * t
+    angle_spline = CubicSpline(t, relative_angle_rad)
+    step_times_s = np.arange(STEPS_PER_SAMPLE * angle_rad.size) * laplace_line.step_s
+    record_steps_s = step_times_s[step_times_s <= t[-1]]
+    times_after_s = np.arange(1, laplace_line.n - record_steps_s.size + 1) * laplace_line.step_s
+    end_speed_rad_s = np.polyfit(t[-6:] - t[-1], relative_angle_rad[-6:], 1)[0]
+    ending_angle_rad = relative_angle_rad[-1] + end_speed_rad_s * _SETTLING_S * (
+        1 - np.exp(-times_after_s / _SETTLING_S)
+    )
+    fade_factors = 0.5 + 0.5 * np.cos(np.pi * np.minimum(times_after_s / times_after_s[-1], 1.0))
+    return (
+        np.concatenate([angle_spline(record_steps_s), ending_angle_rad * fade_factors]),
+        start_rad,
+        speed_rad_s,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -327,18 +343,27 @@ class FreeVibration:
         beam, damping = model.beam, model.damping
         candidate_modes = 12
         mode_poles = poles(beam, damping, candidate_modes)[:, 0]
-        count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))
-        mode_poles = mode_poles[:count]
-        wave = clamped_free_eigenvalues(count) / beam.length_m
-        sign = np.where(np.arange(count) % 2 == 0, 1.0, -1.0)
-        stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * mode_poles**damping.alpha)
-        ratio = root_shear_ratio(count)
-        root = stiffness * np.stack([-2 * sign * wave**2, -2 * sign * ratio * wave**3])
-        root *= model.sensor_filter.response(mode_poles)
+        mode_count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))
+        mode_poles = mode_poles[:mode_count]
+        wave_numbers = clamped_free_eigenvalues(mode_count) / beam.length_m
+        mode_signs = np.where(np.arange(mode_count) % 2 == 0, 1.0, -1.0)
+        complex_stiffness = beam.bending_stiffness_n_m2 * (
+            1 + damping.zeta * mode_poles**damping.alpha
+        )
+        shear_ratios = root_shear_ratio(mode_count)
+        root_loads = complex_stiffness * np.stack(
+            [-2 * mode_signs * wave_numbers**2, -2 * mode_signs * shear_ratios * wave_numbers**3]
+        )
+        root_loads *= model.sensor_filter.response(mode_poles)
         # Units of the amplitudes that give about the same torque in each mode.
-        scale = 1 / np.abs(root[0])
-        unplaced = cls(mode_poles.astype(np.complex128), root * scale, scale, np.empty((count, 0)))
-        return unplaced.at_positions(x_m / beam.length_m)
+        torque_scale = 1 / np.abs(root_loads[0])
+        without_shapes = cls(
+            mode_poles.astype(np.complex128),
+            root_loads * torque_scale,
+            torque_scale,
+            np.empty((mode_count, 0)),
+        )
+        return without_shapes.at_positions(x_m / beam.length_m)
 
     def at_positions(self, fractions: Real) -> "FreeVibration":
         """Return the free vibrations with the displacement at other positions.
@@ -348,8 +373,8 @@ class FreeVibration:
         fractions
             Positions as fractions of the length, shape (positions,).
         """
-        shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
-        return replace(self, shapes=shapes * self.scale[:, None])
+        mode_shapes = np.stack([mode_shape(i + 1, fractions) for i in range(self.poles.size)])
+        return replace(self, shapes=mode_shapes * self.scale[:, None])
 
     def channels(self, t: Real) -> Real:
         """Return torque and shear of each vibration at some times, shape (2, t, 2 · modes).
@@ -360,8 +385,10 @@ class FreeVibration:
             Times from the record's beginning.
         """
         oscillation = np.exp(np.multiply.outer(t, self.poles))
-        parts = [oscillation * root for root in self.root]
-        return np.array([np.hstack([part.real, -part.imag]) for part in parts])
+        complex_parts = [oscillation * root_load for root_load in self.root]
+        return np.array(
+            [np.hstack([complex_part.real, -complex_part.imag]) for complex_part in complex_parts]
+        )
 
     def displacement(self, t: NDArray[np.floating], amplitudes: Real) -> Real:
         """Return the beam's displacement for given amplitudes of the free vibrations.
@@ -375,12 +402,16 @@ class FreeVibration:
         amplitudes
             Amplitudes of cosines and sines, shape (2 · modes, r) or (2 · modes,).
         """
-        count = self.poles.size
+        mode_count = self.poles.size
         oscillation = np.exp(np.multiply.outer(t, self.poles)).T
-        vibration_columns = amplitudes.reshape(2 * count, -1)
-        displacement_m = np.multiply(oscillation.real[:, :, None], vibration_columns[:count, None])
-        displacement_m -= np.multiply(oscillation.imag[:, :, None], vibration_columns[count:, None])
-        displacement: Real = self.shapes.T @ displacement_m.reshape(count, -1)
+        vibration_columns = amplitudes.reshape(2 * mode_count, -1)
+        displacement_m = np.multiply(
+            oscillation.real[:, :, None], vibration_columns[:mode_count, None]
+        )
+        displacement_m -= np.multiply(
+            oscillation.imag[:, :, None], vibration_columns[mode_count:, None]
+        )
+        displacement: Real = self.shapes.T @ displacement_m.reshape(mode_count, -1)
         return displacement.reshape(-1, t.size, *amplitudes.shape[1:])
 
 
@@ -403,18 +434,24 @@ class _FreeMotionFit:
 
         Repeated fits estimate the noise of torque and shear, which gives the weights.
         """
-        noise = [1.0] * len(innovations)
+        noise_stds = [1.0] * len(innovations)
         for _ in range(3):
-            a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
-            b = np.concatenate([e[:quiet] / s for e, s in zip(innovations, noise, strict=True)])
-            normal = a.T @ a
-            regularisation = 1e-9 * np.trace(normal) / normal.shape[0]
-            covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
-            values = covariance @ (a.T @ b)
-            residuals = [e - d @ values for e, d in zip(innovations, designs, strict=True)]
-            degrees_of_freedom = max(quiet - values.size / len(residuals), quiet / 2)
-            noise = [float(np.sqrt(np.sum(e[:quiet] ** 2) / degrees_of_freedom)) for e in residuals]
-        a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise, strict=True)])
-        normal = a.T @ a
-        covariance = np.linalg.inv(normal + regularisation * np.eye(normal.shape[0]))
-        return cls(values, covariance, noise, residuals)
+            a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise_stds, strict=True)])
+            b = np.concatenate(
+                [e[:quiet] / s for e, s in zip(innovations, noise_stds, strict=True)]
+            )
+            normal_matrix = a.T @ a
+            regularisation = 1e-9 * np.trace(normal_matrix) / normal_matrix.shape[0]
+            covariance = np.linalg.inv(
+                normal_matrix + regularisation * np.eye(normal_matrix.shape[0])
+            )
+            fitted_values = covariance @ (a.T @ b)
+            residuals = [e - d @ fitted_values for e, d in zip(innovations, designs, strict=True)]
+            degrees_of_freedom = max(quiet - fitted_values.size / len(residuals), quiet / 2)
+            noise_stds = [
+                float(np.sqrt(np.sum(e[:quiet] ** 2) / degrees_of_freedom)) for e in residuals
+            ]
+        a = np.vstack([d[:quiet] / s for d, s in zip(designs, noise_stds, strict=True)])
+        normal_matrix = a.T @ a
+        covariance = np.linalg.inv(normal_matrix + regularisation * np.eye(normal_matrix.shape[0]))
+        return cls(fitted_values, covariance, noise_stds, residuals)

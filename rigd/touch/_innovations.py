@@ -60,7 +60,7 @@ _ZERO_BANDWIDTH_RAD_S = 0.5
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedBeam:
-    """Discrete model of the free beam with an observer, for one tick rate and sensor.
+    """Discrete model of the beam without contact, with an observer, for one tick rate and sensor.
 
     Examples
     --------
@@ -102,7 +102,7 @@ def observed_beam(
     beam: Beam,
     damping: Damping,
     rate_hz: float,
-    noise: ChannelNoise,
+    noise_stds: ChannelNoise,
     *,
     tool_inertia_kg_m2: float = 0.0,
     torque_after_angle_s: float = 0.0,
@@ -116,7 +116,7 @@ def observed_beam(
         Parameters of the exact model.
     rate_hz
         Ticks a second.
-    noise
+    noise_stds
         Noise of torque, base shear and angle.
     tool_inertia_kg_m2
         Inertia between sensor and beam.
@@ -130,34 +130,34 @@ def observed_beam(
     ObservedBeam
         Model for an `InnovationFilter`.
     """
-    filter_ = _fit_filter(
+    angle_filter = _fit_filter(
         beam, damping, rate_hz, tool_inertia_kg_m2, torque_after_angle_s, sensor_filter
     )
-    has_shear = noise.shear_n is not None
-    observer = _design_observer(beam, damping, rate_hz, noise, filter_.noise_gain)
-    f, o = filter_.a.shape[0], observer.a.shape[0]
+    has_shear = noise_stds.shear_n is not None
+    observer = _design_observer(beam, damping, rate_hz, noise_stds, angle_filter.noise_gain)
+    f, o = angle_filter.a.shape[0], observer.a.shape[0]
     n = f + o
-    matrix = np.zeros((n + 4, n + 3))
-    matrix[:f, :f], matrix[:f, n] = filter_.a, filter_.b
-    prediction = np.zeros((2, n + 3))
-    prediction[:, :f], prediction[:, n] = filter_.c, filter_.d
-    innovation = -prediction
-    innovation[:, f:n] -= observer.c
-    innovation[0, n + 1] = innovation[1, n + 2] = 1.0
-    matrix[f:n, f:n] = observer.a
-    matrix[f:n] += observer.gain @ innovation
-    matrix[n : n + 2] = observer.whitening @ innovation
-    matrix[n + 2 :] = observer.whitening @ prediction
-    gain = np.zeros((n, 2))
-    channels = 2 if has_shear else 1
-    gain[f:, :channels] = observer.gain[:, :channels] @ np.linalg.inv(
-        observer.whitening[:channels, :channels]
+    step_matrix = np.zeros((n + 4, n + 3))
+    step_matrix[:f, :f], step_matrix[:f, n] = angle_filter.a, angle_filter.b
+    prediction_rows = np.zeros((2, n + 3))
+    prediction_rows[:, :f], prediction_rows[:, n] = angle_filter.c, angle_filter.d
+    innovation_rows = -prediction_rows
+    innovation_rows[:, f:n] -= observer.c
+    innovation_rows[0, n + 1] = innovation_rows[1, n + 2] = 1.0
+    step_matrix[f:n, f:n] = observer.a
+    step_matrix[f:n] += observer.gain @ innovation_rows
+    step_matrix[n : n + 2] = observer.whitening @ innovation_rows
+    step_matrix[n + 2 :] = observer.whitening @ prediction_rows
+    observer_gain = np.zeros((n, 2))
+    channel_count = 2 if has_shear else 1
+    observer_gain[f:, :channel_count] = observer.gain[:, :channel_count] @ np.linalg.inv(
+        observer.whitening[:channel_count, :channel_count]
     )
-    return ObservedBeam(matrix, gain, observer.whitening, n, channels)
+    return ObservedBeam(step_matrix, observer_gain, observer.whitening, n, channel_count)
 
 
 class InnovationFilter:
-    """Filter that computes the innovations of torque and shear tick by tick.
+    """Filter that computes the deviation of torque and shear from the free beam at each tick.
 
     It starts with the beam at rest at the first angle.
 
@@ -213,7 +213,7 @@ class InnovationFilter:
         angle_stale: bool = False,
         wrench_stale: bool = False,
     ) -> None:
-        """Compute the innovations of a tick from its readings.
+        """Compute the deviations of torque and shear of a tick from the model, from its readings.
 
         Parameters
         ----------
@@ -233,10 +233,10 @@ class InnovationFilter:
             relative_angle_rad = 2.0 * self._angle_rad - self._previous_angle_rad
         if missed:
             start_rad = self._angle_rad
-            for tick in range(1, missed + 1):
-                fraction = tick / (missed + 1)
+            for missed_tick in range(1, missed + 1):
+                path_fraction = missed_tick / (missed + 1)
                 self._step_without_wrench(
-                    start_rad + fraction * (relative_angle_rad - start_rad), torque_nm, shear_n
+                    start_rad + path_fraction * (relative_angle_rad - start_rad), torque_nm, shear_n
                 )
         if wrench_stale:
             self._step_without_wrench(relative_angle_rad, torque_nm, shear_n)
@@ -247,29 +247,31 @@ class InnovationFilter:
     def predicted_shear_n(self) -> float:
         """Base shear in N predicted from the angle alone; 0 if the model has no shear."""
         torque_coefficient, shear_coefficient = self._unwhitening
-        torque, shear = self.predicted
-        return torque_coefficient * torque + shear_coefficient * shear
+        whitened_torque, whitened_shear = self.predicted
+        return torque_coefficient * whitened_torque + shear_coefficient * whitened_shear
 
     def _step_with_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Compute one tick with the angle relative to rest, torque and shear."""
+        """Process the angle relative to rest, torque and shear of one tick."""
         n = self._states
-        input_, output = self._vectors
-        input_[n] = relative_angle_rad
-        input_[n + 1] = torque_nm
-        input_[n + 2] = shear_n
-        self._multiply(input_[: n + 3], output)
-        self._vectors = output, input_
-        torque, shear, predicted_torque, predicted_shear = output[n:].tolist()
-        self.whitened = torque, shear
+        input_vector, output_vector = self._vectors
+        input_vector[n] = relative_angle_rad
+        input_vector[n + 1] = torque_nm
+        input_vector[n + 2] = shear_n
+        self._multiply(input_vector[: n + 3], output_vector)
+        self._vectors = output_vector, input_vector
+        torque_innovation, shear_innovation, predicted_torque, predicted_shear = output_vector[
+            n:
+        ].tolist()
+        self.whitened = torque_innovation, shear_innovation
         self.predicted = predicted_torque, predicted_shear
         self._previous_angle_rad, self._angle_rad = self._angle_rad, relative_angle_rad
 
     def _step_without_wrench(
         self, relative_angle_rad: float, torque_nm: float, shear_n: float
     ) -> None:
-        """Compute one tick without a valid wrench, whose effect on the state is undone."""
+        """Process one tick without a valid wrench, whose effect on the filter's state is undone."""
         self._step_with_wrench(relative_angle_rad, torque_nm, shear_n)
         self._vectors[0][: self._states] -= self._gain @ np.array(self.whitened)
         self.whitened = 0.0, 0.0
@@ -306,44 +308,51 @@ def _fit_filter(
     Its poles are those of the exact model. Some real poles and delay taps approximate the remaining
     response.
     """
-    pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
-    upper_poles = pairs[_is_represented_mode(pairs[:, 0], rate_hz), 0]
+    pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(_CANDIDATE_MODES), beam, damping)
+    upper_poles = pole_pairs[_is_represented_mode(pole_pairs[:, 0], rate_hz), 0]
     complex_poles: Complex = np.exp(upper_poles / rate_hz)
     real_poles: Real = np.exp(
         -np.geomspace(_SLOWEST_REAL_POLE_RAD_S, rate_hz, _REAL_POLE_COUNT) / rate_hz
     )
 
     half_width_hz = np.maximum(-upper_poles.real, 1e-3 * upper_poles.imag) / (2 * pi)
-    near_hz = upper_poles.imag[:, None] / (2 * pi) + half_width_hz[:, None] * np.linspace(-3, 3, 11)
+    resonance_hz = upper_poles.imag[:, None] / (2 * pi) + half_width_hz[:, None] * np.linspace(
+        -3, 3, 11
+    )
     band_hz = np.geomspace(_FIT_START_HZ, _FIT_END_FRACTION * rate_hz, 400)
-    frequency_hz = np.concatenate([band_hz, near_hz.ravel()])
+    frequency_hz = np.concatenate([band_hz, resonance_hz.ravel()])
     frequency_hz = frequency_hz[(frequency_hz > 0) & (frequency_hz < _FIT_END_FRACTION * rate_hz)]
     s = 2j * pi * frequency_hz
-    exact = PointForceGrid(s, beam, damping)
-    response = np.array([exact.torque_per_angle(), exact.shear_per_angle()])
-    response[0] += tool_inertia_kg_m2 * s**2
-    response *= sensor_filter.response(s) * np.exp(-torque_after_angle_s * s)
+    exact_model = PointForceGrid(s, beam, damping)
+    exact_response = np.array([exact_model.torque_per_angle(), exact_model.shear_per_angle()])
+    exact_response[0] += tool_inertia_kg_m2 * s**2
+    exact_response *= sensor_filter.response(s) * np.exp(-torque_after_angle_s * s)
 
-    weight = np.minimum(1.0, (_FULL_WEIGHT_END_HZ / frequency_hz) ** 3)
-    weight *= np.minimum(1.0, frequency_hz / _FULL_WEIGHT_START_HZ)
-    columns = _term_responses(s / rate_hz, complex_poles, real_poles)
+    fit_weights = np.minimum(1.0, (_FULL_WEIGHT_END_HZ / frequency_hz) ** 3)
+    fit_weights *= np.minimum(1.0, frequency_hz / _FULL_WEIGHT_START_HZ)
+    term_responses = _term_responses(s / rate_hz, complex_poles, real_poles)
     rest_response = _term_responses(np.zeros(1, dtype=complex), complex_poles, real_poles).real
-    coefficients = np.empty((2, columns.shape[1]))
-    for row, target in zip(coefficients, response, strict=True):
-        scale = weight / np.abs(target)
-        weighted = columns * scale[:, None]
+    coefficients = np.empty((2, term_responses.shape[1]))
+    for row, fit_target in zip(coefficients, exact_response, strict=True):
+        fit_scale = fit_weights / np.abs(fit_target)
+        weighted_columns = term_responses * fit_scale[:, None]
         # An angle at rest must give exactly no torque, not only a small one.
-        matrix = np.concatenate([weighted.real, weighted.imag, 1e4 * rest_response])
-        right_hand_side = np.concatenate([(target * scale).real, (target * scale).imag, [0.0]])
-        column_norms = np.linalg.norm(matrix, axis=0)
+        least_squares_matrix = np.concatenate(
+            [weighted_columns.real, weighted_columns.imag, 1e4 * rest_response]
+        )
+        right_hand_side = np.concatenate(
+            [(fit_target * fit_scale).real, (fit_target * fit_scale).imag, [0.0]]
+        )
+        column_norms = np.linalg.norm(least_squares_matrix, axis=0)
         row[:] = (
-            np.linalg.lstsq(matrix / column_norms, right_hand_side, rcond=1e-12)[0] / column_norms
+            np.linalg.lstsq(least_squares_matrix / column_norms, right_hand_side, rcond=1e-12)[0]
+            / column_norms
         )
 
-    band_response = (
+    dense_response = (
         _term_responses(1j * np.linspace(0, pi, 4001), complex_poles, real_poles) @ coefficients.T
     )
-    noise_gain = np.sqrt(np.mean(np.abs(band_response) ** 2, axis=0))
+    noise_gain = np.sqrt(np.mean(np.abs(dense_response) ** 2, axis=0))
     return _state_space(complex_poles, real_poles, coefficients, noise_gain)
 
 
@@ -353,10 +362,10 @@ def _is_represented_mode(upper_poles: Complex, rate_hz: float) -> NDArray[np.boo
     Such a mode oscillates at less than `_MAX_FREQUENCY_FRACTION` of the tick rate. A pole of NaN
     belongs to no mode.
     """
-    represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
+    is_represented: NDArray[np.bool_] = upper_poles.imag > _MIN_IMAGINARY_FRACTION * np.abs(
         upper_poles
     )
-    return represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz)
+    return is_represented & (upper_poles.imag < 2 * pi * _MAX_FREQUENCY_FRACTION * rate_hz)
 
 
 def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) -> Complex:
@@ -365,11 +374,20 @@ def _term_responses(s_ticks: Complex, complex_poles: Complex, real_poles: Real) 
     The terms are the real and the imaginary part of each complex pole, the real poles and the delay
     taps. `s_ticks` is the Laplace variable times the period.
     """
-    delay = np.exp(-s_ticks)[:, None]
-    up, down = 1 / (1 - complex_poles * delay), 1 / (1 - complex_poles.conj() * delay)
-    real_terms = 1 / (1 - real_poles * delay)
+    tick_delay = np.exp(-s_ticks)[:, None]
+    upper_terms, lower_terms = (
+        1 / (1 - complex_poles * tick_delay),
+        1 / (1 - complex_poles.conj() * tick_delay),
+    )
+    real_terms = 1 / (1 - real_poles * tick_delay)
     return np.concatenate(
-        [up + down, 1j * (up - down), real_terms, delay ** np.arange(_DELAY_TAPS)], axis=1
+        [
+            upper_terms + lower_terms,
+            1j * (upper_terms - lower_terms),
+            real_terms,
+            tick_delay ** np.arange(_DELAY_TAPS),
+        ],
+        axis=1,
     )
 
 
@@ -389,15 +407,15 @@ def _state_space(
     b[even_states], b[even_states + 1] = complex_poles.real, complex_poles.imag
     real_states = np.arange(2 * m, 2 * m + k)
     a[real_states, real_states] = b[real_states] = real_poles
-    taps = np.arange(2 * m + k, n)
-    b[taps[0]] = 1.0
-    a[taps[1:], taps[:-1]] = 1.0
+    delay_states = np.arange(2 * m + k, n)
+    b[delay_states[0]] = 1.0
+    a[delay_states[1:], delay_states[:-1]] = 1.0
     # A state is the sum up to the previous tick, moved on by one tick: adding θ completes it.
     c = np.zeros((2, n))
     c[:, even_states] = 2 * coefficients[:, :m]
     c[:, even_states + 1] = -2 * coefficients[:, m : 2 * m]
     c[:, real_states] = coefficients[:, 2 * m : 2 * m + k]
-    c[:, taps] = coefficients[:, -_DELAY_TAPS + 1 :]
+    c[:, delay_states] = coefficients[:, -_DELAY_TAPS + 1 :]
     d = (
         2 * coefficients[:, :m].sum(axis=1)
         + coefficients[:, 2 * m : 2 * m + k].sum(axis=1)
@@ -437,9 +455,9 @@ def _design_observer(
         z[represented] / beam.length_m,
     )
     has_shear = noise.shear_n is not None
-    channels = 2 if has_shear else 1
+    channel_count = 2 if has_shear else 1
     m = complex_poles.size
-    n = 2 * m + channels
+    n = 2 * m + channel_count
     a, c = np.zeros((n, n)), np.zeros((2, n))
     even_states = np.arange(0, 2 * m, 2)
     a[even_states, even_states] = a[even_states + 1, even_states + 1] = complex_poles.real
@@ -447,23 +465,29 @@ def _design_observer(
         -complex_poles.imag,
         complex_poles.imag,
     )
-    zeros = np.arange(2 * m, n)
-    a[zeros, zeros] = 1.0
+    zero_states = np.arange(2 * m, n)
+    a[zero_states, zero_states] = 1.0
     c[0, even_states] = 1.0
-    c[np.arange(channels), zeros] = 1.0
+    c[np.arange(channel_count), zero_states] = 1.0
     noise_stds = np.array([noise.torque_nm, noise.shear_n or 0.0])
-    variance = noise_stds**2 + (noise_gain * noise.angle_rad) ** 2
+    noise_variances = noise_stds**2 + (noise_gain * noise.angle_rad) ** 2
     q = np.zeros(n)
     # A random walk of this size gives the observer its bandwidth.
-    q[even_states] = q[even_states + 1] = variance[0] * (_VIBRATION_BANDWIDTH_RAD_S / rate_hz) ** 2
-    q[zeros] = variance[:channels] * (_ZERO_BANDWIDTH_RAD_S / rate_hz) ** 2
+    q[even_states] = q[even_states + 1] = (
+        noise_variances[0] * (_VIBRATION_BANDWIDTH_RAD_S / rate_hz) ** 2
+    )
+    q[zero_states] = noise_variances[:channel_count] * (_ZERO_BANDWIDTH_RAD_S / rate_hz) ** 2
     if has_shear:
         c[1, even_states] = root_shear_ratio(_OBSERVED_MODES)[represented] * wave_number
-    measured_rows = c[:channels]
-    r = np.diag(variance[:channels])
+    measured_rows = c[:channel_count]
+    r = np.diag(noise_variances[:channel_count])
     covariance = solve_discrete_are(a.T, measured_rows.T, np.diag(q), r)
-    innovation = measured_rows @ covariance @ measured_rows.T + r
-    gain, whitening = np.zeros((n, 2)), np.zeros((2, 2))
-    gain[:, :channels] = a @ np.linalg.solve(innovation, measured_rows @ covariance).T
-    whitening[:channels, :channels] = np.linalg.inv(np.linalg.cholesky(innovation))
-    return _Observer(a, c, gain, whitening)
+    innovation_covariance = measured_rows @ covariance @ measured_rows.T + r
+    observer_gain, whitening = np.zeros((n, 2)), np.zeros((2, 2))
+    observer_gain[:, :channel_count] = (
+        a @ np.linalg.solve(innovation_covariance, measured_rows @ covariance).T
+    )
+    whitening[:channel_count, :channel_count] = np.linalg.inv(
+        np.linalg.cholesky(innovation_covariance)
+    )
+    return _Observer(a, c, observer_gain, whitening)

@@ -34,7 +34,7 @@ _FIRST_POSITION_M = 0.003
 
 
 class LaplaceLine:
-    """Laplace transform of functions of time on ``n`` steps, along a line parallel to the axis.
+    """Laplace transform of functions on ``n`` time steps, on a line of constant real part.
 
     Parameters
     ----------
@@ -51,10 +51,10 @@ class LaplaceLine:
 
     def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
         self.n, self.step_s = n, step_s
-        shift = WRAP_AROUND_EXPONENT / (n * step_s)
-        used_frequencies = round(band * (n // 2)) + 1
-        self.s = shift + 2j * np.pi * np.arange(used_frequencies) / (n * step_s)
-        self._growth = np.exp(shift * step_s * np.arange(n))
+        real_part_per_s = WRAP_AROUND_EXPONENT / (n * step_s)
+        frequency_count = round(band * (n // 2)) + 1
+        self.s = real_part_per_s + 2j * np.pi * np.arange(frequency_count) / (n * step_s)
+        self._growth = np.exp(real_part_per_s * step_s * np.arange(n))
 
     def to_laplace(self, samples: Real) -> Complex:
         """Return the Laplace transform of a function of time, along the last axis.
@@ -67,65 +67,69 @@ class LaplaceLine:
         """
         from scipy.fft import rfft
 
-        damped = samples / self._growth[: samples.shape[-1]]
-        spectrum: Complex = rfft(damped, self.n, axis=-1)[..., : self.s.size]
+        damped_samples = samples / self._growth[: samples.shape[-1]]
+        spectrum: Complex = rfft(damped_samples, self.n, axis=-1)[..., : self.s.size]
         return spectrum
 
-    def to_time(self, transform: Complex, steps: int) -> Real:
+    def to_time(self, laplace_values: Complex, step_count: int) -> Real:
         """Return a function of time from its Laplace transform, along the last axis.
 
         Parameters
         ----------
-        transform
+        laplace_values
             Laplace transform at the frequencies of the line, along the last axis.
-        steps
+        step_count
             Number of time steps that are returned, from the first on.
         """
         from scipy.fft import irfft
 
-        if transform.shape[-1] == self.n // 2 + 1:
-            transform = transform.copy()
-            transform[..., -1] = transform[..., -1].real
-        samples: Real = irfft(transform, self.n, axis=-1)[..., :steps] * self._growth[:steps]
+        if laplace_values.shape[-1] == self.n // 2 + 1:
+            laplace_values = laplace_values.copy()
+            laplace_values[..., -1] = laplace_values[..., -1].real
+        samples: Real = (
+            irfft(laplace_values, self.n, axis=-1)[..., :step_count] * self._growth[:step_count]
+        )
         return samples
 
 
 class ForcePulse:
-    """Triangular pulse of force, with which responses in the Laplace domain become kernels.
+    """Triangular pulse of force, to compute responses over time from Laplace transforms.
 
     Parameters
     ----------
     step_s
         Half the width of the pulse, which is the time between two values of a kernel.
-    steps
+    step_count
         Number of values of a kernel.
     """
 
     __slots__ = ("_delayed_pulse", "_steps", "line")
 
-    def __init__(self, step_s: float, steps: int) -> None:
+    def __init__(self, step_s: float, step_count: int) -> None:
         from scipy.fft import next_fast_len
 
-        self._steps = steps
+        self._steps = step_count
         fine_step_s = step_s / _OVERSAMPLING
-        self.line = LaplaceLine(next_fast_len(2 * _OVERSAMPLING * steps, real=True), fine_step_s)
+        self.line = LaplaceLine(
+            next_fast_len(2 * _OVERSAMPLING * step_count, real=True), fine_step_s
+        )
         s = self.line.s
-        pulse = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
+        pulse_transform = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
-        self._delayed_pulse = pulse * np.exp(-s * step_s)
+        self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
 
-    def kernels(self, response: Complex) -> Real:
-        """Return the kernels of responses: their values over time for one hat, shape (k, steps).
+    def kernels(self, laplace_response: Complex) -> Real:
+        """Return responses over time to one triangular pulse of force, shape (k, steps).
 
         Parameters
         ----------
-        response
+        laplace_response
             Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
         """
-        values = self.line.to_time(
-            self._delayed_pulse * response, _OVERSAMPLING * (self._steps + 1)
+        fine_values = self.line.to_time(
+            self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
         )
-        return values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
+        return fine_values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,47 +150,64 @@ class ContactKernels:
 
     @property
     def steps(self) -> int:
-        """Number of time steps of the kernels."""
+        """Number of time steps of the responses."""
         return int(self.displacement.shape[1])
 
-    def at_positions(self, x_m: Real, steps: int) -> "ContactKernels":
-        """Return the kernels at other positions, by cubic interpolation of four positions.
+    def at_positions(self, x_m: Real, step_count: int) -> "ContactKernels":
+        """Return the responses at other positions, by cubic interpolation of four positions.
 
         Parameters
         ----------
         x_m
             Positions within the range of those of the kernels, shape (k,).
-        steps
+        step_count
             Number of time steps of the result.
         """
-        first, weights = cubic_weights(x_m, self.x_m)
-        tables = (self.displacement[:, :steps], self.torque[:, :steps], self.shear[:, :steps])
+        first_rows, weights = cubic_weights(x_m, self.x_m)
+        kernel_tables = (
+            self.displacement[:, :step_count],
+            self.torque[:, :step_count],
+            self.shear[:, :step_count],
+        )
         return ContactKernels(
-            x_m, self.step_s, *(interpolate_rows(t, first, weights) for t in tables)
+            x_m, self.step_s, *(interpolate_rows(t, first_rows, weights) for t in kernel_tables)
         )
 
-    def with_wider_pulses(self, factor: int, steps: int) -> "ContactKernels":
-        """Return the kernels of wider triangular pulses, with longer time steps.
+    def with_wider_pulses(self, widening_factor: int, step_count: int) -> "ContactKernels":
+        """Return the responses to wider triangular pulses of force, with longer time steps.
 
         Parameters
         ----------
-        factor
+        widening_factor
             Ratio of the longer time step to the present one.
-        steps
+        step_count
             Number of time steps of the result.
         """
-        pulse = 1 - np.abs(np.arange(1 - factor, factor)) / factor
-        tables = []
-        for table in (self.displacement, self.torque, self.shear):
-            padded = np.pad(table, ((0, 0), (factor - 1, factor - 1)))
+        pulse_weights = (
+            1 - np.abs(np.arange(1 - widening_factor, widening_factor)) / widening_factor
+        )
+        wide_tables = []
+        for kernel_table in (self.displacement, self.torque, self.shear):
+            padded_table = np.pad(
+                kernel_table, ((0, 0), (widening_factor - 1, widening_factor - 1))
+            )
             # A wide hat with its peak at 0 is a sum of narrow ones from 1 - factor to factor - 1.
             wide_response = sum(
-                weight
-                * padded[:, factor - 1 - i : factor - 1 - i + (steps - 1) * factor + 1 : factor]
-                for i, weight in zip(range(1 - factor, factor), pulse, strict=True)
+                pulse_weight
+                * padded_table[
+                    :,
+                    widening_factor - 1 - i : widening_factor
+                    - 1
+                    - i
+                    + (step_count - 1) * widening_factor
+                    + 1 : widening_factor,
+                ]
+                for i, pulse_weight in zip(
+                    range(1 - widening_factor, widening_factor), pulse_weights, strict=True
+                )
             )
-            tables.append(np.ascontiguousarray(wide_response))
-        return ContactKernels(self.x_m, factor * self.step_s, *tables)
+            wide_tables.append(np.ascontiguousarray(wide_response))
+        return ContactKernels(self.x_m, widening_factor * self.step_s, *wide_tables)
 
 
 def contact_kernels(
@@ -194,7 +215,7 @@ def contact_kernels(
     damping: Damping,
     x_m: Real,
     step_s: float,
-    steps: int,
+    step_count: int,
     sensor_filter: SensorFilter = NO_FILTER,
 ) -> ContactKernels:
     """Return the responses of the exact model to a triangular pulse of force at some positions.
@@ -207,27 +228,27 @@ def contact_kernels(
         Positions of the force along the beam, shape (m,).
     step_s
         Time between two values of a kernel.
-    steps
+    step_count
         Number of values of a kernel.
     sensor_filter
         Filters of torque and shear.
     """
-    pulse = ForcePulse(step_s, steps)
-    s = pulse.line.s
-    grid = PointForceGrid(s, beam, damping)
+    force_pulse = ForcePulse(step_s, step_count)
+    s = force_pulse.line.s
+    force_grid = PointForceGrid(s, beam, damping)
     filter_response = sensor_filter.response(s)
-    stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
-    tables = np.empty((3, x_m.size, steps))
+    complex_stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
+    kernel_tables = np.empty((3, x_m.size, step_count))
     for i in range(0, x_m.size, _POSITIONS_AT_ONCE):
         x = x_m[i : i + _POSITIONS_AT_ONCE]
         responses = (
-            grid.per_force(x, x).T,
-            -filter_response * grid.per_angle(x).T,
-            filter_response * stiffness * grid.per_force(np.zeros_like(x), x, 3).T,
+            force_grid.per_force(x, x).T,
+            -filter_response * force_grid.per_angle(x).T,
+            filter_response * complex_stiffness * force_grid.per_force(np.zeros_like(x), x, 3).T,
         )
-        for table, response in zip(tables, responses, strict=True):
-            table[i : i + _POSITIONS_AT_ONCE] = pulse.kernels(response)
-    return ContactKernels(x_m, step_s, *tables)
+        for kernel_table, laplace_response in zip(kernel_tables, responses, strict=True):
+            kernel_table[i : i + _POSITIONS_AT_ONCE] = force_pulse.kernels(laplace_response)
+    return ContactKernels(x_m, step_s, *kernel_tables)
 
 
 @dataclass(frozen=True, slots=True)
@@ -245,41 +266,43 @@ class CrossKernels:
     """Displacement over time of each mode for a pulse of force, where its shape is 1; shape
     (modes, n)."""
 
-    def between_positions(self, x_m: Real, other_m: Real, steps: int) -> Real:
-        """Return the kernels between pairs of positions, by interpolation of the mode shapes.
+    def between_positions(self, x_m: Real, other_m: Real, step_count: int) -> Real:
+        """Return displacement per force pulse between pairs of positions, shape (pairs, steps).
 
         Parameters
         ----------
         x_m, other_m
             Positions of force and displacement, shape (k,); they may be exchanged.
-        steps
+        step_count
             Number of time steps of the result.
         """
         first_shapes, second_shapes = (
             interpolate_rows(self.shapes, *cubic_weights(x, self.x_m)) for x in (x_m, other_m)
         )
-        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :steps]
+        cross_kernels_of_pairs: Real = (first_shapes * second_shapes) @ self.kernels[:, :step_count]
         return cross_kernels_of_pairs
 
 
 def cross_kernels(
-    beam: Beam, damping: Damping, x_m: Real, step_s: float, steps: int
+    beam: Beam, damping: Damping, x_m: Real, step_s: float, step_count: int
 ) -> CrossKernels:
-    """Return the kernels from a force at one position to the displacement at another position.
+    """Return the displacements over time at one position per force pulse at another.
 
     The arguments are those of `contact_kernels`.
     """
-    pulse = ForcePulse(step_s, steps)
-    s = pulse.line.s
-    inertial = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
-    internal = 1 + damping.zeta * s**damping.alpha
-    wave = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
-    stiffness = beam.bending_stiffness_n_m2 * beam.length_m
-    per_force = 1 / (stiffness * (inertial + internal * wave[:, None] ** 4))
-    shapes = np.stack(
+    force_pulse = ForcePulse(step_s, step_count)
+    s = force_pulse.line.s
+    inertial_factor = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
+    stiffness_factor = 1 + damping.zeta * s**damping.alpha
+    wave_numbers = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m
+    stiffness_scale = beam.bending_stiffness_n_m2 * beam.length_m
+    per_force = 1 / (
+        stiffness_scale * (inertial_factor + stiffness_factor * wave_numbers[:, None] ** 4)
+    )
+    mode_shapes = np.stack(
         [mode_shape(i + 1, x_m / beam.length_m) for i in range(_CROSS_MODE_COUNT)], axis=1
     )
-    return CrossKernels(x_m, shapes, pulse.kernels(per_force))
+    return CrossKernels(x_m, mode_shapes, force_pulse.kernels(per_force))
 
 
 _POSITIONS_AT_ONCE = 8
@@ -300,40 +323,43 @@ def positions(length_m: float, spacing_m: float) -> Real:
     return np.linspace(_FIRST_POSITION_M, length_m, n)
 
 
-def chebyshev_nodes(x_m: Real, count: int) -> tuple[Real, Real]:
+def chebyshev_nodes(x_m: Real, node_count: int) -> tuple[Real, Real]:
     """Return Chebyshev nodes, and the matrix that interpolates from them to given positions.
 
     Parameters
     ----------
     x_m
         Increasing positions, shape (m,).
-    count
+    node_count
         Number of nodes.
 
     Returns
     -------
-    nodes_m : ndarray, shape (count,)
+    nodes_m : ndarray, shape (node_count,)
         Positions of the nodes.
     between : ndarray, shape (m, count)
         Matrix that interpolates values at the nodes to the given positions.
     """
     from numpy.polynomial import chebyshev
 
-    nodes = chebyshev.chebpts1(count)
-    scaled = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
-    at_nodes, at_positions = (chebyshev.chebvander(each, count - 1) for each in (nodes, scaled))
-    between: Real = at_positions @ np.linalg.inv(at_nodes)
-    return x_m[0] + (x_m[-1] - x_m[0]) * (nodes + 1) / 2, between
+    unit_nodes = chebyshev.chebpts1(node_count)
+    unit_positions = 2 * (x_m - x_m[0]) / (x_m[-1] - x_m[0]) - 1
+    at_nodes, at_positions = (
+        chebyshev.chebvander(unit_points, node_count - 1)
+        for unit_points in (unit_nodes, unit_positions)
+    )
+    interpolation_matrix: Real = at_positions @ np.linalg.inv(at_nodes)
+    return x_m[0] + (x_m[-1] - x_m[0]) * (unit_nodes + 1) / 2, interpolation_matrix
 
 
-def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
+def cubic_weights(positions_at: Real, grid_points: Real) -> tuple[NDArray[np.intp], Real]:
     """Return the indices and weights of a cubic interpolation on an equally spaced grid.
 
     Parameters
     ----------
-    at
+    positions_at
         Points to which is interpolated, shape (k,).
-    grid
+    grid_points
         At least four equally spaced, increasing points.
 
     Returns
@@ -343,9 +369,9 @@ def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
     weights : ndarray, shape (k, 4)
         Weights of these four grid points.
     """
-    position = (np.asarray(at) - grid[0]) / (grid[1] - grid[0])
-    first = np.clip(np.floor(position).astype(np.intp) - 1, 0, grid.size - 4)
-    u = position - first
+    grid_positions = (np.asarray(positions_at) - grid_points[0]) / (grid_points[1] - grid_points[0])
+    first_indices = np.clip(np.floor(grid_positions).astype(np.intp) - 1, 0, grid_points.size - 4)
+    u = grid_positions - first_indices
     weights = np.stack(
         [
             -(u - 1) * (u - 2) * (u - 3) / 6,
@@ -355,12 +381,12 @@ def cubic_weights(at: Real, grid: Real) -> tuple[NDArray[np.intp], Real]:
         ],
         axis=-1,
     )
-    return first, weights
+    return first_indices, weights
 
 
-def interpolate_rows(table: Real, first: NDArray[np.intp], weights: Real) -> Real:
-    """Interpolate between the rows of a table (m, n) with the result of `cubic_weights`: (k, n)."""
-    total = weights[:, 0, None] * table[first]
+def interpolate_rows(value_table: Real, first_rows: NDArray[np.intp], weights: Real) -> Real:
+    """Interpolate between the rows of a table (m, n) by `cubic_weights`; shape (k, n)."""
+    weighted_sum = weights[:, 0, None] * value_table[first_rows]
     for i in range(1, 4):
-        total += weights[:, i, None] * table[first + i]
-    return total
+        weighted_sum += weights[:, i, None] * value_table[first_rows + i]
+    return weighted_sum

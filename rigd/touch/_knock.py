@@ -13,94 +13,100 @@ _DURATIONS_S = np.array([1e-3, 2e-3, 4e-3, 8e-3, 16e-3, 32e-3])
 
 
 class KnockResponse:
-    """Effect of a knock on the record of a touch: a half-sine pulse of force.
+    """Effect of a knock on the beam, a half-sine pulse of force, on torque and base shear.
 
     A candidate has four columns: position, instant, logarithm of the duration, and peak.
 
     Parameters
     ----------
-    contact
+    obstacle_contact
         Integration of the contact for the record.
     kernels
         Contact kernels on the time steps of the integration.
-    stride
+    position_stride
         Number of the kernels' positions from one starting position of the search to the next.
     """
 
     __slots__ = ("_contact", "_kernels", "_stride")
 
-    def __init__(self, contact: ObstacleContact, kernels: ContactKernels, stride: int) -> None:
-        self._contact, self._kernels, self._stride = contact, kernels, stride
+    def __init__(
+        self, obstacle_contact: ObstacleContact, kernels: ContactKernels, position_stride: int
+    ) -> None:
+        self._contact, self._kernels, self._stride = obstacle_contact, kernels, position_stride
 
-    def predict(self, parameters: Real, window: WhitenedWindow) -> Real:
+    def predict(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
         """Return the effect of knocks on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         parameters
             Position, instant, logarithm of the duration and peak of each knock, shape (k, 4).
-        window
+        sample_window
             Samples for which the effect is predicted.
         """
-        motion = window.motion
-        last = motion.t[window.end - 1]
-        steps = int(np.ceil((last - parameters[:, 1].min()) / self._kernels.step_s)) + 3
-        steps = min(steps, self._kernels.steps)
-        local_kernels = self._kernels.at_positions(parameters[:, 0], steps)
-        phase = np.arange(steps) * self._kernels.step_s / np.exp(parameters[:, 2:3])
-        force = parameters[:, 3:4] * np.sin(np.pi * np.minimum(phase, 1.0))
-        tables = (local_kernels.torque, local_kernels.shear)[: motion.noise.size]
-        return self._contact.effects(tables, force, parameters[:, 1], window)
+        free_motion = sample_window.motion
+        last_time_s = free_motion.t[sample_window.end - 1]
+        step_count = int(np.ceil((last_time_s - parameters[:, 1].min()) / self._kernels.step_s)) + 3
+        step_count = min(step_count, self._kernels.steps)
+        local_kernels = self._kernels.at_positions(parameters[:, 0], step_count)
+        pulse_phase = np.arange(step_count) * self._kernels.step_s / np.exp(parameters[:, 2:3])
+        forces_n = parameters[:, 3:4] * np.sin(np.pi * np.minimum(pulse_phase, 1.0))
+        kernel_tables = (local_kernels.torque, local_kernels.shear)[: free_motion.noise.size]
+        return self._contact.effects(kernel_tables, forces_n, parameters[:, 1], sample_window)
 
-    def starts(self, window: WhitenedWindow, latest: int, count: int) -> Real:
-        """Return the likeliest knocks of a grid, each with its best peak, shape (count, 4).
+    def starts(self, sample_window: WhitenedWindow, latest_sample: int, knock_count: int) -> Real:
+        """Return the likeliest knocks of a grid, each with its best peak, (knock_count, 4).
 
         Parameters
         ----------
-        window
+        sample_window
             Whitened innovations with which the knocks are compared.
-        latest
+        latest_sample
             Index of the last sample at which the knock may begin.
-        count
+        knock_count
             Number of knocks that are returned.
         """
-        positions = self._kernels.x_m[:: self._stride]
-        grid = np.stack(
+        positions_m = self._kernels.x_m[:: self._stride]
+        knock_grid = np.stack(
             [
-                each.ravel()
-                for each in np.meshgrid(positions, np.log(_DURATIONS_S), [1.0], indexing="ij")
+                grid_axis.ravel()
+                for grid_axis in np.meshgrid(
+                    positions_m, np.log(_DURATIONS_S), [1.0], indexing="ij"
+                )
             ],
             axis=1,
         )
-        first = window.motion.t[window.first]
-        unit = self.predict(np.insert(grid, 1, first, axis=1), window)
-        candidates = []
-        for sample in range(window.first, latest + 1):
-            delay_samples = sample - window.first
-            delayed_effect = np.zeros_like(unit)
-            delayed_effect[:, :, delay_samples:] = unit[:, :, : unit.shape[2] - delay_samples]
-            effect = window.data - window.residuals(delayed_effect)
-            power = np.einsum("kn,kn->k", effect, effect) + 1e-300
-            peak = effect @ window.data / power
-            gain = peak**2 * power
-            rows = np.argsort(-gain)[:count]
-            candidates.append(
+        first_time_s = sample_window.motion.t[sample_window.first]
+        unit_effects = self.predict(np.insert(knock_grid, 1, first_time_s, axis=1), sample_window)
+        candidate_parts = []
+        for sample_index in range(sample_window.first, latest_sample + 1):
+            delay_samples = sample_index - sample_window.first
+            delayed_effect = np.zeros_like(unit_effects)
+            delayed_effect[:, :, delay_samples:] = unit_effects[
+                :, :, : unit_effects.shape[2] - delay_samples
+            ]
+            delayed_effects = sample_window.data - sample_window.residuals(delayed_effect)
+            effect_power = np.einsum("kn,kn->k", delayed_effects, delayed_effects) + 1e-300
+            peaks_n = delayed_effects @ sample_window.data / effect_power
+            chi2_gain = peaks_n**2 * effect_power
+            best_rows = np.argsort(-chi2_gain)[:knock_count]
+            candidate_parts.append(
                 np.column_stack(
                     [
-                        -gain[rows],
-                        grid[rows, 0],
-                        np.full(rows.size, window.motion.t[sample]),
-                        grid[rows, 1],
-                        peak[rows],
+                        -chi2_gain[best_rows],
+                        knock_grid[best_rows, 0],
+                        np.full(best_rows.size, sample_window.motion.t[sample_index]),
+                        knock_grid[best_rows, 1],
+                        peaks_n[best_rows],
                     ]
                 )
             )
-        all_candidates = np.concatenate(candidates)
-        return all_candidates[np.argsort(all_candidates[:, 0])[:count], 1:]
+        all_candidates = np.concatenate(candidate_parts)
+        return all_candidates[np.argsort(all_candidates[:, 0])[:knock_count], 1:]
 
     @staticmethod
     def space(x_m: tuple[float, float], instants: tuple[float, float]) -> ParameterRanges:
-        """Return the ranges of a knock's four parameters.
+        """Return the allowed ranges of a knock's four parameters.
 
         Parameters
         ----------

@@ -33,7 +33,7 @@ identified."""
 
 @dataclass(frozen=True, slots=True)
 class TouchModel:
-    """Exact model of the beam for the estimation of touches, with its uncertainty."""
+    """Exact beam model for the estimation of touches, with its parameters' uncertainty."""
 
     beam: Beam
     """Length, density and stiffness of the beam."""
@@ -56,41 +56,43 @@ class TouchModel:
 
     @property
     def wrench_delay_s(self) -> float:
-        """Age of torque and shear in s without the delay of the weighted mean of records."""
+        """Age of torque and shear in s, without the delay of averaging the sensor's records."""
         return self.torque_delay_s - self.sensor_filter.weights_delay_s
 
-    def with_changed_parameter(self, name: str, by: float) -> "TouchModel":
+    def with_changed_parameter(self, name: str, parameter_change: float) -> "TouchModel":
         """Return the model with one parameter changed by a given difference.
 
         Parameters
         ----------
         name
             Name of the parameter, one of `UNCERTAIN_PARAMETERS`.
-        by
+        parameter_change
             Difference in the unit of the parameter.
         """
         beam, damping = self.beam, self.damping
         match name:
             case "bending_stiffness_n_m2":
-                factor = 1 + by / beam.bending_stiffness_n_m2
+                coefficient = 1 + parameter_change / beam.bending_stiffness_n_m2
                 beam = replace(
                     beam,
-                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * factor,
-                    density_kg_per_m=beam.density_kg_per_m * factor,
+                    bending_stiffness_n_m2=beam.bending_stiffness_n_m2 * coefficient,
+                    density_kg_per_m=beam.density_kg_per_m * coefficient,
                 )
             case "density_over_stiffness":
-                factor = 1 + by / beam.density_over_stiffness
-                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * factor)
+                coefficient = 1 + parameter_change / beam.density_over_stiffness
+                beam = replace(beam, density_kg_per_m=beam.density_kg_per_m * coefficient)
             case "zeta" | "gamma":
-                damping = replace(damping, **{name: max(getattr(damping, name) + by, 0.0)})
+                damping = replace(
+                    damping, **{name: max(getattr(damping, name) + parameter_change, 0.0)}
+                )
             case "alpha" | "lambda":
                 key = "lambda_" if name == "lambda" else name
-                order = min(max(getattr(damping, key) + by, 0.0), 1.99)
-                damping = replace(damping, **{key: order})
+                exponent = min(max(getattr(damping, key) + parameter_change, 0.0), 1.99)
+                damping = replace(damping, **{key: exponent})
             case "tool_inertia_kg_m2":
-                return replace(self, tool_inertia_kg_m2=self.tool_inertia_kg_m2 + by)
+                return replace(self, tool_inertia_kg_m2=self.tool_inertia_kg_m2 + parameter_change)
             case "delay_s":
-                return replace(self, torque_delay_s=self.torque_delay_s + by)
+                return replace(self, torque_delay_s=self.torque_delay_s + parameter_change)
             case _:
                 raise ValueError(f"{name!r} is not one of {UNCERTAIN_PARAMETERS}.")
         return replace(self, beam=beam, damping=damping)
@@ -121,7 +123,7 @@ class TouchModel:
         sensor_filter
             Filters of torque and shear.
         """
-        values = {
+        parameter_values = {
             "bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
             "density_over_stiffness": beam.density_over_stiffness,
             "zeta": damping.zeta,
@@ -134,7 +136,10 @@ class TouchModel:
             angle_delay_s,
             torque_delay_s,
             sensor_filter,
-            std={name: factor * values[name] for name, factor in _ASSUMED_RELATIVE_STD.items()},
+            std={
+                parameter_name: relative_std * parameter_values[parameter_name]
+                for parameter_name, relative_std in _ASSUMED_RELATIVE_STD.items()
+            },
         )
 
     @classmethod

@@ -30,7 +30,7 @@ _MAX_DISTANCE_M = 0.3
 
 
 class TwoObstacleContact:
-    """Integration in time of the contact with two obstacles, for the record of one touch.
+    """Model of the beam's contact with two obstacles, for the record of one touch.
 
     Candidates have six columns: position, instant and logarithm of the stiffness of the first
     obstacle, then the position of the second obstacle, the free beam's distance from it at that
@@ -38,29 +38,29 @@ class TwoObstacleContact:
 
     Parameters
     ----------
-    contact
+    obstacle_contact
         Integration of the contact with one obstacle.
     kernels
         Contact kernels on the time steps of the integration.
-    crossing
+    pair_kernels
         Kernels from a force at one position to the displacement at another, on the same steps.
     """
 
     __slots__ = ("_contact", "_crossing", "_kernels")
 
     def __init__(
-        self, contact: ObstacleContact, kernels: ContactKernels, crossing: CrossKernels
+        self, obstacle_contact: ObstacleContact, kernels: ContactKernels, pair_kernels: CrossKernels
     ) -> None:
-        self._contact, self._kernels, self._crossing = contact, kernels, crossing
+        self._contact, self._kernels, self._crossing = obstacle_contact, kernels, pair_kernels
 
-    def predict(self, parameters: Real, window: WhitenedWindow) -> tuple[Real, Real]:
+    def predict(self, parameters: Real, sample_window: WhitenedWindow) -> tuple[Real, Real]:
         """Return the effect of two obstacles on torque and shear, and the force of the first.
 
         Parameters
         ----------
         parameters
             Candidates, shape (k, 6).
-        window
+        sample_window
             Samples for which the effect is predicted.
 
         Returns
@@ -70,37 +70,52 @@ class TwoObstacleContact:
         force : ndarray, shape (k, n)
             Force of the first obstacle on the beam in N, at the steps from the touch on.
         """
-        contact, instant = self._contact, parameters[:, 1]
-        steps = contact.step_count(instant, window)
-        positions = parameters[:, 0], parameters[:, 3]
-        kernels = [self._kernels.at_positions(x, steps) for x in positions]
-        (beyond, side), (beyond_other, side_other) = (
-            contact.motion_beyond_obstacle(x, instant, steps) for x in positions
+        obstacle_contact, instants_s = self._contact, parameters[:, 1]
+        step_count = obstacle_contact.step_count(instants_s, sample_window)
+        positions_m = parameters[:, 0], parameters[:, 3]
+        local_kernels = [self._kernels.at_positions(x, step_count) for x in positions_m]
+        (beyond_first_m, first_side), (beyond_second_m, second_side) = (
+            obstacle_contact.motion_beyond_obstacle(x, instants_s, step_count) for x in positions_m
         )
-        cross = self._crossing.between_positions(*positions, steps) * (side * side_other)[:, None]
-        pressing = integrate_two_contacts(
-            (kernels[0].displacement, kernels[1].displacement),
-            cross,
-            (beyond, beyond_other - parameters[:, 4:5]),
+        local_cross_kernels = (
+            self._crossing.between_positions(*positions_m, step_count)
+            * (first_side * second_side)[:, None]
+        )
+        pressing_forces_n = integrate_two_contacts(
+            (local_kernels[0].displacement, local_kernels[1].displacement),
+            local_cross_kernels,
+            (beyond_first_m, beyond_second_m - parameters[:, 4:5]),
             (np.exp(parameters[:, 2]), np.exp(parameters[:, 5])),
         )
-        forces = -side[:, None] * pressing[0], -side_other[:, None] * pressing[1]
-        channels = window.motion.noise.size
-        first, second = (
-            contact.effects((local.torque, local.shear)[:channels], force, instant, window)
-            for local, force in zip(kernels, forces, strict=True)
+        forces_n = (
+            -first_side[:, None] * pressing_forces_n[0],
+            -second_side[:, None] * pressing_forces_n[1],
         )
-        return first + second, forces[0]
+        channel_count = sample_window.motion.noise.size
+        first_effect, second_effect = (
+            obstacle_contact.effects(
+                (position_kernels.torque, position_kernels.shear)[:channel_count],
+                force_n,
+                instants_s,
+                sample_window,
+            )
+            for position_kernels, force_n in zip(local_kernels, forces_n, strict=True)
+        )
+        return first_effect + second_effect, forces_n[0]
 
-    def predict_channels(self, parameters: Real, window: WhitenedWindow) -> Real:
+    def predict_channels(self, parameters: Real, sample_window: WhitenedWindow) -> Real:
         """Return the effect of two obstacles on torque and shear, shape (k, c, samples).
 
         The arguments are those of `predict`.
         """
-        return self.predict(parameters, window)[0]
+        return self.predict(parameters, sample_window)[0]
 
     def starts(
-        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+        self,
+        single_obstacle: Real,
+        sample_window: WhitenedWindow,
+        parameter_ranges: ParameterRanges,
+        pair_count: int,
     ) -> Real:
         """Return pairs of obstacles from which the search starts, shape (k, 6).
 
@@ -111,11 +126,11 @@ class TwoObstacleContact:
         single_obstacle
             Position, instant and logarithm of the stiffness of the single obstacle that explains
             the record best.
-        window
+        sample_window
             Whitened innovations with which the pairs are compared.
-        space
+        parameter_ranges
             Ranges of the parameters.
-        count
+        pair_count
             Number of positions of a second obstacle: those with the largest reduction of the
             residuals, by first-order effects.
         """
@@ -126,47 +141,65 @@ class TwoObstacleContact:
         equivalent_pairs[:, [2, 5]] -= np.log(2 * _EQUIVALENT_POSITIONS**2)
         equivalent_pairs[:, 4] = 0.0
         return np.vstack(
-            [equivalent_pairs, self._with_second_obstacle(single_obstacle, window, space, count)]
+            [
+                equivalent_pairs,
+                self._with_second_obstacle(
+                    single_obstacle, sample_window, parameter_ranges, pair_count
+                ),
+            ]
         )
 
     def _with_second_obstacle(
-        self, single_obstacle: Real, window: WhitenedWindow, space: ParameterRanges, count: int
+        self,
+        single_obstacle: Real,
+        sample_window: WhitenedWindow,
+        parameter_ranges: ParameterRanges,
+        pair_count: int,
     ) -> Real:
-        """Return one obstacle with each of the likeliest second obstacles, shape (count, 6).
+        """Return pairs of one obstacle and a likely second obstacle, shape (pair_count, 6).
 
         Their likelihood is computed from the first-order effect of the second obstacle.
         """
-        x_m = np.linspace(space.low[3], space.high[3], _POSITION_COUNT)
-        instants = np.full(_POSITION_COUNT, single_obstacle[1])
-        steps = self._contact.step_count(instants, window)
+        x_m = np.linspace(parameter_ranges.low[3], parameter_ranges.high[3], _POSITION_COUNT)
+        instants_s = np.full(_POSITION_COUNT, single_obstacle[1])
+        step_count = self._contact.step_count(instants_s, sample_window)
         delay_steps = np.round(_SECOND_TOUCH_DELAYS_S / self._kernels.step_s).astype(np.intp)
-        beyond, _ = self._contact.motion_beyond_obstacle(x_m, instants, steps)
-        distances_m = np.maximum(beyond[:, np.minimum(delay_steps, steps - 1)], 0.0)
-        pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
-        with_second = np.tile(pair, (_POSITION_COUNT * delay_steps.size, 1))
+        beyond_m, _ = self._contact.motion_beyond_obstacle(x_m, instants_s, step_count)
+        distances_m = np.maximum(beyond_m[:, np.minimum(delay_steps, step_count - 1)], 0.0)
+        trial_pair = np.concatenate([single_obstacle, [0.0, 0.0, np.log(_TRIAL_STIFFNESS_N_PER_M)]])
+        with_second = np.tile(trial_pair, (_POSITION_COUNT * delay_steps.size, 1))
         with_second[:, 3], with_second[:, 4] = np.repeat(x_m, delay_steps.size), distances_m.ravel()
         without_second = np.concatenate(
-            [single_obstacle, [x_m[-1], space.high[4], MIN_LN_STIFFNESS]]
+            [single_obstacle, [x_m[-1], parameter_ranges.high[4], MIN_LN_STIFFNESS]]
         )
-        changed_first = without_second + np.diag(space.difference)[:3]
-        rows = np.vstack([without_second, changed_first, with_second])
-        residual = window.residuals(self.predict_channels(rows, window))
-        residual_without_second, effect = residual[0], residual[4:] - residual[0]
+        changed_first = without_second + np.diag(parameter_ranges.difference)[:3]
+        candidate_rows = np.vstack([without_second, changed_first, with_second])
+        residuals = sample_window.residuals(self.predict_channels(candidate_rows, sample_window))
+        residual_without_second, second_effects = residuals[0], residuals[4:] - residuals[0]
         # Effects that changes of the first could have are projected out of both.
         q, triangle = np.linalg.qr(
-            ((residual[1:4] - residual_without_second) / space.difference[:3, None]).T
+            ((residuals[1:4] - residual_without_second) / parameter_ranges.difference[:3, None]).T
         )
-        projected_effect = effect - (effect @ q) @ q.T
-        power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
-        factor = np.maximum(-(projected_effect @ residual_without_second) / power, 0.0)
-        gain = (factor**2 * power).reshape(_POSITION_COUNT, -1)
-        likeliest = np.argsort(-gain.max(axis=1))[:count]
-        chosen = likeliest * delay_steps.size + gain[likeliest].argmax(axis=1)
-        starts: Real = with_second[chosen]
-        starts[:, 5] += np.log(np.clip(factor[chosen], 0.1, 100.0))
-        follows = (residual_without_second + factor[chosen, None] * effect[chosen]) @ q
-        moves = -np.linalg.solve(triangle, follows.T).T
-        starts[:, :3] += np.clip(moves, -4 * space.scale[:3], 4 * space.scale[:3])
+        projected_effect = second_effects - (second_effects @ q) @ q.T
+        effect_power = np.einsum("kn,kn->k", projected_effect, projected_effect) + 1e-300
+        effect_factors = np.maximum(
+            -(projected_effect @ residual_without_second) / effect_power, 0.0
+        )
+        chi2_gain = (effect_factors**2 * effect_power).reshape(_POSITION_COUNT, -1)
+        likeliest_positions = np.argsort(-chi2_gain.max(axis=1))[:pair_count]
+        chosen_rows = likeliest_positions * delay_steps.size + chi2_gain[
+            likeliest_positions
+        ].argmax(axis=1)
+        starts: Real = with_second[chosen_rows]
+        starts[:, 5] += np.log(np.clip(effect_factors[chosen_rows], 0.1, 100.0))
+        first_obstacle_residuals = (
+            residual_without_second
+            + effect_factors[chosen_rows, None] * second_effects[chosen_rows]
+        ) @ q
+        first_obstacle_changes = -np.linalg.solve(triangle, first_obstacle_residuals.T).T
+        starts[:, :3] += np.clip(
+            first_obstacle_changes, -4 * parameter_ranges.scale[:3], 4 * parameter_ranges.scale[:3]
+        )
         return starts
 
     @staticmethod
@@ -184,7 +217,7 @@ class TwoObstacleContact:
 
     @staticmethod
     def space(single_obstacle: ParameterRanges) -> ParameterRanges:
-        """Return the ranges of the six parameters of two obstacles.
+        """Return the allowed ranges of the six parameters of two obstacles.
 
         Parameters
         ----------

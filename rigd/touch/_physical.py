@@ -36,7 +36,7 @@ window of samples, shape (k, c, samples)."""
 
 @dataclass(frozen=True, slots=True)
 class ParameterRanges:
-    """Ranges and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
+    """Bounds and step sizes of the p parameters of one kind of obstacle; arrays of shape (p,)."""
 
     low: Real
     """Smallest value of each parameter."""
@@ -69,13 +69,13 @@ class WhitenedWindow:
 
     @classmethod
     def from_motion(
-        cls, motion: FreeMotion, first: int, end: int, deviations: Real | None = None
+        cls, free_motion: FreeMotion, first: int, end: int, deviations: Real | None = None
     ) -> "WhitenedWindow":
         """Return the whitened innovations of the samples from `first` to `end`.
 
         Parameters
         ----------
-        motion
+        free_motion
             Motion of the beam without a touch in the record.
         first, end
             Index of the first sample, and of the sample after the last.
@@ -85,34 +85,40 @@ class WhitenedWindow:
             used, without those that the touch transmits.
         """
         if deviations is None:
-            deviations = motion.design[:, first:end] @ motion.spread
-        noise = motion.noise[:, None, None]
-        columns = (deviations[:, : end - first] / noise).reshape(-1, deviations.shape[2])
-        covariance = np.eye(columns.shape[0]) + columns @ columns.T
+            deviations = free_motion.design[:, first:end] @ free_motion.spread
+        noise_stds = free_motion.noise[:, None, None]
+        scaled_deviations = (deviations[:, : end - first] / noise_stds).reshape(
+            -1, deviations.shape[2]
+        )
+        covariance = np.eye(scaled_deviations.shape[0]) + scaled_deviations @ scaled_deviations.T
         whitening = np.linalg.inv(np.linalg.cholesky(covariance))
-        raw = (motion.innovations[:, first:end] / motion.noise[:, None]).ravel()
-        return cls(motion, first, end, whitening, whitening @ raw)
+        scaled_innovations = (
+            free_motion.innovations[:, first:end] / free_motion.noise[:, None]
+        ).ravel()
+        return cls(free_motion, first, end, whitening, whitening @ scaled_innovations)
 
-    def residuals(self, predicted: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
+    def residuals(self, predicted_effects: NDArray[np.floating[Any]]) -> NDArray[np.floating[Any]]:
         """Return the whitened innovations minus predicted effects of touches, shape (k, n).
 
         The result has the floating-point precision of the prediction.
 
         Parameters
         ----------
-        predicted
+        predicted_effects
             Effect of each touch on torque and base shear, shape (k, c, samples).
         """
-        noise, whitening, data = (
-            each.astype(predicted.dtype, copy=False)
-            for each in (self.motion.noise, self.whitening, self.data)
+        noise_stds, whitening, whitened_data = (
+            float_array.astype(predicted_effects.dtype, copy=False)
+            for float_array in (self.motion.noise, self.whitening, self.data)
         )
-        scaled = (predicted / noise[:, None]).reshape(predicted.shape[0], -1)
-        return data - scaled @ whitening.T
+        scaled_predictions = (predicted_effects / noise_stds[:, None]).reshape(
+            predicted_effects.shape[0], -1
+        )
+        return whitened_data - scaled_predictions @ whitening.T
 
 
 class ObstacleContact:
-    """Integration in time of the contact with obstacles, for the record of one touch.
+    """Model of the beam's contact with an obstacle, for the record of one touch.
 
     Parameters
     ----------
@@ -120,32 +126,32 @@ class ObstacleContact:
         Contact kernels at some positions, on the time steps of the integration.
     x_m
         Positions at which the displacement of the free motion is given.
-    motion
+    free_motion
         Motion of the beam without a touch in the record.
     """
 
     __slots__ = ("_kernels", "_motion", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, x_m: Real, motion: FreeMotion) -> None:
-        self._kernels, self._x_m, self._motion = kernels, x_m, motion
+    def __init__(self, kernels: ContactKernels, x_m: Real, free_motion: FreeMotion) -> None:
+        self._kernels, self._x_m, self._motion = kernels, x_m, free_motion
 
     def predict(
         self,
         parameters: Real,
-        window: WhitenedWindow,
-        side: float | None = None,
+        sample_window: WhitenedWindow,
+        pressing_side: float | None = None,
         kernels: ContactKernels | None = None,
     ) -> tuple[Real, Real]:
-        """Return the effect of obstacles on torque and shear, and the contact forces.
+        """Return the effect of obstacles on torque and shear, and the contact forces in N.
 
         Parameters
         ----------
         parameters
             Candidates with the columns of `OBSTACLE_PARAMETERS`, at least the first three; shape
             (k, p).
-        window
+        sample_window
             Samples for which the effect is predicted.
-        side
+        pressing_side
             Direction in which the beam presses, 1 or -1; None: the direction of its motion.
         kernels
             Kernels with one row for the only position; None: they are interpolated.
@@ -157,27 +163,31 @@ class ObstacleContact:
         force : ndarray, shape (k, n)
             Force on the beam in N, at the steps from the touch on.
         """
-        motion = self._motion
-        x, instant = parameters[:, 0], parameters[:, 1]
+        free_motion = self._motion
+        x, instants_s = parameters[:, 0], parameters[:, 1]
         step_s = self._kernels.step_s
-        steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at_positions(x, steps) if kernels is None else kernels
-        approach, sides = self.motion_beyond_obstacle(x, instant, steps, side)
+        time_steps = self.step_count(instants_s, sample_window)
+        local_kernels = self._kernels.at_positions(x, time_steps) if kernels is None else kernels
+        approaches_m, pressing_sides = self.motion_beyond_obstacle(
+            x, instants_s, time_steps, pressing_side
+        )
         motion_parameters = parameters[:, 3:].T
         pressing_force_n = integrate_contact(
-            np.broadcast_to(local_kernels.displacement[:, :steps], approach.shape),
-            approach,
+            np.broadcast_to(local_kernels.displacement[:, :time_steps], approaches_m.shape),
+            approaches_m,
             np.exp(parameters[:, 2]),
             step_s,
-            *(sides * motion_parameters[0],) if len(motion_parameters) else (),
+            *(pressing_sides * motion_parameters[0],) if len(motion_parameters) else (),
             *motion_parameters[1:2],
         )
-        force = -sides[:, None] * pressing_force_n
-        tables = (local_kernels.torque, local_kernels.shear)[: motion.innovations.shape[0]]
-        return self.effects(tables, force, instant, window), force
+        forces_n = -pressing_sides[:, None] * pressing_force_n
+        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+            : free_motion.innovations.shape[0]
+        ]
+        return self.effects(kernel_tables, forces_n, instants_s, sample_window), forces_n
 
     def effect_of_changed_motion(
-        self, parameters: Real, window: WhitenedWindow, displacement_changes_m: Real
+        self, parameters: Real, sample_window: WhitenedWindow, displacement_changes_m: Real
     ) -> Real:
         """Return how changes of the free motion act on torque and shear through the contact.
 
@@ -188,43 +198,55 @@ class ObstacleContact:
         ----------
         parameters
             Position, instant and logarithm of the stiffness of an obstacle at rest.
-        window
+        sample_window
             Samples for which the effect is predicted.
         displacement_changes_m
             Changes of the displacement at the obstacle's position, on the free motion's steps from
             its first step on, shape (r, columns).
         """
-        x, instant = parameters[:1], parameters[1:2]
-        steps = self.step_count(instant, window)
-        local_kernels = self._kernels.at_positions(x, steps)
-        approach, side = self.motion_beyond_obstacle(x, instant, steps)
-        instants = np.repeat(instant, len(displacement_changes_m))
-        added_approach_m = side * self._on_kernel_steps(displacement_changes_m, instants, steps)
-        all_approaches = np.vstack(
-            [approach, approach + added_approach_m - added_approach_m[:, :1]]
+        x, instant_s = parameters[:1], parameters[1:2]
+        time_steps = self.step_count(instant_s, sample_window)
+        local_kernels = self._kernels.at_positions(x, time_steps)
+        approach_m, pressing_side = self.motion_beyond_obstacle(x, instant_s, time_steps)
+        repeated_instants_s = np.repeat(instant_s, len(displacement_changes_m))
+        added_approach_m = pressing_side * self._on_kernel_steps(
+            displacement_changes_m, repeated_instants_s, time_steps
         )
-        stiffness = np.full((1, len(all_approaches)), np.exp(parameters[2]))
+        all_approaches = np.vstack(
+            [approach_m, approach_m + added_approach_m - added_approach_m[:, :1]]
+        )
+        stiffnesses_n_per_m = np.full((1, len(all_approaches)), np.exp(parameters[2]))
         pressing_force_n = integrate_contact(
-            local_kernels.displacement, all_approaches[None], stiffness, self._kernels.step_s
+            local_kernels.displacement,
+            all_approaches[None],
+            stiffnesses_n_per_m,
+            self._kernels.step_s,
         )[0]
-        tables = (local_kernels.torque, local_kernels.shear)[: self._motion.innovations.shape[0]]
+        kernel_tables = (local_kernels.torque, local_kernels.shear)[
+            : self._motion.innovations.shape[0]
+        ]
         return self.effects(
-            tables, -side * (pressing_force_n[1:] - pressing_force_n[0]), instants, window
+            kernel_tables,
+            -pressing_side * (pressing_force_n[1:] - pressing_force_n[0]),
+            repeated_instants_s,
+            sample_window,
         )
 
-    def step_count(self, instant: Real, window: WhitenedWindow) -> int:
+    def step_count(self, instants_s: Real, sample_window: WhitenedWindow) -> int:
         """Return the number of time steps from the earliest touch to the end of the window.
 
         Parameters
         ----------
-        instant
+        instants_s
             Instants of touch, shape (k,).
-        window
+        sample_window
             Samples at whose end the integration ends.
         """
         step_s = self._kernels.step_s
-        steps = int(np.ceil((self._motion.t[window.end - 1] - instant.min()) / step_s)) + 3
-        return min(max(steps, 4), self._kernels.steps)
+        needed_steps = (
+            int(np.ceil((self._motion.t[sample_window.end - 1] - instants_s.min()) / step_s)) + 3
+        )
+        return min(max(needed_steps, 4), self._kernels.steps)
 
     def pressing_direction(self, parameters: Real) -> float:
         """Return the direction of the beam's motion at a touch, 1 or -1.
@@ -237,38 +259,44 @@ class ObstacleContact:
         return float(self.motion_beyond_obstacle(parameters[:1], parameters[1:2], 1)[1][0])
 
     def effects(
-        self, tables: tuple[Real, ...], force: Real, instant: Real, window: WhitenedWindow
+        self,
+        tables: tuple[Real, ...],
+        forces_n: Real,
+        instants_s: Real,
+        sample_window: WhitenedWindow,
     ) -> Real:
         """Return the effect of contact forces on torque and base shear, shape (k, c, samples).
 
         Parameters
         ----------
         tables
-            Kernel of torque, and of shear if it is measured, with as many rows as `force` or one.
-        force
+            Kernel of torque, and of shear if measured, with as many rows as `forces_n` or one.
+        forces_n
             Forces on the beam at the steps of the kernels, shape (k, n).
-        instant
+        instants_s
             Instant of each force's first step, shape (k,).
-        window
+        sample_window
             Samples for which the effect is predicted.
         """
-        motion = self._motion
+        free_motion = self._motion
         step_s = self._kernels.step_s
-        stride = round((motion.t[1] - motion.t[0]) / step_s)
-        samples = window.end - window.first
-        begin = (motion.t[window.first] - instant) / step_s
+        steps_per_sample = round((free_motion.t[1] - free_motion.t[0]) / step_s)
+        sample_count = sample_window.end - sample_window.first
+        begin_steps = (free_motion.t[sample_window.first] - instants_s) / step_s
         # Convolution and shift commute: shifting first puts the steps of all at the samples.
-        aligned = shift_rows(force, begin, (samples - 1) * stride + 1)
-        return contact_responses(tables, aligned, stride, samples)
+        aligned_forces = shift_rows(
+            forces_n, begin_steps, (sample_count - 1) * steps_per_sample + 1
+        )
+        return contact_responses(tables, aligned_forces, steps_per_sample, sample_count)
 
     def motion_beyond_obstacle(
-        self, x: Real, instant: Real, steps: int, given_direction: float | None = None
+        self, positions_m: Real, instants_s: Real, steps: int, given_direction: float | None = None
     ) -> tuple[Real, Real]:
         """Return how far the free beam would move beyond the obstacle, and in which direction.
 
         Parameters
         ----------
-        x, instant
+        positions_m, instants_s
             Positions and instants of touches, shape (k,).
         steps
             Number of time steps from the instants on.
@@ -283,27 +311,29 @@ class ObstacleContact:
         side : ndarray, shape (k,)
             Direction of the motion, 1 or -1.
         """
-        motion = self._motion
-        first, weights = cubic_weights(x, self._x_m)
-        displacement_m = interpolate_rows(motion.displacement_m, first, weights)
-        free = self._on_kernel_steps(displacement_m, instant, steps)
+        free_motion = self._motion
+        first_rows, weights = cubic_weights(positions_m, self._x_m)
+        displacement_m = interpolate_rows(free_motion.displacement_m, first_rows, weights)
+        free_motion_m = self._on_kernel_steps(displacement_m, instants_s, steps)
         if given_direction is None:
-            before = shift_rows(displacement_m, (instant - motion.first_s) / motion.step_s - 1.0, 1)
-            side = np.where(free[:, 0] >= before[:, 0], 1.0, -1.0)
+            position_before_m = shift_rows(
+                displacement_m, (instants_s - free_motion.first_s) / free_motion.step_s - 1.0, 1
+            )
+            pressing_sides = np.where(free_motion_m[:, 0] >= position_before_m[:, 0], 1.0, -1.0)
         else:
-            side = np.full(x.size, given_direction)
-        return side[:, None] * (free - free[:, :1]), side
+            pressing_sides = np.full(positions_m.size, given_direction)
+        return pressing_sides[:, None] * (free_motion_m - free_motion_m[:, :1]), pressing_sides
 
-    def _on_kernel_steps(self, displacement_m: Real, instant: Real, steps: int) -> Real:
-        """Interpolate displacements to the kernels' time steps, each row from its instant on."""
-        motion = self._motion
-        begin = (instant - motion.first_s) / motion.step_s
-        substeps = max(1, round(motion.step_s / self._kernels.step_s))
-        interpolated = np.empty((begin.size, substeps * -(-steps // substeps)))
+    def _on_kernel_steps(self, displacement_m: Real, instants_s: Real, steps: int) -> Real:
+        """Interpolate displacements to the time steps of the contact, each row from its instant."""
+        free_motion = self._motion
+        begin_steps = (instants_s - free_motion.first_s) / free_motion.step_s
+        substeps = max(1, round(free_motion.step_s / self._kernels.step_s))
+        interpolated_m = np.empty((begin_steps.size, substeps * -(-steps // substeps)))
         for i in range(substeps):
-            part = interpolated[:, i::substeps]
-            part[:] = shift_rows(displacement_m, begin + i / substeps, part.shape[1])
-        return interpolated[:, :steps]
+            substep = interpolated_m[:, i::substeps]
+            substep[:] = shift_rows(displacement_m, begin_steps + i / substeps, substep.shape[1])
+        return interpolated_m[:, :steps]
 
 
 @dataclass(frozen=True, slots=True)
@@ -324,10 +354,10 @@ step that fails, the predicted reduction counts."""
 
 
 def find_minima(
-    predict: Prediction,
-    window: WhitenedWindow,
-    starts: Real,
-    space: ParameterRanges,
+    predict_effect: Prediction,
+    sample_window: WhitenedWindow,
+    start_candidates: Real,
+    parameter_ranges: ParameterRanges,
     rounds: int = 12,
     free: NDArray[np.bool_] | None = None,
 ) -> Minima:
@@ -335,71 +365,112 @@ def find_minima(
 
     Parameters
     ----------
-    predict
+    predict_effect
         Function that predicts the effect of candidates.
-    window
+    sample_window
         Whitened innovations with which the predictions are compared.
-    starts
+    start_candidates
         Candidates from which the iterations start, shape (k, p).
-    space
+    parameter_ranges
         Ranges of the parameters.
     rounds
         Largest number of iterations.
     free
         Whether each parameter of each start is free, shape (k, p); None: all are free.
     """
-    current = np.clip(starts, space.low, space.high)
-    damping = np.full(len(current), 1e-2)
-    residual, jacobian = _linearise(predict, window, current, space)
-    chi2 = np.einsum("kn,kn->k", residual, residual)
-    active = np.ones(len(current), dtype=bool)
-    regularisation = 1e-6 / space.scale**2
+    best_parameters = np.clip(start_candidates, parameter_ranges.low, parameter_ranges.high)
+    damping_factors = np.full(len(best_parameters), 1e-2)
+    current_residuals, jacobians = _linearise(
+        predict_effect, sample_window, best_parameters, parameter_ranges
+    )
+    chi2 = np.einsum("kn,kn->k", current_residuals, current_residuals)
+    is_active = np.ones(len(best_parameters), dtype=bool)
+    regularisation = 1e-6 / parameter_ranges.scale**2
     for _ in range(rounds):
-        rows = np.flatnonzero(active)
-        j, r = jacobian[rows], residual[rows]
+        active_rows = np.flatnonzero(is_active)
+        j, r = jacobians[active_rows], current_residuals[active_rows]
         if free is not None:
-            j = j * free[rows, None]
-        normal = np.einsum("knp,knq->kpq", j, j)
-        gradient = np.einsum("knp,kn->kp", j, r)
-        diagonal = np.einsum("kpp->kp", normal) * damping[rows, None] + regularisation
-        normal += diagonal[:, :, None] * np.eye(current.shape[1])
-        step = -np.linalg.solve(normal, gradient[:, :, None])[:, :, 0]
-        step = np.clip(step, -8 * space.scale, 8 * space.scale)
-        trial = np.clip(current[rows] + step, space.low, space.high)
-        predicted_residual = r + np.einsum("knp,kp->kn", j, trial - current[rows])
-        predicted_gain = chi2[rows] - np.einsum("kn,kn->k", predicted_residual, predicted_residual)
-        new_residual, new_jacobian = _linearise(predict, window, trial, space)
-        new_chi2 = np.einsum("kn,kn->k", new_residual, new_residual)
-        gain = chi2[rows] - new_chi2
-        is_improved = gain > 0
-        accepted_rows = rows[is_improved]
-        current[accepted_rows], chi2[accepted_rows] = trial[is_improved], new_chi2[is_improved]
-        residual[accepted_rows], jacobian[accepted_rows] = (
-            new_residual[is_improved],
+            j = j * free[active_rows, None]
+        normal_matrices = np.einsum("knp,knq->kpq", j, j)
+        gradients = np.einsum("knp,kn->kp", j, r)
+        normal_diagonals = (
+            np.einsum("kpp->kp", normal_matrices) * damping_factors[active_rows, None]
+            + regularisation
+        )
+        normal_matrices += normal_diagonals[:, :, None] * np.eye(best_parameters.shape[1])
+        parameter_steps = -np.linalg.solve(normal_matrices, gradients[:, :, None])[:, :, 0]
+        parameter_steps = np.clip(
+            parameter_steps, -8 * parameter_ranges.scale, 8 * parameter_ranges.scale
+        )
+        trial_parameters = np.clip(
+            best_parameters[active_rows] + parameter_steps,
+            parameter_ranges.low,
+            parameter_ranges.high,
+        )
+        predicted_residual = r + np.einsum(
+            "knp,kp->kn", j, trial_parameters - best_parameters[active_rows]
+        )
+        predicted_gain = chi2[active_rows] - np.einsum(
+            "kn,kn->k", predicted_residual, predicted_residual
+        )
+        new_residuals, new_jacobian = _linearise(
+            predict_effect, sample_window, trial_parameters, parameter_ranges
+        )
+        new_chi2 = np.einsum("kn,kn->k", new_residuals, new_residuals)
+        chi2_gain = chi2[active_rows] - new_chi2
+        is_improved = chi2_gain > 0
+        accepted_rows = active_rows[is_improved]
+        best_parameters[accepted_rows], chi2[accepted_rows] = (
+            trial_parameters[is_improved],
+            new_chi2[is_improved],
+        )
+        current_residuals[accepted_rows], jacobians[accepted_rows] = (
+            new_residuals[is_improved],
             new_jacobian[is_improved],
         )
-        damping[rows] = np.where(is_improved, damping[rows] / 6, damping[rows] * 8)
+        damping_factors[active_rows] = np.where(
+            is_improved, damping_factors[active_rows] / 6, damping_factors[active_rows] * 8
+        )
         # Residuals have kinks where contacts begin and end: short steps may fail to reduce them.
-        active[rows[np.where(is_improved, gain, predicted_gain) < _MIN_CHI2_REDUCTION]] = False
-        if not active.any():
+        is_active[
+            active_rows[np.where(is_improved, chi2_gain, predicted_gain) < _MIN_CHI2_REDUCTION]
+        ] = False
+        if not is_active.any():
             break
-    return Minima(current, chi2, jacobian)
+    return Minima(best_parameters, chi2, jacobians)
 
 
 def _linearise(
-    predict: Prediction, window: WhitenedWindow, current: Real, space: ParameterRanges
+    predict_effect: Prediction,
+    sample_window: WhitenedWindow,
+    current_candidates: Real,
+    parameter_ranges: ParameterRanges,
 ) -> tuple[Real, Real]:
-    """Return the residuals of candidates, (k, n), and derivatives by the parameters, (k, n, p)."""
-    width = current.shape[1]
-    shifts = np.where(current + space.difference > space.high, -space.difference, space.difference)
-    rows = np.concatenate([current, *(current + np.eye(width)[i] * shifts for i in range(width))])
-    residuals = window.residuals(predict(rows, window)).reshape(width + 1, len(current), -1)
-    derivatives = (residuals[1:] - residuals[0]) / shifts.T[:, :, None]
+    """Return candidates' residuals (k, n), and their derivatives by the parameters (k, n, p)."""
+    parameter_count = current_candidates.shape[1]
+    parameter_shifts = np.where(
+        current_candidates + parameter_ranges.difference > parameter_ranges.high,
+        -parameter_ranges.difference,
+        parameter_ranges.difference,
+    )
+    shifted_candidates = np.concatenate(
+        [
+            current_candidates,
+            *(
+                current_candidates + np.eye(parameter_count)[i] * parameter_shifts
+                for i in range(parameter_count)
+            ),
+        ]
+    )
+    residuals = sample_window.residuals(predict_effect(shifted_candidates, sample_window)).reshape(
+        parameter_count + 1, len(current_candidates), -1
+    )
+    derivatives = (residuals[1:] - residuals[0]) / parameter_shifts.T[:, :, None]
     return residuals[0], np.moveaxis(derivatives, 0, -1)
 
 
 class CandidateGrid:
-    """Grid of candidates over position, instant and stiffness, from which the search starts.
+    """Grid of candidate obstacles over position, instant and stiffness, to start a search.
 
     All candidates are integrated together in coarse time steps.
 
@@ -407,101 +478,118 @@ class CandidateGrid:
     ----------
     kernels
         Contact kernels whose step divides the sampling period.
-    stride
+    position_stride
         Number of the kernels' positions from one position of the grid to the next.
     rate_hz
         Samples a second.
-    samples
+    sample_count
         Number of samples that are compared.
     """
 
     __slots__ = ("_channels", "_kernel", "_ratio", "_samples", "_step_s", "_stride", "_x_m")
 
-    def __init__(self, kernels: ContactKernels, stride: int, rate_hz: float, samples: int) -> None:
+    def __init__(
+        self, kernels: ContactKernels, position_stride: int, rate_hz: float, sample_count: int
+    ) -> None:
         self._ratio = round(1 / (rate_hz * kernels.step_s))
-        self._samples, self._stride, self._step_s = samples, stride, kernels.step_s
-        steps = self._ratio * samples
-        self._x_m = kernels.x_m[::stride]
+        self._samples, self._stride, self._step_s = sample_count, position_stride, kernels.step_s
+        time_steps = self._ratio * sample_count
+        self._x_m = kernels.x_m[::position_stride]
         # Single precision suffices for choosing starts, and is twice as fast.
-        self._kernel = kernels.displacement[::stride, :steps].astype(np.float32)
-        lag = self._ratio * np.arange(samples)[:, None] - np.arange(steps)
+        self._kernel = kernels.displacement[::position_stride, :time_steps].astype(np.float32)
+        lag_steps = self._ratio * np.arange(sample_count)[:, None] - np.arange(time_steps)
         self._channels = [
-            np.where(lag >= 0, table[::stride][:, np.maximum(lag, 0)], 0.0)
+            np.where(
+                lag_steps >= 0, kernel_table[::position_stride][:, np.maximum(lag_steps, 0)], 0.0
+            )
             .transpose(0, 2, 1)
             .astype(np.float32)
-            for table in (kernels.torque, kernels.shear)
+            for kernel_table in (kernels.torque, kernels.shear)
         ]  # (positions, steps, samples)
 
     def integrate(
-        self, motion: FreeMotion, window: WhitenedWindow, latest: int
+        self, free_motion: FreeMotion, sample_window: WhitenedWindow, latest_sample: int
     ) -> tuple[Real, Real]:
-        """Return all candidates of the grid, and their sums of squared residuals.
+        """Return all candidate obstacles of the grid, and their sums of squared residuals.
 
         Parameters
         ----------
-        motion
+        free_motion
             Motion of the beam without a touch in the record.
-        window
+        sample_window
             Whitened innovations with which the candidates are compared.
-        latest
+        latest_sample
             Index of the last sample at which the touch may begin. The earliest is the first sample
             of the window.
         """
-        samples = np.arange(window.first + 1, latest + 1)
-        batches = np.array_split(samples, -(-samples.size // _INSTANTS_AT_ONCE))
-        chi2 = [self._sums_of_squares(motion, window, batch) for batch in batches]
-        starts = np.meshgrid(
-            self._x_m, motion.t[samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
+        touch_samples = np.arange(sample_window.first + 1, latest_sample + 1)
+        sample_batches = np.array_split(touch_samples, -(-touch_samples.size // _INSTANTS_AT_ONCE))
+        chi2 = [
+            self._sums_of_squares(free_motion, sample_window, sample_batch)
+            for sample_batch in sample_batches
+        ]
+        grid_axes = np.meshgrid(
+            self._x_m, free_motion.t[touch_samples], np.log(GRID_STIFFNESSES_N_PER_M), indexing="ij"
         )
-        return np.stack(starts, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
+        return np.stack(grid_axes, axis=-1).reshape(-1, 3), np.concatenate(chi2, axis=1).ravel()
 
     def _sums_of_squares(
-        self, motion: FreeMotion, window: WhitenedWindow, samples: NDArray[np.intp]
+        self, free_motion: FreeMotion, sample_window: WhitenedWindow, samples: NDArray[np.intp]
     ) -> Real:
-        """Return sums of squared residuals for touches at some samples.
+        """Return the grid candidates' sums of squared residuals for touches at some samples.
 
         The shape is (positions, instants, stiffnesses).
         """
-        positions, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
-        length = window.end - int(samples[0])
-        steps = self._ratio * length
-        begins = np.round((motion.t[samples] - motion.first_s) / motion.step_s).astype(np.intp)
-        columns = begins[:, None] + np.arange(-1, steps)
-        last = motion.displacement_m.shape[1] - 1
-        displacement_m = motion.displacement_m[:: self._stride][:, np.minimum(columns, last)]
+        position_count, stiffness_count = self._x_m.size, GRID_STIFFNESSES_N_PER_M.size
+        sample_count = sample_window.end - int(samples[0])
+        time_steps = self._ratio * sample_count
+        begin_steps = np.round(
+            (free_motion.t[samples] - free_motion.first_s) / free_motion.step_s
+        ).astype(np.intp)
+        step_columns = begin_steps[:, None] + np.arange(-1, time_steps)
+        last_column = free_motion.displacement_m.shape[1] - 1
+        displacement_m = free_motion.displacement_m[:: self._stride][
+            :, np.minimum(step_columns, last_column)
+        ]
         # Axes: position, instant, step.
-        side = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
+        pressing_sides = np.where(displacement_m[:, :, 1] >= displacement_m[:, :, 0], 1, -1)[
             :, :, None
         ].astype(np.float32)
-        approach = (side * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])).astype(
-            np.float32
-        )
+        approaches_m = (
+            pressing_sides * (displacement_m[:, :, 1:] - displacement_m[:, :, 1:2])
+        ).astype(np.float32)
         pressing_force_n = integrate_contact(
-            self._kernel[:, :steps],
-            np.repeat(approach, stiffness_count, axis=1),
-            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (positions, samples.size)),
+            self._kernel[:, :time_steps],
+            np.repeat(approaches_m, stiffness_count, axis=1),
+            np.tile(GRID_STIFFNESSES_N_PER_M.astype(np.float32), (position_count, samples.size)),
             self._step_s,
         )
-        force = -np.repeat(side, stiffness_count, axis=1) * pressing_force_n
-        predicted = np.zeros(
+        forces_n = -np.repeat(pressing_sides, stiffness_count, axis=1) * pressing_force_n
+        predicted_effects = np.zeros(
             (
-                positions,
+                position_count,
                 samples.size,
                 stiffness_count,
-                motion.noise.size,
-                window.end - window.first,
+                free_motion.noise.size,
+                sample_window.end - sample_window.first,
             ),
             dtype=np.float32,
         )
-        for channel in range(motion.noise.size):
-            effect = force @ self._channels[channel][:, :steps, :length]
-            effect = effect.reshape(positions, samples.size, stiffness_count, length)
-            for i, sample in enumerate(samples):
-                count = window.end - sample
-                predicted[:, i, :, channel, -count:] = effect[:, i, :, :count]
-        residual = window.residuals(predicted.reshape(-1, *predicted.shape[3:]))
-        chi2: Real = np.einsum("kn,kn->k", residual, residual)
-        return chi2.reshape(positions, samples.size, stiffness_count)
+        for channel_index in range(free_motion.noise.size):
+            channel_effect = forces_n @ self._channels[channel_index][:, :time_steps, :sample_count]
+            channel_effect = channel_effect.reshape(
+                position_count, samples.size, stiffness_count, sample_count
+            )
+            for i, touch_sample in enumerate(samples):
+                later_samples = sample_window.end - touch_sample
+                predicted_effects[:, i, :, channel_index, -later_samples:] = channel_effect[
+                    :, i, :, :later_samples
+                ]
+        sample_residuals = sample_window.residuals(
+            predicted_effects.reshape(-1, *predicted_effects.shape[3:])
+        )
+        chi2: Real = np.einsum("kn,kn->k", sample_residuals, sample_residuals)
+        return chi2.reshape(position_count, samples.size, stiffness_count)
 
 
 _INSTANTS_AT_ONCE = 16
@@ -510,18 +598,18 @@ GRID_STIFFNESSES_N_PER_M = np.array([60.0, 300.0, 1000.0, 3000.0, 10000.0, 10000
 """Stiffnesses of the grid's candidates in N/m."""
 
 
-def chi2_of(predict: Prediction, window: WhitenedWindow, candidates: Real) -> Real:
-    """Return the sum of squared residuals of each candidate, shape (k,).
+def chi2_of(predict_effect: Prediction, sample_window: WhitenedWindow, candidates: Real) -> Real:
+    """Return the sum of squared residuals of each candidate obstacle, shape (k,).
 
     Parameters
     ----------
-    predict
+    predict_effect
         Function that predicts the effect of candidates.
-    window
+    sample_window
         Whitened innovations with which the predictions are compared.
     candidates
         Parameters of the candidates, shape (k, p).
     """
-    residual = window.residuals(predict(candidates, window))
-    chi2: Real = np.einsum("kn,kn->k", residual, residual)
+    candidate_residuals = sample_window.residuals(predict_effect(candidates, sample_window))
+    chi2: Real = np.einsum("kn,kn->k", candidate_residuals, candidate_residuals)
     return chi2

@@ -27,7 +27,7 @@ _MAX_CENTRES = 16
 
 @dataclass(frozen=True, slots=True)
 class Posterior:
-    """Posterior distribution of an obstacle's parameters, as weighted samples."""
+    """Posterior distribution of an obstacle's parameters, such as position, as weighted samples."""
 
     samples: Real
     """Parameters of each sample, shape (n, p)."""
@@ -41,41 +41,41 @@ class Posterior:
         """Effective number of samples: number of equal weights with the same precision."""
         return float(1 / np.sum(self.weights**2))
 
-    def quantiles(self, column: int, levels: tuple[float, ...]) -> Real:
-        """Return quantiles of a parameter's posterior distribution.
+    def quantiles(self, parameter_column: int, quantile_levels: tuple[float, ...]) -> Real:
+        """Return quantiles of the posterior distribution of one obstacle parameter.
 
         Parameters
         ----------
-        column
+        parameter_column
             Column of the parameter.
-        levels
+        quantile_levels
             Probabilities of the quantiles, between 0 and 1.
         """
-        values = self.samples[:, column]
-        order = np.argsort(values)
-        cumulated = np.cumsum(self.weights[order]) - 0.5 * self.weights[order]
-        return np.interp(levels, cumulated, values[order])
+        parameter_values = self.samples[:, parameter_column]
+        value_order = np.argsort(parameter_values)
+        cumulated_weights = np.cumsum(self.weights[value_order]) - 0.5 * self.weights[value_order]
+        return np.interp(quantile_levels, cumulated_weights, parameter_values[value_order])
 
-    def mean(self, column: int) -> float:
-        """Return the posterior mean of a parameter.
-
-        Parameters
-        ----------
-        column
-            Column of the parameter.
-        """
-        return float(self.weights @ self.samples[:, column])
-
-    def std(self, column: int) -> float:
-        """Return the posterior standard deviation of a parameter.
+    def mean(self, parameter_column: int) -> float:
+        """Return the mean of one obstacle parameter's posterior distribution.
 
         Parameters
         ----------
-        column
+        parameter_column
             Column of the parameter.
         """
-        deviation = self.samples[:, column] - self.mean(column)
-        return float(np.sqrt(self.weights @ deviation**2))
+        return float(self.weights @ self.samples[:, parameter_column])
+
+    def std(self, parameter_column: int) -> float:
+        """Return the standard deviation of one obstacle parameter's posterior distribution.
+
+        Parameters
+        ----------
+        parameter_column
+            Column of the parameter.
+        """
+        deviations = self.samples[:, parameter_column] - self.mean(parameter_column)
+        return float(np.sqrt(self.weights @ deviations**2))
 
 
 def sample_posterior(
@@ -90,7 +90,7 @@ def sample_posterior(
     enough_samples: float,
     smallest_std: Real,
 ) -> Posterior:
-    """Draw weighted samples of the posterior, with a uniform prior within the bounds.
+    """Draw weighted samples of obstacle parameters from the posterior, uniform prior in bounds.
 
     Parameters
     ----------
@@ -114,71 +114,83 @@ def sample_posterior(
         Smallest standard deviation for drawing samples, shape (p,).
     """
     rng = np.random.default_rng(0)  # the same record gives the same answer
-    width = centres.shape[1]
-    low, high = bounds
+    parameter_count = centres.shape[1]
+    lower_bounds, upper_bounds = bounds
     mixture = np.full(len(centres), 1 / len(centres))
-    samples = np.empty((0, width))
+    samples = np.empty((0, parameter_count))
     chi2 = np.empty(0)
-    density = np.empty(0)
+    proposal_density = np.empty(0)
     proposals: list[tuple[Real, Real, Real]] = []
     posterior = None
     for _ in range(rounds):
-        chosen = rng.choice(len(centres), count, p=mixture)
-        factors = np.linalg.cholesky(covariances)
-        normal = rng.standard_normal((count, width))
+        chosen_centres = rng.choice(len(centres), count, p=mixture)
+        centre_factors = np.linalg.cholesky(covariances)
+        normal_numbers = rng.standard_normal((count, parameter_count))
         student_scale = np.sqrt(_STUDENT_DEGREES / rng.chisquare(_STUDENT_DEGREES, count))
-        drawn = centres[chosen] + student_scale[:, None] * np.einsum(
-            "kpq,kq->kp", factors[chosen], normal
+        drawn_samples = centres[chosen_centres] + student_scale[:, None] * np.einsum(
+            "kpq,kq->kp", centre_factors[chosen_centres], normal_numbers
         )
-        in_bounds = np.all((drawn >= low) & (drawn <= high), axis=1)
+        is_in_bounds = np.all(
+            (drawn_samples >= lower_bounds) & (drawn_samples <= upper_bounds), axis=1
+        )
         drawn_chi2 = np.full(count, np.inf)
-        if in_bounds.any():
-            drawn_chi2[in_bounds] = chi2_of(drawn[in_bounds])
+        if is_in_bounds.any():
+            drawn_chi2[is_in_bounds] = chi2_of(drawn_samples[is_in_bounds])
         proposals.append((centres, covariances, mixture))
-        density = density + _density(samples, *proposals[-1]) if samples.size else density
-        own_density = sum(_density(drawn, *each) for each in proposals)
-        samples = np.concatenate([samples, drawn])
+        proposal_density = (
+            proposal_density + _density(samples, *proposals[-1])
+            if samples.size
+            else proposal_density
+        )
+        own_density = sum(_density(drawn_samples, *proposal) for proposal in proposals)
+        samples = np.concatenate([samples, drawn_samples])
         chi2 = np.concatenate([chi2, drawn_chi2])
-        density = np.concatenate([density, own_density])
-        log_weights = -0.5 * (chi2 - chi2.min()) / scale - np.log(density)
+        proposal_density = np.concatenate([proposal_density, own_density])
+        log_weights = -0.5 * (chi2 - chi2.min()) / scale - np.log(proposal_density)
         weights = np.exp(log_weights - log_weights.max())
         weights /= weights.sum()
         posterior = Posterior(samples, weights, chi2)
         if posterior.effective_samples > enough_samples and len(proposals) > 1:
             break
         # Tempered weights choose the next centres, so that one lucky sample does not dominate.
-        tempered = weights**0.5
-        tempered /= tempered.sum()
-        best = np.argsort(-tempered)[:_MAX_CENTRES]
-        centres, mixture = samples[best], tempered[best] / tempered[best].sum()
-        mean = tempered @ samples
-        deviation = samples - mean
+        tempered_weights = weights**0.5
+        tempered_weights /= tempered_weights.sum()
+        best_centre = np.argsort(-tempered_weights)[:_MAX_CENTRES]
+        centres, mixture = (
+            samples[best_centre],
+            tempered_weights[best_centre] / tempered_weights[best_centre].sum(),
+        )
+        weighted_mean = tempered_weights @ samples
+        deviations = samples - weighted_mean
         clipped_deviation = np.minimum(
-            np.abs(deviation),
+            np.abs(deviations),
             6 * np.sqrt(weights @ (samples - weights @ samples) ** 2) + smallest_std,
-        ) * np.sign(deviation)
-        covariance = (clipped_deviation * tempered[:, None]).T @ clipped_deviation
-        shrink = max(len(best), 2) ** (-2 / (width + 4))
+        ) * np.sign(deviations)
+        covariance = (clipped_deviation * tempered_weights[:, None]).T @ clipped_deviation
+        shrink_factor = max(len(best_centre), 2) ** (-2 / (parameter_count + 4))
         covariances = np.broadcast_to(
-            shrink * covariance + np.diag(smallest_std**2), (len(best), width, width)
+            shrink_factor * covariance + np.diag(smallest_std**2),
+            (len(best_centre), parameter_count, parameter_count),
         )
     assert posterior is not None
     return posterior
 
 
-def _density(samples: Real, centres: Real, covariances: Real, mixture: Real) -> Real:
+def _density(samples: Real, centres: Real, covariances: Real, mixture_weights: Real) -> Real:
     """Return the density of a mixture of Student distributions at samples, shape (n,).
 
     A constant factor is omitted.
     """
-    width = samples.shape[1]
-    total = np.zeros(samples.shape[0])
-    for centre, covariance, weight in zip(centres, covariances, mixture, strict=True):
-        factor = np.linalg.cholesky(covariance)
-        scaled = np.linalg.solve(factor, (samples - centre).T)
-        distance = np.sum(scaled**2, axis=0)
-        peak_density = weight / np.prod(np.diag(factor))
-        total += peak_density * (1 + distance / _STUDENT_DEGREES) ** (
-            -(_STUDENT_DEGREES + width) / 2
+    parameter_count = samples.shape[1]
+    total_density = np.zeros(samples.shape[0])
+    for proposal_centre, covariance, centre_weight in zip(
+        centres, covariances, mixture_weights, strict=True
+    ):
+        cholesky_factor = np.linalg.cholesky(covariance)
+        scaled_deviations = np.linalg.solve(cholesky_factor, (samples - proposal_centre).T)
+        squared_distances = np.sum(scaled_deviations**2, axis=0)
+        peak_density = centre_weight / np.prod(np.diag(cholesky_factor))
+        total_density += peak_density * (1 + squared_distances / _STUDENT_DEGREES) ** (
+            -(_STUDENT_DEGREES + parameter_count) / 2
         )
-    return total
+    return total_density

@@ -11,7 +11,7 @@ Real = NDArray[np.float64]
 
 @dataclass(frozen=True, slots=True)
 class Estimated:
-    """Estimated number with its uncertainty."""
+    """Estimated number, with its standard deviation and its 95 % interval."""
 
     value: float
     """Estimated value."""
@@ -21,7 +21,7 @@ class Estimated:
     """Interval that contains the true value in 95 of 100 records."""
 
     def as_dict(self) -> dict[str, Any]:
-        """Return value, standard deviation and interval as a document of JSON types."""
+        """Return value, standard deviation and 95 % interval as a dictionary of JSON types."""
         return {"value": self.value, "std": self.std, "interval_95": list(self.interval_95)}
 
 
@@ -70,26 +70,31 @@ class TouchEstimate:
         return self.time_s is not None
 
     def as_dict(self, start_s: float = 0.0) -> dict[str, Any]:
-        """Return the estimate of the touch as a document of JSON types.
+        """Return the estimate of the touch as a dictionary of JSON types.
 
         Parameters
         ----------
         start_s
             Time of the record's first sample, which is added to the instant of touch.
         """
-        time = self.time_s
-        if time is not None:
-            low, high = time.interval_95
-            time = replace(
-                time, value=time.value + start_s, interval_95=(low + start_s, high + start_s)
+        touch_time = self.time_s
+        if touch_time is not None:
+            low_s, high_s = touch_time.interval_95
+            touch_time = replace(
+                touch_time,
+                value=touch_time.value + start_s,
+                interval_95=(low_s + start_s, high_s + start_s),
             )
         quantities = {
             "x_m": self.x_m,
-            "time_s": time,
+            "time_s": touch_time,
             "force_n": self.force_n,
             "stiffness_n_per_m": self.stiffness_n_per_m,
         }
-        return {name: each and each.as_dict() for name, each in quantities.items()} | {
+        return {
+            quantity_name: estimated and estimated.as_dict()
+            for quantity_name, estimated in quantities.items()
+        } | {
             "kind": self.kind,
             "model": self.model,
         }

@@ -12,7 +12,7 @@ Complex = NDArray[np.complex128]
 
 @dataclass(frozen=True, slots=True)
 class SensorFilter:
-    """Filters of torque and shear between the beam and the samples of a session.
+    """Low-pass filter and averaging of torque and shear by the force sensor.
 
     Examples
     --------
@@ -35,9 +35,9 @@ class SensorFilter:
 
     @classmethod
     def of_records(
-        cls, corner_hz: float, order: int, kind: str, records: int, spacing_s: float
+        cls, corner_hz: float, order: int, kind: str, record_count: int, spacing_s: float
     ) -> "SensorFilter":
-        """Return the filter of a sensor that makes several records per tick.
+        """Return the filter of a sensor that sends several readings per tick, which are averaged.
 
         Parameters
         ----------
@@ -46,19 +46,19 @@ class SensorFilter:
         kind
             How the records form a sample: "mean" of those in one tick, or weighted by a "triangle"
             over two ticks.
-        records
+        record_count
             Number of records a tick.
         spacing_s
             Time between two records.
         """
-        weights = np.full(records, 1 / records)
+        record_weights = np.full(record_count, 1 / record_count)
         if kind == "triangle":
-            weights = np.convolve(weights, weights)
-        return cls(corner_hz, order, tuple(weights.tolist()), spacing_s)
+            record_weights = np.convolve(record_weights, record_weights)
+        return cls(corner_hz, order, tuple(record_weights.tolist()), spacing_s)
 
     @property
     def weights_delay_s(self) -> float:
-        """Group delay in s of the weighted mean of records, part of the stated age of a sample."""
+        """Group delay in s of the weighted mean of the sensor's readings of one tick."""
         return 0.5 * (len(self.weights) - 1) * self.spacing_s
 
     def response(self, s: ArrayLike) -> Complex:
@@ -69,13 +69,15 @@ class SensorFilter:
         s
             Laplace variable in rad/s, of any shape.
         """
-        points = np.asarray(s, dtype=np.complex128)
-        ages = self.spacing_s * np.arange(len(self.weights))[::-1]
-        values: Complex = np.exp(np.multiply.outer(points, -ages)) @ np.array(self.weights)
+        laplace_points = np.asarray(s, dtype=np.complex128)
+        record_ages_s = self.spacing_s * np.arange(len(self.weights))[::-1]
+        filter_response: Complex = np.exp(
+            np.multiply.outer(laplace_points, -record_ages_s)
+        ) @ np.array(self.weights)
         if self.corner_hz > 0:
-            u = points / (2 * pi * self.corner_hz)
-            values /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
-        return values
+            u = laplace_points / (2 * pi * self.corner_hz)
+            filter_response /= 1 + u if self.order == 1 else 1 + u * (sqrt(2) + u)
+        return filter_response
 
 
 NO_FILTER: Final = SensorFilter()

@@ -43,7 +43,7 @@ remain."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class WatchedBeam:
-    """Model and signatures of a beam for a `TouchDetector`."""
+    """Beam model and effects of touches on it, with which a `TouchDetector` compares readings."""
 
     observed: ObservedBeam
     """Model of the free beam, with the noise of its readings."""
@@ -51,7 +51,7 @@ class WatchedBeam:
     """Signatures of touches from the function `signatures`, shape (signatures, 2 · ticks)."""
 
 
-def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> WatchedBeam:
+def watched_beam(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) -> WatchedBeam:
     """Return the model and the signatures of a beam, with which touches are detected.
 
     Parameters
@@ -60,20 +60,22 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise: ChannelNoise) -> Wa
         Model of the beam.
     rate_hz
         Ticks a second.
-    noise
+    noise_stds
         Noise of torque, base shear and angle.
     """
-    observed = observed_beam(
+    observed_model = observed_beam(
         model.beam,
         model.damping,
         rate_hz,
-        noise,
+        noise_stds,
         tool_inertia_kg_m2=model.tool_inertia_kg_m2,
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,
     )
-    vectors = signatures(model.beam, model.damping, rate_hz, observed, model.sensor_filter)
-    return WatchedBeam(observed, vectors)
+    unit_signatures = signatures(
+        model.beam, model.damping, rate_hz, observed_model, model.sensor_filter
+    )
+    return WatchedBeam(observed_model, unit_signatures)
 
 
 def signatures(
@@ -103,36 +105,38 @@ def signatures(
     ndarray of shape (signatures, 2 · ticks)
         Innovations of torque and shear for each tick, the oldest tick first.
     """
-    ages = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
-    ticks = int(ages.max())
+    ages_ticks = np.maximum(1, np.round(_CONTACT_AGES_S * rate_hz)).astype(int)
+    tick_count = int(ages_ticks.max())
     step_s = 1 / (_STEPS_PER_TICK * rate_hz)
-    positions = beam.length_m * _POSITION_FRACTIONS
+    positions_m = beam.length_m * _POSITION_FRACTIONS
     kernels = contact_kernels(
-        beam, damping, positions, step_s, _STEPS_PER_TICK * ticks + 1, sensor_filter
+        beam, damping, positions_m, step_s, _STEPS_PER_TICK * tick_count + 1, sensor_filter
     )
-    approach = positions[:, None] * step_s * np.arange(kernels.steps)
-    per_tick = _impulse_responses(model, ticks)
+    approaches_m = positions_m[:, None] * step_s * np.arange(kernels.steps)
+    impulse_responses = _impulse_responses(model, tick_count)
 
     signature_blocks = []
-    for stiffness in _STIFFNESSES_N_PER_M:
-        force = integrate_contact(
-            kernels.displacement, approach, np.full(positions.size, stiffness), step_s
+    for stiffness_n_per_m in _STIFFNESSES_N_PER_M:
+        forces_n = integrate_contact(
+            kernels.displacement, approaches_m, np.full(positions_m.size, stiffness_n_per_m), step_s
         )
-        readings = contact_responses(
+        tick_readings = contact_responses(
             (kernels.torque, kernels.shear),
-            force,
+            forces_n,
             _STEPS_PER_TICK // _CONTACT_PHASES,
-            _CONTACT_PHASES * ticks + 1,
+            _CONTACT_PHASES * tick_count + 1,
         )
-        for phase in range(1, _CONTACT_PHASES + 1):
-            at_ticks = (
-                readings[:, :, phase::_CONTACT_PHASES].transpose(0, 2, 1).reshape(-1, 2 * ticks)
+        for tick_phase in range(1, _CONTACT_PHASES + 1):
+            tick_forces = (
+                tick_readings[:, :, tick_phase::_CONTACT_PHASES]
+                .transpose(0, 2, 1)
+                .reshape(-1, 2 * tick_count)
             )
-            innovations = at_ticks @ per_tick
-            for age in ages:
-                rows = np.zeros_like(innovations)
-                rows[:, 2 * (ticks - age) :] = innovations[:, : 2 * age]
-                signature_blocks.append(rows)
+            innovations = tick_forces @ impulse_responses
+            for age in ages_ticks:
+                age_rows = np.zeros_like(innovations)
+                age_rows[:, 2 * (tick_count - age) :] = innovations[:, : 2 * age]
+                signature_blocks.append(age_rows)
     all_signatures = np.concatenate(signature_blocks)
     norms = np.linalg.norm(all_signatures, axis=1)
     return _select_dissimilar(all_signatures[norms > 0] / norms[norms > 0, None])
@@ -143,26 +147,30 @@ def _impulse_responses(model: ObservedBeam, ticks: int) -> Real:
 
     The shape is (2 · ticks, 2 · ticks).
     """
-    table = np.zeros((2 * ticks, 2 * ticks))
-    for channel, impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
-        filter_ = InnovationFilter(model)
+    response_matrix = np.zeros((2 * ticks, 2 * ticks))
+    for channel_index, unit_impulse in enumerate(((1.0, 0.0), (0.0, 1.0))):
+        innovation_filter = InnovationFilter(model)
         for tick in range(ticks):
-            filter_.step(0.0, *(impulse if tick == 0 else (0.0, 0.0)))
-            for begin in range(ticks - tick):
-                at = 2 * (begin + tick)
-                table[2 * begin + channel, at : at + 2] = filter_.whitened
-    return table
+            innovation_filter.step(0.0, *(unit_impulse if tick == 0 else (0.0, 0.0)))
+            for row_begin in range(ticks - tick):
+                at = 2 * (row_begin + tick)
+                response_matrix[2 * row_begin + channel_index, at : at + 2] = (
+                    innovation_filter.whitened
+                )
+    return response_matrix
 
 
-def _select_dissimilar(rows: Real) -> Real:
+def _select_dissimilar(unit_vectors: Real) -> Real:
     """Return a selection of unit vectors such that every other vector is similar to one of them.
 
     Each selected vector is the one that is least similar to those selected before.
     """
-    selected = [0]
-    similarity = np.abs(rows @ rows[0])
-    while similarity.min() < _REDUNDANT_CORRELATION:
-        farthest = int(similarity.argmin())
-        selected.append(farthest)
-        np.maximum(similarity, np.abs(rows @ rows[farthest]), out=similarity)
-    return rows[selected]
+    selected_rows = [0]
+    similarities = np.abs(unit_vectors @ unit_vectors[0])
+    while similarities.min() < _REDUNDANT_CORRELATION:
+        farthest_row = int(similarities.argmin())
+        selected_rows.append(farthest_row)
+        np.maximum(
+            similarities, np.abs(unit_vectors @ unit_vectors[farthest_row]), out=similarities
+        )
+    return unit_vectors[selected_rows]

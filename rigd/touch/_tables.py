@@ -21,27 +21,27 @@ _SPACING_M = 0.007
 
 
 class TouchTables:
-    """Precomputed quantities for the estimation of touches with one model at one rate."""
+    """Precomputed contact responses for the estimation of touches, for one beam model and rate."""
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
         self.x_m = positions(model.beam.length_m, _SPACING_M)
         steps_per_sample = 4 * max(1, round(4000 / rate_hz))
-        steps = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
+        step_count = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
         self.finest = contact_kernels(
             model.beam,
             model.damping,
             self.x_m,
             1 / (steps_per_sample * rate_hz),
-            steps,
+            step_count,
             model.sensor_filter,
         )
-        self.middle = self.finest.with_wider_pulses(2, steps // 2)
+        self.middle = self.finest.with_wider_pulses(2, step_count // 2)
         self.coarse = self.finest.with_wider_pulses(
-            steps_per_sample // 4, steps // (steps_per_sample // 4)
+            steps_per_sample // 4, step_count // (steps_per_sample // 4)
         )
         half_sample_kernels = self.finest.with_wider_pulses(
-            steps_per_sample // 2, steps // (steps_per_sample // 2)
+            steps_per_sample // 2, step_count // (steps_per_sample // 2)
         )
         self.crossing = cross_kernels(
             model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
@@ -56,15 +56,18 @@ class TouchTables:
         no_positions = np.empty(0)
         self.changed = [
             FreeBeam(
-                model.with_changed_parameter(name, std), no_positions, rate_hz, self.max_samples
+                model.with_changed_parameter(parameter_name, std),
+                no_positions,
+                rate_hz,
+                self.max_samples,
             )
-            for name, std in model.std.items()
+            for parameter_name, std in model.std.items()
             if std > 0
         ]
         """Beams in each of which one uncertain parameter is changed by its standard deviation."""
 
-    def starts(self, samples: int) -> CandidateGrid:
-        """Return the grid of candidates for a comparison over a number of samples."""
-        if samples not in self._grids:
-            self._grids[samples] = CandidateGrid(self.coarse, 2, self.rate_hz, samples)
-        return self._grids[samples]
+    def starts(self, sample_count: int) -> CandidateGrid:
+        """Return the grid of candidate obstacles for a comparison over a number of samples."""
+        if sample_count not in self._grids:
+            self._grids[sample_count] = CandidateGrid(self.coarse, 2, self.rate_hz, sample_count)
+        return self._grids[sample_count]

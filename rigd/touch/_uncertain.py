@@ -16,7 +16,10 @@ Real = NDArray[np.float64]
 
 
 def uncertainty_effects(
-    tables: TouchTables, record: TouchRecord, likeliest: Real, window: WhitenedWindow
+    touch_tables: TouchTables,
+    touch_record: TouchRecord,
+    likely_obstacle: Real,
+    sample_window: WhitenedWindow,
 ) -> Real:
     """Return the effects of r uncertainties on the innovations, for one standard deviation each.
 
@@ -24,94 +27,108 @@ def uncertainty_effects(
 
     Parameters
     ----------
-    tables
+    touch_tables
         Precomputed quantities of the model at the record's rate.
-    record
+    touch_record
         Samples around the touch.
-    likeliest
+    likely_obstacle
         Position, instant and logarithm of the stiffness of the likeliest obstacle, shape (1, 3).
-    window
+    sample_window
         Innovations from a sample that is certainly before the touch to the end.
     """
-    motion, quiet = window.motion, window.first
-    finest_effect = ObstacleContact(tables.finest, tables.x_m, motion).predict(likeliest, window)[
-        0
-    ][0]
-    contact = ObstacleContact(tables.middle, tables.x_m, motion)
-    middle_effect = contact.predict(likeliest, window)[0][0]
-    effects = [
+    free_motion, quiet_samples = sample_window.motion, sample_window.first
+    finest_effect = ObstacleContact(touch_tables.finest, touch_tables.x_m, free_motion).predict(
+        likely_obstacle, sample_window
+    )[0][0]
+    obstacle_contact = ObstacleContact(touch_tables.middle, touch_tables.x_m, free_motion)
+    middle_effect = obstacle_contact.predict(likely_obstacle, sample_window)[0][0]
+    effect_list = [
         finest_effect - middle_effect,
-        *_free_motion_effects(tables, contact, likeliest[0], window),
-        *_encoder_noise_effects(tables, contact, likeliest[0], window),
+        *_free_motion_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
+        *_encoder_noise_effects(touch_tables, obstacle_contact, likely_obstacle[0], sample_window),
     ]
-    span = slice(window.first, window.end)
-    residual = motion.innovations[:, span] - middle_effect
-    x = float(likeliest[0, 0])
-    nearby_m = min(x, tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
-    for free in tables.changed:
-        changed = free.at_positions(nearby_m).motion(
-            record, quiet, quiet - 4, motion.angle_transform
+    window_slice = slice(sample_window.first, sample_window.end)
+    residuals = free_motion.innovations[:, window_slice] - middle_effect
+    x = float(likely_obstacle[0, 0])
+    nearby_m = min(x, touch_tables.x_m[-1] - 1.5e-3) + 1e-3 * np.arange(-1.5, 2.0)
+    for nearby_beam in touch_tables.changed:
+        changed_beam = nearby_beam.at_positions(nearby_m).motion(
+            touch_record, quiet_samples, quiet_samples - 4, free_motion.angle_transform
         )
-        kernels = contact_kernels(
-            free.model.beam,
-            free.model.damping,
+        nearby_kernels = contact_kernels(
+            nearby_beam.model.beam,
+            nearby_beam.model.damping,
             np.array([x]),
-            tables.middle.step_s,
-            round((motion.t[-1] - likeliest[0, 1]) / tables.middle.step_s) + 4,
-            free.model.sensor_filter,
+            touch_tables.middle.step_s,
+            round((free_motion.t[-1] - likely_obstacle[0, 1]) / touch_tables.middle.step_s) + 4,
+            nearby_beam.model.sensor_filter,
         )
-        effect, _ = ObstacleContact(kernels, nearby_m, changed).predict(
-            likeliest, window, kernels=kernels
+        position_effect, _ = ObstacleContact(nearby_kernels, nearby_m, changed_beam).predict(
+            likely_obstacle, sample_window, kernels=nearby_kernels
         )
-        effects.append(changed.innovations[:, span] - effect[0] - residual)
-    return np.stack(effects, axis=-1)
+        effect_list.append(
+            changed_beam.innovations[:, window_slice] - position_effect[0] - residuals
+        )
+    return np.stack(effect_list, axis=-1)
 
 
 def _free_motion_effects(
-    tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
+    touch_tables: TouchTables,
+    obstacle_contact: ObstacleContact,
+    likely_obstacle: Real,
+    sample_window: WhitenedWindow,
 ) -> Real:
     """Return the effects of the free motion's uncertainty on the innovations, (q, c, n).
 
     They include the effects through the contact, such as another instant of touch.
     """
-    motion = window.motion
-    spread = motion.spread
-    count = motion.ringing.poles.size * 2
-    position_fraction = likeliest[:1] / tables.model.beam.length_m
-    steps = motion.displacement_m.shape[1]
+    free_motion = sample_window.motion
+    spread = free_motion.spread
+    amplitude_count = free_motion.ringing.poles.size * 2
+    position_fraction = likely_obstacle[:1] / touch_tables.model.beam.length_m
+    step_count = free_motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
-    t = motion.first_s + tables.model.angle_delay_s + motion.step_s * np.arange(steps)
-    displacement_m = motion.ringing.at_positions(position_fraction).displacement(t, spread[:count])[
-        0
-    ]
-    direct = motion.design[:, window.first : window.end] @ spread
-    return direct.transpose(2, 0, 1) + contact.effect_of_changed_motion(
-        likeliest, window, displacement_m.T
+    t = (
+        free_motion.first_s
+        + touch_tables.model.angle_delay_s
+        + free_motion.step_s * np.arange(step_count)
+    )
+    displacement_m = free_motion.ringing.at_positions(position_fraction).displacement(
+        t, spread[:amplitude_count]
+    )[0]
+    direct_effects = free_motion.design[:, sample_window.first : sample_window.end] @ spread
+    return direct_effects.transpose(2, 0, 1) + obstacle_contact.effect_of_changed_motion(
+        likely_obstacle, sample_window, displacement_m.T
     )
 
 
 def _encoder_noise_effects(
-    tables: TouchTables, contact: ObstacleContact, likeliest: Real, window: WhitenedWindow
+    touch_tables: TouchTables,
+    obstacle_contact: ObstacleContact,
+    likely_obstacle: Real,
+    sample_window: WhitenedWindow,
 ) -> Real:
     """Return the effects of the encoder's noise through the contact on the innovations.
 
     There is one for each sample of the angle; the shape is (samples, c, n).
     """
-    motion = window.motion
-    samples = np.arange(window.first, window.end)
-    nearest = int(np.argmin(np.abs(tables.x_m - likeliest[0])))
-    sample_displacement = tables.free.displacement_per_sample(nearest, samples.size + 8)
+    free_motion = sample_window.motion
+    sample_indices = np.arange(sample_window.first, sample_window.end)
+    nearest_position = int(np.argmin(np.abs(touch_tables.x_m - likely_obstacle[0])))
+    sample_displacement = touch_tables.free.displacement_per_sample(
+        nearest_position, sample_indices.size + 8
+    )
     # Columns begin four samples before the window.
-    window_steps = np.arange(motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
-    index = (
+    window_steps = np.arange(free_motion.displacement_m.shape[1]) - 4 * STEPS_PER_SAMPLE
+    response_index = (
         window_steps[None, :]
-        - STEPS_PER_SAMPLE * (samples - window.first - SPLINE_FADE_SAMPLES)[:, None]
+        - STEPS_PER_SAMPLE * (sample_indices - sample_window.first - SPLINE_FADE_SAMPLES)[:, None]
     )
     displacement_m = np.where(
-        (index >= 0) & (index < sample_displacement.size),
-        sample_displacement[np.clip(index, 0, sample_displacement.size - 1)],
+        (response_index >= 0) & (response_index < sample_displacement.size),
+        sample_displacement[np.clip(response_index, 0, sample_displacement.size - 1)],
         0.0,
     )
-    return contact.effect_of_changed_motion(
-        likeliest, window, motion.angle_noise_rad * displacement_m
+    return obstacle_contact.effect_of_changed_motion(
+        likely_obstacle, sample_window, free_motion.angle_noise_rad * displacement_m
     )

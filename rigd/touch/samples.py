@@ -37,10 +37,10 @@ def around_touch(
     free_from
         Tick before which the beam was in contact, so that earlier samples are not used.
     """
-    ticks = samples["tick"].astype(np.int64)
-    first = max(tick - round(HISTORY_S * rate_hz), free_from)
-    last = tick + round(FINAL_S * rate_hz)
-    return samples[(ticks >= first) & (ticks <= last)]
+    sample_ticks = samples["tick"].astype(np.int64)
+    first_tick = max(tick - round(HISTORY_S * rate_hz), free_from)
+    last_tick = tick + round(FINAL_S * rate_hz)
+    return samples[(sample_ticks >= first_tick) & (sample_ticks <= last_tick)]
 
 
 def touch_record(
@@ -49,7 +49,7 @@ def touch_record(
     rate_hz: float,
     shear_projection: Sequence[float] | None,
 ) -> TouchRecord:
-    """Return the record of a touch for the estimator, with missed ticks interpolated.
+    """Return angle, torque and shear around a touch, with missed ticks interpolated.
 
     Parameters
     ----------
@@ -62,18 +62,18 @@ def touch_record(
     shear_projection
         Coefficients of the base shear, shear = projection · wrench; None: it is not measured.
     """
-    ticks = samples["tick"].astype(np.int64)
-    all_ticks = np.arange(ticks[0], ticks[-1] + 1)
+    sample_ticks = samples["tick"].astype(np.int64)
+    all_ticks = np.arange(sample_ticks[0], sample_ticks[-1] + 1)
 
     def interpolated(values: NDArray[np.float64]) -> NDArray[np.float64]:
-        return np.interp(all_ticks, ticks, values)
+        return np.interp(all_ticks, sample_ticks, values)
 
     return TouchRecord(
         rate_hz,
         interpolated(samples["angle_rad"]),
         interpolated(samples["coupling_torque_nm"]),
         None if shear_projection is None else interpolated(base_shear_n(samples, shear_projection)),
-        int(tick - ticks[0]),
+        int(tick - sample_ticks[0]),
     )
 
 
@@ -89,6 +89,6 @@ def base_shear_n(
     shear_projection
         Six coefficients of the base shear, shear = projection · wrench.
     """
-    wrench = np.array([samples[axis] for axis in WRENCH_FIELDS])
-    shear: NDArray[np.float64] = np.array(shear_projection) @ wrench
-    return shear
+    wrench_rows = np.array([samples[axis_name] for axis_name in WRENCH_FIELDS])
+    shear_n: NDArray[np.float64] = np.array(shear_projection) @ wrench_rows
+    return shear_n
