@@ -117,11 +117,11 @@ class ReportedValue:
 
     def as_json(self) -> dict[str, Any]:
         """Return value, standard deviation, 95 % interval and flag as a JSON-ready dict."""
-        interval_95 = None if self.interval_95 is None else list(self.interval_95)
+        interval_list = None if self.interval_95 is None else list(self.interval_95)
         return {
             "value": self.value,
             "std": self.std,
-            "interval_95": interval_95,
+            "interval_95": interval_list,
             "flag": self.flag,
         }
 
@@ -253,7 +253,10 @@ class Estimates:
         """
         return replace(
             self,
-            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
+            parameters={
+                parameter_name: each.flagged(flag)
+                for parameter_name, each in self.parameters.items()
+            },
             sizes=tuple(each.flagged(flag) for each in self.sizes),
             modes=tuple(
                 replace(
@@ -321,7 +324,7 @@ class Headline(Estimates):
         status : str
             "selected", "compatible" or "excluded".
         """
-        return tuple(name for name, its in self.structures if its == status)
+        return tuple(structure_name for structure_name, its in self.structures if its == status)
 
 
 def headline(
@@ -344,45 +347,47 @@ def headline(
     unexplained : str or None
         Reason against every number. None if the residual is noise only.
     """
-    freest = candidate_set.freest
+    freest_candidate = candidate_set.freest
     fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
-    reasons: dict[str, str] = {
+    order_reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
     }
-    intervals: dict[str, tuple[float, float]] = {
+    order_intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
         for each in orders
-        if each.profile.is_computed and each.order in freest.structure.free
+        if each.profile.is_computed and each.order in freest_candidate.structure.free
     }
-    result = headline_of_fit(
-        freest.name, freest.fit, visible_numbers, reasons, intervals, unexplained,
-        candidate_set.fit_with_both_dampings(freest),
+    reported_headline = headline_of_fit(
+        freest_candidate.name, freest_candidate.fit, visible_numbers, order_reasons, order_intervals, unexplained,
+        candidate_set.fit_with_both_dampings(freest_candidate),
     )  # fmt: skip
     if candidate_set.drag is not None:
-        drag = candidate_set.drag
-        reported_drag = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        drag_estimate = candidate_set.drag
+        reported_drag = ReportedValue(
+            drag_estimate.value_m, drag_estimate.std_m, drag_estimate.interval_95_m, unexplained
+        )
         loss_factors = (
             each.flagged(WITH_DRAG_REASON) if each.damping == "external" else each
-            for each in result.sizes
+            for each in reported_headline.sizes
         )
-        result = replace(
-            result,
-            parameters={**result.parameters, "drag": reported_drag},
+        reported_headline = replace(
+            reported_headline,
+            parameters={**reported_headline.parameters, "drag": reported_drag},
             sizes=tuple(loss_factors),
-            drag_speed_m_s=drag.speed_m_s,
+            drag_speed_m_s=drag_estimate.speed_m_s,
         )
     conditional_estimate = (
         _conditional_estimate(candidate_set, fractional_orders) if unexplained is None else None
     )
     return replace(
-        result,
+        reported_headline,
         structures=structures(candidate_set, fractional_orders),
         simpler=conditional_estimate,
     )
 
 
 def headline_of_fit(
-    name: str,
+    parameter_name: str,
     fit: RecordFit,
     visible_numbers: Collection[int],
     reasons: Mapping[str, str] = _EMPTY_MAPPING,
@@ -394,7 +399,7 @@ def headline_of_fit(
 
     Parameters
     ----------
-    name : str
+    parameter_name : str
         Name of the structure in tables.
     fit : RecordFit
         Fit whose parameters are reported.
@@ -413,17 +418,19 @@ def headline_of_fit(
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
     if SECOND_DAMPING_REASON in reasons.values():
         damping_reason = SECOND_DAMPING_REASON
-    flags: dict[str, str] = {
-        name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
+    parameter_flags: dict[str, str] = {
+        parameter_name: order_reason
+        for order_name, order_reason in reasons.items()
+        for parameter_name in (order_name, COEFFICIENT_OF[order_name])
     }
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
+        parameter_flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
     return Headline(
-        name=name,
+        name=parameter_name,
         fit=fit,
         parameters={
             each: _reported_parameter(
-                fit, each, unexplained or flags.get(each), intervals.get(each)
+                fit, each, unexplained or parameter_flags.get(each), intervals.get(each)
             )
             for each in fit.parameters
             if fit.structure.has(each)
@@ -451,7 +458,7 @@ def headline_of_fit(
             )
         ),
         with_both=with_both,
-        structures=((name, "selected"),),
+        structures=((parameter_name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
         explained=unexplained is None,
@@ -485,66 +492,79 @@ def _structure_status(
     candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
     """Return whether the structure of a candidate is selected, compatible or excluded."""
-    freest = candidate_set.freest
-    if candidate is freest:
+    freest_candidate = candidate_set.freest
+    if candidate is freest_candidate:
         return "selected"
-    is_special_case = set(candidate.structure.free) < set(freest.structure.free)
+    is_special_case = set(candidate.structure.free) < set(freest_candidate.structure.free)
     if not is_special_case:
-        is_less_likely = candidate.deviance - freest.deviance > EXCLUSION_DEVIANCES[0]
+        has_less_likelihood = (
+            candidate.deviance - freest_candidate.deviance > EXCLUSION_DEVIANCES[0]
+        )
         has_worse_bic = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
-        return "excluded" if is_less_likely and has_worse_bic else "compatible"
+        return "excluded" if has_less_likelihood and has_worse_bic else "compatible"
     if any(
-        candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
-        for order in fractional_orders
+        candidate.structure.fixed.get(order_name) == 1.0  # type: ignore[call-overload]
+        for order_name in fractional_orders
     ):
         return "excluded"
-    missing_parameters = freest.parameters - candidate.parameters
-    limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
-    return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
+    missing_parameters = freest_candidate.parameters - candidate.parameters
+    deviance_limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
+    return (
+        "excluded"
+        if candidate.deviance - freest_candidate.deviance > deviance_limit
+        else "compatible"
+    )
 
 
 def _conditional_estimate(
     candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> ConditionalEstimate | None:
     """Return the estimates of the simplest compatible structure, or None if there is none."""
-    freest = candidate_set.freest
+    freest_candidate = candidate_set.freest
     compatible_candidates = [
-        each
-        for each in candidate_set.candidates
-        if each.parameters < freest.parameters
-        and _structure_status(candidate_set, each, fractional_orders) == "compatible"
+        candidate
+        for candidate in candidate_set.candidates
+        if candidate.parameters < freest_candidate.parameters
+        and _structure_status(candidate_set, candidate, fractional_orders) == "compatible"
     ]
     if not compatible_candidates:
         return None
-    simplest = min(compatible_candidates, key=lambda each: each.bic)
-    fixed = {
-        order: simplest.structure.fixed[order]  # type: ignore[index]
-        for order, coefficient in COEFFICIENT_OF.items()
-        if order in simplest.structure.fixed and coefficient in simplest.structure.free
+    simplest_candidate = min(compatible_candidates, key=lambda candidate: candidate.bic)
+    fixed_orders = {
+        order_name: simplest_candidate.structure.fixed[order_name]  # type: ignore[index]
+        for order_name, coefficient in COEFFICIENT_OF.items()
+        if order_name in simplest_candidate.structure.fixed
+        and coefficient in simplest_candidate.structure.free
     }
     return ConditionalEstimate(
-        name=simplest.name,
-        fixed=fixed,
+        name=simplest_candidate.name,
+        fixed=fixed_orders,
         parameters={
-            name: _reported_parameter(simplest.fit, name, None, None)
-            for name in simplest.fit.parameters
-            if simplest.structure.has(name) and name not in fixed
+            parameter_name: _reported_parameter(simplest_candidate.fit, parameter_name, None, None)
+            for parameter_name in simplest_candidate.fit.parameters
+            if simplest_candidate.structure.has(parameter_name)
+            and parameter_name not in fixed_orders
         },
     )
 
 
 def _reported_parameter(
-    fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
+    fit: RecordFit, parameter_name: str, reason: str | None, interval: tuple[float, float] | None
 ) -> ReportedValue:
     """Return the reported value of one parameter of a fit, with its interval and flag."""
-    is_free = name in fit.interval
-    interval_95 = interval or fit.interval.get(name)
-    flag = reason
-    if flag is None and name in fit.at_bounds and interval_95 is None:
-        flag = _AT_BOUND_FLAG
-    if flag is None and is_free and interval_95 is None:
-        flag = _NOT_IDENTIFIABLE_FLAG
-    return ReportedValue(fit.parameters[name], fit.std[name] if is_free else 0.0, interval_95, flag)
+    is_free = parameter_name in fit.interval
+    interval_95 = interval or fit.interval.get(parameter_name)
+    invalid_reason = reason
+    if invalid_reason is None and parameter_name in fit.at_bounds and interval_95 is None:
+        invalid_reason = _AT_BOUND_FLAG
+    if invalid_reason is None and is_free and interval_95 is None:
+        invalid_reason = _NOT_IDENTIFIABLE_FLAG
+    return ReportedValue(
+        fit.parameters[parameter_name],
+        fit.std[parameter_name] if is_free else 0.0,
+        interval_95,
+        invalid_reason,
+    )
 
 
 def reported_loss_factor(
@@ -562,10 +582,10 @@ def reported_loss_factor(
         Flag of the reported value. None if it is valid.
     """
     # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
-    half_width = NORMAL_95 * size.std / size.value
+    relative_half_width = NORMAL_95 * size.std / size.value
     interval_95 = (
-        size.value * math.exp(-half_width),
-        size.value * math.exp(min(half_width, 300.0)),
+        size.value * math.exp(-relative_half_width),
+        size.value * math.exp(min(relative_half_width, 300.0)),
     )
     return ReportedLossFactor(
         damping, size.omega_rad_s, ReportedValue(size.value, size.std, interval_95, reason)
@@ -588,14 +608,14 @@ def _reported_mode(
     mode: ModeEstimate, visible_numbers: Collection[int], reason: str | None
 ) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
-    is_visible = mode.number in visible_numbers
-    if reason is None and not is_visible:
+    is_visible_mode = mode.number in visible_numbers
+    if reason is None and not is_visible_mode:
         reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
         mode.number,
         symmetric_value(mode.frequency_hz, mode.frequency_std_hz, reason),
         symmetric_value(mode.damping_ratio, mode.damping_ratio_std, reason),
-        is_visible,
+        is_visible_mode,
     )
 
 

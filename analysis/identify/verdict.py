@@ -109,14 +109,16 @@ def order_verdict(
     doubt : str or None
         Reason against the structure. None if it is valid.
     """
-    status, reason = _order_status(candidate_set, profile, visible_numbers, doubt=doubt)
-    is_reported = status not in ("not identifiable", "absent")
+    order_status, reason_against = _order_status(
+        candidate_set, profile, visible_numbers, doubt=doubt
+    )
+    is_reported = order_status not in ("not identifiable", "absent")
     return OrderVerdict(
         order=profile.order,
-        status=status,
+        status=order_status,
         value=profile.estimate if is_reported else None,
         interval=profile.interval if is_reported else None,
-        reason=reason,
+        reason=reason_against,
         profile=profile,
     )
 
@@ -174,17 +176,17 @@ def _order_status(
     doubt: str | None,
 ) -> tuple[Status, str | None]:
     """Return the status of an order, and the reason against it or None."""
-    freest, order = candidate_set.freest, profile.order
-    reason = not_reported_reason(candidate_set, visible_numbers)
-    if reason is not None:
-        return "not identifiable", reason
-    if not freest.structure.has(order):
+    freest_candidate, order_name = candidate_set.freest, profile.order
+    reason_against = not_reported_reason(candidate_set, visible_numbers)
+    if reason_against is not None:
+        return "not identifiable", reason_against
+    if not freest_candidate.structure.has(order_name):
         return "absent", "no such damping shows"
     if not profile.identifiable:
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     if doubt is not None:
         return "open", doubt
-    if order == "lambda" and candidate_set.drag is not None:
+    if order_name == "lambda" and candidate_set.drag is not None:
         return "open", WITH_DRAG_REASON
     if profile.admits_one:
         return "compatible", None
@@ -278,8 +280,8 @@ class Verdict:
         """Return the verdict as a JSON-ready dict, in which non-finite numbers are None."""
         document = _json_ready(dataclasses.asdict(self))
         assert isinstance(document, dict)
-        for order in ("alpha", "lambda"):
-            profile = document[order]["profile"]
+        for order_document in ("alpha", "lambda"):
+            profile = document[order_document]["profile"]
             profile["valleys"] = profile.pop("local_minima")  # the key of the document
         return document
 
@@ -294,16 +296,18 @@ def rivals(candidate_set: CandidateSet, max_bic_difference: float) -> tuple[Cand
     max_bic_difference : float
         Limit of the difference of BIC.
     """
-    limit = candidate_set.best.bic + max_bic_difference
-    return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
+    bic_limit = candidate_set.best.bic + max_bic_difference
+    return tuple(c for c in candidate_set.candidates[1:] if c.bic < bic_limit)
 
 
 def _json_ready(value: object) -> object:
     """Convert a value for JSON: tuples to lists, non-finite numbers to None."""
     if isinstance(value, dict):
-        return {str(key).rstrip("_"): _json_ready(item) for key, item in value.items()}
+        return {
+            str(key).rstrip("_"): _json_ready(nested_value) for key, nested_value in value.items()
+        }
     if isinstance(value, list | tuple):
-        return [_json_ready(item) for item in value]
+        return [_json_ready(nested_value) for nested_value in value]
     if isinstance(value, float) and not math.isfinite(value):
         return None
     return value
