@@ -120,7 +120,7 @@ _CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Verdict on a record, with the fits that support it.
+    """Verdict on one record of angle and torque, with the fits from which it is drawn.
 
     Attributes
     ----------
@@ -141,14 +141,18 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit whose numbers are reported."""
+        """Return the fit of a beam to the record whose parameter values are reported."""
         return self.headline.fit
 
     @property
     def determined(self) -> frozenset[Order]:
-        """Return the orders, "alpha" or "lambda", that the record determines."""
+        """Return the damping orders, "alpha" or "lambda", that the record determines precisely."""
         order_verdicts = (self.verdict.alpha, self.verdict.lambda_)
-        return frozenset(each.order for each in order_verdicts if each.profile.identifiable)
+        return frozenset(
+            verdict_of_order.order
+            for verdict_of_order in order_verdicts
+            if verdict_of_order.profile.identifiable
+        )
 
 
 def select(
@@ -158,10 +162,10 @@ def select(
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
-    """Select the model that a record supports, and report its parameters.
+    """Select the model of beam and damping that a record supports, and report its parameters.
 
     The modal model is fitted to the record without hum, impacts and gaps. Its modes are reported.
-    If its residual is noise, the antenna is linear and constant. Otherwise drag, nonlinear forces,
+    If its residual is noise, the beam is linear and does not change. Otherwise drag, nonlinear forces,
     changes along the record and impacts are tested. A uniform beam is tested against the modal
     constants. Orders, coefficients and stiffness are estimated from these constants, with the
     tolerance of the geometry that the measurement states. All structures are also fitted to the
@@ -204,7 +208,9 @@ _ResultT = TypeVar("_ResultT")
 
 @dataclass(frozen=True, slots=True)
 class _Assessment(Generic[_ResultT]):
-    """Result on a record, with the candidates that support it.
+    """Result of the model selection on one record, with the fitted candidates it is based on.
+
+    A candidate is one structure of beam and damping, fitted to the record.
 
     Attributes
     ----------
@@ -227,7 +233,11 @@ class _Assessment(Generic[_ResultT]):
 def _assess_with_impacts(
     measurement: Measurement, assess_measurement: Callable[[Measurement], _Assessment[_ResultT]]
 ) -> _Assessment[_ResultT]:
-    """Assess a record, and assess it again with each impact that explains its residual."""
+    """Select the model of a record, and again with each impact that may explain its residual.
+
+    `assess_measurement` is the selection for a measurement whose known impacts are fitted. Return
+    the last result that was improved by an impact.
+    """
     assessment = assess_measurement(measurement)
     for _ in range(MAX_IMPACTS):
         if assessment.explained or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(assessment.kinds):
@@ -256,7 +266,7 @@ def _select_with_known_impacts(
     band_hz: tuple[float, float],
     earlier: Selection | None,
 ) -> _Assessment[Selection]:
-    """Select the structure of a record whose known impacts are part of the measurement."""
+    """Select the structure of a record. The impacts that the measurement states are fitted, too."""
     earlier_candidates = earlier.candidates if earlier else ()
     refitted_candidates = (
         CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed, band_hz)
@@ -508,7 +518,7 @@ def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]
 def _visible_mode_numbers(
     candidate_set: CandidateSet, modal_fit: ModalFit | None
 ) -> tuple[int, ...]:
-    """Return the numbers of the modes that a record shows."""
+    """Return the numbers of the beam modes that are visible in a record, from 1."""
     if modal_fit is None:
         return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
     return modal_fit.visible
@@ -524,8 +534,9 @@ def _add_modal_model(
 ) -> Headline:
     """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
 
-    Return `exact_headline` if there is no modal model. `doubt_reason` is the reason against every number,
-    and `mode_doubt_reason` the reason against every mode. They are None if there is no such reason.
+    Return `exact_headline` if there is no modal model. `doubt_reason` is the reason against every
+    number, and `mode_doubt_reason` the reason against every mode. They are None if there is no such
+    reason.
     """
     if modal_fit is None or uniform_beam_result is None:
         return exact_headline
@@ -553,7 +564,7 @@ def _add_modal_model(
 def _uniform_beam_test(
     measurement: Measurement, modal_fit: ModalFit | None
 ) -> UniformBeamTest | None:
-    """Test whether a uniform beam predicts the modes. Return None without a modal model."""
+    """Test whether a uniform beam predicts the measured modes. Return None without modal model."""
     if modal_fit is None:
         return None
     return uniform_beam_test(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
@@ -583,7 +594,10 @@ def _explain_deviations(
 def _setting_findings(
     candidate_set: CandidateSet, reported_headline: Headline, finding_kinds: Collection[str]
 ) -> tuple[Finding, ...]:
-    """Return findings on settings that differ from the file, if the record can show them."""
+    """Return findings on fitted settings, such as the delay, that differ from those in the file.
+
+    Return none if the record cannot show such a difference.
+    """
     if (
         "implausible" in finding_kinds
         or len(reported_headline.visible_modes) < _MODES_WITHOUT_REDUNDANCY
@@ -595,7 +609,10 @@ def _setting_findings(
 def _is_linear_and_constant(
     candidate_set: CandidateSet, modal_fit: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Return whether noise and no harmonic remains, so that no other effect need be tested."""
+    """Return whether the residual of the modal model is noise without harmonics of the sweep.
+
+    Then no nonlinear or time-varying effect need be tested.
+    """
     _, _, harmonic_tests = _test_residual(candidate_set, modal_fit, band_hz)
     return modal_fit.explained and not any(
         harmonic_test.present for harmonic_test in harmonic_tests
@@ -605,9 +622,9 @@ def _is_linear_and_constant(
 def _fit_further_effects(
     linear_candidates: CandidateSet, *, test_amplitude_effects: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
-    """Test a record for nonlinear and time-varying effects, or for the latter alone.
+    """Test a record for nonlinear and time-varying effects.
 
-    Return the candidate set with the best explanation, its nonlinear forces, and its changes along
+    Nonlinear effects are only tested with `test_amplitude_effects`. Return the candidate set with the best explanation, its nonlinear forces, and its changes along
     the record.
     """
     if not test_amplitude_effects:
@@ -648,7 +665,10 @@ def _fit_further_effects(
 def _likely_stiffness_step(
     linear_candidates: CandidateSet, modal_fit: ModalFit, small_linear_effect: SmallEffect | None
 ) -> StiffnessStep | None:
-    """Return the step of the stiffness if it explains more than any effect of the amplitude."""
+    """Return the step of the stiffness in time that best explains the residual.
+
+    Return None if the small nonlinear effect explains more.
+    """
     stiffness_step = best_stiffness_step(linear_candidates.comparison, modal_fit)
     rival_deviance_reduction = 0.0 if small_linear_effect is None else small_linear_effect.saved
     return (
@@ -697,7 +717,7 @@ def fit_freest_alone(
 def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
-    """Fit only the freest structure to a record whose known impacts are part of the measurement."""
+    """Fit the structure with most free parameters, with the impacts that the measurement states."""
     misread_findings = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
     additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
@@ -767,7 +787,10 @@ def _fit_freest_with_known_impacts(
 def _unidentifiable_orders(
     candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
 ) -> dict[str, str]:
-    """Return the orders that the fit of the freest structure does not determine, with reasons."""
+    """Return why an order is not determined, for each order that the record does not determine.
+
+    The fit is that of the structure with most free parameters.
+    """
     freest_candidate, *other_candidates = candidate_set.candidates
     common_reason = not_reported_reason(candidate_set, visible_numbers)
     order_reasons = {}
@@ -793,7 +816,7 @@ def _unidentifiable_orders(
 
 
 def _wrong_model_reason(finding_kinds: Collection[str], *, residual_explained: bool) -> str | None:
-    """Return the reason why findings or residual refute the model, or None if they do not."""
+    """Return why the findings or the residual refute the fitted model, or None if they do not."""
     if not _CONTRADICTING_KINDS.isdisjoint(finding_kinds):
         return CONTRADICTED_FILE_REASON
     return UNEXPLAINED_REASON if "harmonics" in finding_kinds or not residual_explained else None
@@ -831,8 +854,8 @@ def _mark_doubtful_findings(
 
     `fitted_findings` are effects that were fitted with the beam. `change_findings` are changes
     along the record, which already state their certainty. `model_reason` is the reason against the
-    model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the reasons against single
-    parameters. `only_harmonics_remain` states that harmonics are all that remains.
+    model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the reasons
+    against single parameters. With `only_harmonics_remain` the finding on harmonics is established.
     """
 
     def qualified(finding: Finding) -> Finding:
@@ -863,7 +886,7 @@ def _add_impacts_and_unexplained(
     input_test: InputRelation,
     stiffness_step: StiffnessStep | None = None,
 ) -> tuple[Finding, ...]:
-    """Add impacts before the other findings, and the unexplained residual after them."""
+    """Return the findings on impacts, those of the model, and that on an unexplained residual."""
     residual_explained = whiteness_test.white and not input_test.related
     findings_of_impacts = impact_findings(
         candidate_set.comparison.measurement.knocks, explained=residual_explained
@@ -881,7 +904,10 @@ def _add_impacts_and_unexplained(
 def _test_residual(
     candidate_set: CandidateSet, modal_fit: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
-    """Test the residual of the modal model, or of the first candidate if there is none."""
+    """Test whether the residual is white, follows the angle, or has harmonics of the sweep.
+
+    This is the residual of the modal model, or that of the first candidate without such a model.
+    """
     comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
     modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
     angle_rad = comparison.angle_rad[comparison.retained]
@@ -899,7 +925,7 @@ def _test_residual(
 
 
 def _candidate_table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
-    """Return one table row for each candidate, the one with the lowest BIC first."""
+    """Return the table of candidates: cost, BIC and AIC of each, the lowest BIC first."""
     best_candidate, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
     return tuple(
         CandidateRow(

@@ -67,9 +67,9 @@ class StiffnessStep:
     @property
     def words(self) -> str:
         """Return the step in words, as part of a sentence."""
-        percent_change = float(f"{100 * self.relative_change:.1g}")
+        percent = float(f"{100 * self.relative_change:.1g}")
         return (
-            f"a step of the stiffness by about {percent_change:+g} % near {self.instant_s:.0f} s (each "
+            f"a step of the stiffness by about {percent:+g} % near {self.instant_s:.0f} s (each "
             "mode is then what it was when it was passed)"
         )
 

@@ -481,8 +481,8 @@ def temporal_change_findings(
     one_sweep : bool
         Whether the excitation is a single sweep.
     """
-    for temporal_change in changes:
-        finding = _established_finding(temporal_change)
+    for change in changes:
+        finding = _established_finding(change)
         if established(changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
@@ -490,7 +490,7 @@ def temporal_change_findings(
             yield replace(
                 finding,
                 sentence=(
-                    f"{_EFFECT_NAMES[temporal_change.what]} ({_size_text(temporal_change)}) would explain the record "
+                    f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record "
                     f"as well as {rival_names}: in one sweep, time and frequency vary together."
                 ),
                 value=None,

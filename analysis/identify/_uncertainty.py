@@ -79,7 +79,7 @@ def covariance_of_unknowns(
 
 @dataclass(frozen=True, slots=True)
 class ParameterUncertainty:
-    """Uncertainty of the parameters at a minimum, with the attributes of `RecordFit`."""
+    """Uncertainty of the fitted plant parameters. The attributes are those of `RecordFit`."""
 
     std: dict[str, float | None]
     interval: dict[str, tuple[float, float] | None]
@@ -97,7 +97,9 @@ def parameter_uncertainty(
     unknown_covariance: NDArray[np.float64],
     is_determined: NDArray[np.bool_],
 ) -> ParameterUncertainty:
-    """Propagate the covariance of the unknowns to the plant parameters.
+    """Return standard deviations and intervals of the plant parameters at a minimum.
+
+    They follow from the covariance of the unknowns.
 
     Parameters
     ----------
@@ -308,7 +310,10 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
 
 
 def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Return the standard deviation of a quantity with given derivatives by the unknowns."""
+    """Return the standard deviation of a quantity from its derivatives and their covariance.
+
+    The derivatives, shape (k,), and the covariance, shape (k, k), are those by the unknowns.
+    """
     return math.sqrt(max(float(derivatives @ covariance @ derivatives), 0.0))
 
 
@@ -319,29 +324,29 @@ def ringing(
     poles: Sequence[Pole],
     projected: Projected,
     scatter: float,
-    decay_spectra: NDArray[np.complex128],
+    projected_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],
 ) -> Ringing:
-    """Return the free decay's amplitude in each mode, with its significance.
+    """Return the amplitude of the free decay in each mode, with its chi-square.
 
     A hum is excluded bin by bin. But it starts and ends with the record and so leaks into all other
     bins, which the free decay would partly explain. So only the reduction of the sum of squares in
-    addition to the hum counts. `decay_spectra`, shape (m, K), are the whitened spectra of the free decays
-    and of the other projected terms. `hum_spectra`, shape (h, K), are the whitened spectra of the lines.
-    `scatter` is the variance of real and imaginary parts of the residual.
+    addition to the hum counts. `projected_spectra`, shape (m, K), are the whitened spectra of the
+    free decays and of the other projected terms. `hum_spectra`, shape (h, K), are the whitened
+    spectra of the lines. `scatter` is the variance of real and imaginary parts of the residual.
     """
     decay_count = count_decay_spectra(poles)
-    decay_spectra, decay_amplitudes = (
-        decay_spectra[:decay_count],
+    projected_spectra, decay_amplitudes = (
+        projected_spectra[:decay_count],
         projected.amplitudes[:decay_count],
     )
     explained_squares = float(
         decay_amplitudes @ projected.amplitude_gram[:decay_count, :decay_count] @ decay_amplitudes
     )
     if len(hum_spectra) and decay_amplitudes.size:
-        decay_free_residual = projected.residual - decay_amplitudes @ decay_spectra
+        decay_free_residual = projected.residual - decay_amplitudes @ projected_spectra
         best_factors, remaining_squares = _best_combination(
-            decay_free_residual, np.concatenate([decay_spectra, hum_spectra])
+            decay_free_residual, np.concatenate([projected_spectra, hum_spectra])
         )
         explained_squares = (
             _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares
@@ -366,7 +371,10 @@ def ringing(
 def _best_combination(
     target_spectrum: NDArray[np.complex128], basis_spectra: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the best real combination of spectra, (m,), and its remaining sum of squares."""
+    """Fit a spectrum by a real linear combination of others.
+
+    Return its factors, shape (m,), and the sum of squares that remains.
+    """
     real_spectra = np.ascontiguousarray(basis_spectra).view(np.float64)
     spectrum_norms = np.sqrt(np.einsum("ij,ij->i", real_spectra, real_spectra))
     spectrum_norms[spectrum_norms == 0] = 1.0

@@ -130,7 +130,7 @@ class DragLaw:
     slowing: float = 0.0
 
     def at(self, speed_m_s: float) -> float:
-        """Return C_D d in m at a speed in m/s."""
+        """Return drag coefficient times diameter, C_D d, in m at a speed in m/s."""
         return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING_EXPONENT - 1))
 
 
@@ -170,14 +170,17 @@ class DragTorque:
 
     @property
     def by_ln_density(self) -> Real:
-        """Return the torque derivative by ln(mass per length), with constant poles and drag."""
+        """Return the derivative of the drag torque by ln(mass per length), in N·m, shape (m,).
+
+        Poles and drag law are constant.
+        """
         law_coefficients = np.array([self.law.constant_m, self.law.slowing])
         torque_derivative: Real = self.torque_nm - law_coefficients @ self.by_law
         return torque_derivative
 
 
 class DragResponse:
-    """Drag torque of one beam whose root follows a given angle.
+    """Computation of the torque by air drag on one beam whose root follows a given angle.
 
     Parameters
     ----------
@@ -221,13 +224,16 @@ class DragResponse:
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
 
     def first_order(self) -> Real:
-        """Return the torque per C_D d in the limit of a small drag, in N, shape (m,)."""
+        """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
+
+        C_D d is drag coefficient times diameter.
+        """
         return self._torque_over_time(
             self._modal_forces(_drag_force(self._linear_speed(), DragLaw(1.0)))
         )
 
     def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
-        """Return the torque by drag and its derivatives.
+        """Return the torque by air drag in N·m, and its derivatives by poles, damping and law.
 
         Parameters
         ----------
@@ -313,17 +319,17 @@ class DragResponse:
 
     @property
     def poles(self) -> Complex:
-        """Return the upper pole of each mode in rad/s, shape (modes,)."""
+        """Return the pole with positive imaginary part of each mode, in rad/s, shape (modes,)."""
         upper_poles: Complex = self._pole_pairs[:, 0]
         return upper_poles
 
     @property
     def _leverage(self) -> Real:
-        """Return the leverage L b_i of each mode i in m, shape (modes,)."""
+        """Return the leverage ``L b_i`` of each mode i in m: root torque per modal force."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed_m_s: Real) -> float:
-        """Return the mean speed in m/s over time and beam, weighted with the power of the drag."""
+        """Return the mean speed of the beam in m/s, weighted with the power dissipated by drag."""
         speed_cubed = np.abs(speed_m_s) ** 3
         total_power = float(speed_cubed.sum(axis=0) @ self._grid.weight_m)
         speed_times_power = float(
@@ -341,7 +347,10 @@ class DragResponse:
         return point_speed_m_s
 
     def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
-        """Replace the speeds without drag by those with drag, in the same array."""
+        """Replace the speeds of the beam points without drag, in m/s, by those with drag.
+
+        The array is changed itself.
+        """
         speed_by_state, by_state, by_force = self._time_step_matrices()
         step_matrix = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
         state_by_force = by_force @ self._grid.to_modes
@@ -377,10 +386,11 @@ class DragResponse:
     ) -> list[Real]:
         """Return the first-order change of the modal forces by added speeds and by the drag law.
 
-        To first order the points are not needed: the effect of the speed of one mode on the force
-        on another is one number at each step. `speed_m_s`, shape (3 m, points), is with drag. Each
-        element of `speed_sources` holds the index of a mode and the speed, shape (3 m,), that is added to
-        it.
+        To first order the force on a mode is a sum over the modal speeds, with one factor for each
+        pair of modes at each time step. `speed_m_s`, shape (3 m, points), includes the effect of
+        drag. Each element of `speed_sources` holds the index of a mode, and the speed, shape
+        (3 m,), that is added to this mode. The changes by the two coefficients of the drag law come
+        last.
         """
         speed_by_state, by_state, by_force = self._time_step_matrices()
         step_matrix = np.concatenate([speed_by_state, by_state])
@@ -471,7 +481,7 @@ class DragResponse:
         return speed_output[:, : 2 * n] @ extrapolating_matrix, by_state, by_force
 
     def _impedance_slopes(self) -> Complex:
-        """Return the derivative of Z_i by s at both poles of each mode, shape (modes, 2)."""
+        """Return the derivative of the modal impedance Z_i by s at both poles, shape (modes, 2)."""
         s, damping = self._pole_pairs, self.plant.damping
         density_over_stiffness = self.plant.beam.density_over_stiffness
         log_s = np.log(s)
@@ -488,33 +498,47 @@ class DragResponse:
 
     @property
     def _point_to_modal_forces(self) -> Real:
-        """Return the matrix from point forces to modal forces and root moment."""
+        """Return the matrix that converts forces at the beam points to modal forces.
+
+        Its last row gives the moment about the root.
+        """
         return np.vstack([self._grid.to_modes, self._grid.to_moment])
 
     def _modal_forces(self, point_force: Real) -> Real:
-        """Return modal forces and, last, root moment, shape (modes + 1, 3 m), of point forces."""
+        """Convert forces at the beam points to modal forces and, last, the moment about the root.
+
+        The result has the shape (modes + 1, 3 m).
+        """
         modal_forces: Real = self._point_to_modal_forces @ point_force.T
         return modal_forces
 
     def _transform_forces(self, modal_forces: Real) -> Complex:
-        """Transform modal forces and root moment to the points `s`, shape (modes + 1, bins)."""
+        """Return the Laplace transform of modal forces and root moment at the points `s`.
+
+        Its shape is (modes + 1, bins).
+        """
         fine_transforms = np.fft.rfft(modal_forces / self._growth, _OVERSAMPLING * self._length)
         force_spectra: Complex = fine_transforms[:, : self.s.size] / _OVERSAMPLING
         return force_spectra
 
     def _torque_transform(self, force_spectra: Complex) -> Complex:
-        """Return the transform of the torque by modal forces and root moment, without the delay."""
+        """Return the Laplace transform of the torque that modal forces and root moment cause.
+
+        It is in N·m·s at the points `s`, without the delay of the torque.
+        """
         torque_spectrum: Complex = (
             self._leverage @ (self._inertial_response * force_spectra[:-1]) - force_spectra[-1]
         )
         return torque_spectrum
 
     def _torque_over_time(self, modal_forces: Real) -> Real:
-        """Return the sampled torque in N·m by modal forces and root moment over time."""
+        """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
         return self.in_time(self._torque_transform(self._transform_forces(modal_forces)))
 
     def in_time(self, torque_transform: Complex) -> Real:
-        """Convert the transform of a torque to samples, after the torque channel, (..., m).
+        """Convert the Laplace transform of a torque to samples in N·m, shape (..., m).
+
+        The samples include delay and filters of the torque channel.
 
         Parameters
         ----------
@@ -543,14 +567,17 @@ class DragResponse:
         return torque_spectrum
 
     def _oversampled_values(self, spectrum: Complex) -> Real:
-        """Return the values of a transform at three times the sampling rate, shape (..., 3 m)."""
+        """Convert a Laplace transform to values over time, at three times the sampling rate.
+
+        Their shape is (..., 3 m).
+        """
         fine_samples = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
         oversampled_values: Real = fine_samples[..., : self._growth.size] * self._growth
         return oversampled_values
 
 
 def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
-    """Return the drag force per metre in N/m, of the shape of the speeds."""
+    """Return the drag force per length of the beam in N/m, at speeds in m/s of the same shape."""
     speed_magnitude = np.abs(speed_m_s)
     force_per_speed = law.constant_m * speed_magnitude
     if law.slowing:
@@ -560,15 +587,15 @@ def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
 
 
 def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
-    """Return both poles of each mode, shape (modes, 2), from its ``(k L)^4``."""
+    """Return both poles of each mode in rad/s, shape (modes, 2), from its ``(k L)^4``."""
     pole_pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
     return pole_pairs.astype(np.complex128)
 
 
 def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
-    """Return the weights of the last forces in one time step of ``z' = p z + F``.
+    """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    They have the shape (poles, 1 + `_PAST_FORCES`), with the newest force first. Between the
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest force first. Between the
     instants the force is the polynomial through all of these forces.
     """
     quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
@@ -646,7 +673,9 @@ class DragExpansion:
         parameter_names: Sequence[str],
         parameter_slopes: Real,
     ) -> tuple[Complex, Complex]:
-        """Return how the drag torque changes for another beam, and the derivatives of this change.
+        """Return the change of the drag torque if another beam replaces this one.
+
+        Its derivatives by the unknowns of the other beam are returned as well.
 
         Parameters
         ----------
@@ -747,9 +776,9 @@ class DragExpansion:
     def _torque_beyond_first_order(
         self, mode_number: int, own_pole: complex, other_pole: complex
     ) -> tuple[Complex, Complex]:
-        """Return the part of one mode's linear torque beyond first order in its pole.
+        """Return the change of one mode's torque with its pole, without the first-order part.
 
-        The torque spectrum has the shape (K,). It is returned with its derivatives by the real and
+        The spectrum has the shape (K,). It is returned with its derivatives by the real and
         the imaginary part of the pole, shape (2, K).
         """
         s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
@@ -774,7 +803,10 @@ class DragExpansion:
 def _parameter_rows(
     derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
 ) -> Real:
-    """Return the rows of a derivative matrix for some parameters, zero for missing ones, (n, k)."""
+    """Return the derivatives of the wanted parameters by the unknowns, shape (n, k).
+
+    `derivative_names` are the parameters of the given rows. A missing parameter gets zeros.
+    """
     zero_row = np.zeros(derivatives.shape[1])
     return np.array(
         [

@@ -347,7 +347,7 @@ def headline(
     unexplained : str or None
         Reason against every number. None if the residual is noise only.
     """
-    freest_candidate = candidate_set.freest
+    freest = candidate_set.freest
     fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
     order_reasons: dict[str, str] = {
         each.order: each.reason for each in orders if each.reason is not None
@@ -355,11 +355,11 @@ def headline(
     order_intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
         for each in orders
-        if each.profile.is_computed and each.order in freest_candidate.structure.free
+        if each.profile.is_computed and each.order in freest.structure.free
     }
     reported_headline = headline_of_fit(
-        freest_candidate.name, freest_candidate.fit, visible_numbers, order_reasons, order_intervals, unexplained,
-        candidate_set.fit_with_both_dampings(freest_candidate),
+        freest.name, freest.fit, visible_numbers, order_reasons, order_intervals, unexplained,
+        candidate_set.fit_with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag_estimate = candidate_set.drag

@@ -228,7 +228,7 @@ def order_sentence(verdict: OrderVerdict) -> str:
     estimate_text, first_text, last_text = to_uncertainty(
         (profile.estimate, lower_end, upper_end), std
     )
-    value_text = f"{estimate_text} (95 %: {first_text} to {last_text})"
+    order_text = f"{estimate_text} (95 %: {first_text} to {last_text})"
     if verdict.status == "absent":
         return f"No {damping_name} was found, so its order {order_name} has no meaning."
     if verdict.status == "not identifiable":
@@ -238,17 +238,17 @@ def order_sentence(verdict: OrderVerdict) -> str:
         )
     if verdict.reason is not None:
         return (
-            f"The order {order_name} of the {damping_name} is not established: {value_text} fits, but "
-            f"{verdict.reason}. "
+            f"The order {order_name} of the {damping_name} is not established: {order_text} fits, "
+            f"but {verdict.reason}. "
             "Do not interpret it."
         )
     if verdict.status == "compatible":
-        return f"The order {order_name} of the {damping_name} is {value_text}, consistent with 1."
+        return f"The order {order_name} of the {damping_name} is {order_text}, consistent with 1."
     if verdict.status == "fractional":
-        return f"The order {order_name} of the {damping_name} is {value_text}; 1 is excluded."
+        return f"The order {order_name} of the {damping_name} is {order_text}; 1 is excluded."
     return (
-        f"The order {order_name} of the {damping_name} is {value_text}: 1 is doubtful, but not excluded (p = "
-        f"{math.erfc(math.sqrt(deviance_of_order_one(profile) / 2)):.1g})."
+        f"The order {order_name} of the {damping_name} is {order_text}: 1 is doubtful, but not "
+        f"excluded (p = {math.erfc(math.sqrt(deviance_of_order_one(profile) / 2)):.1g})."
     )
 
 
@@ -259,7 +259,7 @@ def _list_structures(structure_names: tuple[str, ...]) -> str:
 
 def _conditional_sentence(simpler: ConditionalEstimate) -> str:
     """Return the sentence on the conditional estimate of a simpler structure."""
-    assumption_text = " and ".join(
+    condition = " and ".join(
         f"{parameter_name} = {fixed_value:g}"
         for parameter_name, fixed_value in simpler.fixed.items()
     )
@@ -269,7 +269,7 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
         if parameter_name in simpler.parameters
     ]
     return (
-        f"{assumption_text[0].upper()}{assumption_text[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
+        f"{condition[0].upper()}{condition[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
         "not excluded; "
         f"if true (type {simpler.name}): {', '.join(number_texts)}."
     )
@@ -283,12 +283,13 @@ def _value_and_interval_text(reported_value: ReportedValue) -> str:
     decimal_exponent = (
         math.floor(math.log10(abs(reported_value.value))) if reported_value.value else 0
     )
-    power_of_ten = 10.0**decimal_exponent if decimal_exponent < -2 else 1.0
-    decimal_digits = decimals(reported_value.std / power_of_ten)
-    exponent_text = f"e{decimal_exponent}" if decimal_exponent < -2 else ""
+    divisor = 10.0**decimal_exponent if decimal_exponent < -2 else 1.0
+    digit_count = decimals(reported_value.std / divisor)
+    power_text = f"e{decimal_exponent}" if decimal_exponent < -2 else ""
     return (
-        f"{reported_value.value / power_of_ten:.{decimal_digits}f}{exponent_text} "
-        f"({lower_end / power_of_ten:.{decimal_digits}f}{exponent_text} to {upper_end / power_of_ten:.{decimal_digits}f}{exponent_text})"
+        f"{reported_value.value / divisor:.{digit_count}f}{power_text} "
+        f"({lower_end / divisor:.{digit_count}f}{power_text} to "
+        f"{upper_end / divisor:.{digit_count}f}{power_text})"
     )
 
 

@@ -236,7 +236,7 @@ class UniformBeamProblem:
         return x @ self.transform.T + self._offset
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
-        """Return the rig with the uniform beam and damping that a vector of unknowns describes."""
+        """Return the rig with the uniform beam and damping for a vector of unknowns, shape (7,)."""
         ln_zeta, alpha, ln_gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(
             x
         ).tolist()
@@ -257,7 +257,9 @@ class UniformBeamProblem:
     def constants(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Predict the modal constants of m beams with n modes, shape (m, 4 n).
+        """Predict the modal constants of m uniform beams with n modes each, shape (m, 4 n).
+
+        The four constants of a mode are `MODE_CONSTANT_NAMES`. A mode without pole gives NaN.
 
         Parameters
         ----------
@@ -340,7 +342,9 @@ class UniformBeamProblem:
     def differences(
         self, x: NDArray[np.float64], terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Return predicted minus measured modal constants, shape (m, 4 n); phases within ±pi.
+        """Return predicted minus measured modal constants, shape (m, 4 n).
+
+        Differences of phases are between -pi and pi.
 
         Parameters
         ----------
@@ -358,7 +362,10 @@ class UniformBeamProblem:
         return constant_deviations
 
     def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return predicted minus measured constants, whitened by their covariance, (m, 4 n)."""
+        """Return predicted minus measured modal constants, shape (m, 4 n).
+
+        They are whitened: without error of the model their covariance is the unit matrix.
+        """
         return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
@@ -439,7 +446,9 @@ class UniformBeamProblem:
         return sorted((self.minimize(x) for x in start_vectors), key=lambda minimum: minimum.cost)
 
     def minimize_without_damping(self, coefficient_index: int, x: NDArray[np.float64]) -> Minimum:
-        """Minimize chi-square without one damping, whose loss is fixed at its lower bound.
+        """Minimize chi-square with the loss of one damping fixed at its lower bound.
+
+        This is a fit without internal or without external damping.
 
         Parameters
         ----------
@@ -478,7 +487,7 @@ class UniformBeamProblem:
         ) / self.transform[parameter_index, parameter_index]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
-            """Return the normal equations in the transformed unknowns."""
+            """Return chi-square and its derivatives by the transformed unknowns."""
             found = self.equations(from_transformed @ y)
             return NormalEquations(
                 found.cost,
@@ -508,7 +517,7 @@ def _minimize_within_bounds(
 
 @dataclass(frozen=True, slots=True)
 class UniformBeamTest:
-    """Test of whether a plain uniform beam predicts the modal constants of a record.
+    """Result of the test whether a uniform beam predicts the modal constants of a record.
 
     Attributes
     ----------
@@ -542,7 +551,7 @@ class UniformBeamTest:
         return BeamUniformity(self.status, self.p_value)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the test as JSON-ready dict, in which numbers may be NaN or infinite."""
+        """Return the result of the test as a dict for JSON. Numbers may be NaN or infinite."""
         return {
             **self.summary.as_json(),
             "chi_square": self.chi_square,
@@ -613,7 +622,10 @@ class TolerantEstimate:
     deviance_without_damping: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
-        """Return names and covariance matrix of the parameters as a JSON-ready dict."""
+        """Return names and covariance matrix of the beam parameters as a dict for JSON.
+
+        A name with the prefix "ln_" stands for the logarithm of the parameter.
+        """
         parameter_names = [
             f"ln_{parameter_name}" if parameter_name in LOGARITHMIC_PARAMETERS else parameter_name
             for parameter_name in PARAMETERS
@@ -740,9 +752,9 @@ def tolerant_estimate(
 
 
 def _count_idle_unknowns(problem: UniformBeamProblem, minimum: Minimum) -> int:
-    """Count the unknowns that do not affect chi-square at a minimum.
+    """Count the unknowns that are at a bound or do not affect chi-square at a minimum.
 
-    Absent damping has such unknowns.
+    The order of a vanishing damping is one of them.
     """
     chi_square_curvature = np.diag(minimum.equations.hessian)
     is_at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
@@ -755,7 +767,10 @@ def _estimate_at_minimum(
     basis: EstimateBasis,
     p_value: float | None,
 ) -> TolerantEstimate:
-    """Return beam parameters with standard deviations and 95 % intervals at the lowest minimum."""
+    """Return the beam parameters at the lowest minimum, with their uncertainties.
+
+    The minima are sorted by chi-square, the lowest first.
+    """
     best_minimum = minima[0]
     plant = problem.plant(best_minimum.x)
     bounded_hessian = best_minimum.equations.hessian + np.diag(
@@ -823,8 +838,9 @@ def _interval_end(
 ) -> float:
     """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
 
-    Return the edge of the range if chi-square does not rise so far. `parameter_index` is the position of the
-    parameter in `PARAMETERS`. `signed_std` is its standard deviation, negative for the lower end.
+    Return the edge of the range if chi-square does not rise so far. `parameter_index` is the index
+    of the parameter in `PARAMETERS`. `signed_std` is its standard deviation, negative for the lower
+    end.
     """
     estimated_value = float(problem.parameters(best_minimum.x)[parameter_index])
     range_edge = math.copysign(math.inf, signed_std)

@@ -68,12 +68,16 @@ class StateSpace:
         s : ndarray of complex
             Points in rad/s, none of them a pole.
         """
-        response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
+        frequency_response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
         for first_point in range(0, s.size, _POINTS_PER_BLOCK):
-            block = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
-            resolvent = np.linalg.solve(block * np.eye(self.order) - self.a, self.b[None] + 0j)
-            response[first_point : first_point + _POINTS_PER_BLOCK] = self.c @ resolvent + self.d
-        return response
+            point_range = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
+            resolvent = np.linalg.solve(
+                point_range * np.eye(self.order) - self.a, self.b[None] + 0j
+            )
+            frequency_response[first_point : first_point + _POINTS_PER_BLOCK] = (
+                self.c @ resolvent + self.d
+            )
+        return frequency_response
 
     def sampled(self, rate_hz: float) -> StateSpace:
         """Convert the system to a sampling rate, exactly for inputs held between the samples.
@@ -104,32 +108,36 @@ def with_filter(system: StateSpace, time_constant_s: float, order: int) -> State
         Order of the filter: 1 or 2.
     """
     n, m = system.b.shape
-    omega = 1.0 / time_constant_s
+    cutoff_rad_s = 1.0 / time_constant_s
     a = np.zeros((n + order, n + order))
     b = np.zeros((n + order, m))
     a[:n, :n], b[:n] = system.a, system.b
     first_state, last_state = n, n + order - 1
     # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-    a[last_state, :n], b[last_state] = omega * system.c[0], omega * system.d[0]
-    a[last_state, first_state] = -omega
+    a[last_state, :n], b[last_state] = cutoff_rad_s * system.c[0], cutoff_rad_s * system.d[0]
+    a[last_state, first_state] = -cutoff_rad_s
     if order == 2:
-        a[first_state, last_state] = omega
-        a[last_state, last_state] = -np.sqrt(2) * omega
-    unit = system.outputs.units[0]
-    names = ("filter_output", "filter_slope")[:order]
+        a[first_state, last_state] = cutoff_rad_s
+        a[last_state, last_state] = -np.sqrt(2) * cutoff_rad_s
+    output_unit = system.outputs.units[0]
+    state_names = ("filter_output", "filter_slope")[:order]
     return replace(
         system,
         a=a,
         b=b,
         c=np.eye(1, n + order, n),
         d=np.zeros_like(system.d),
-        states=concatenate_names((system.states, SignalNames(names, (unit,) * order))),
+        states=concatenate_names((system.states, SignalNames(state_names, (output_unit,) * order))),
     )
 
 
-def concatenate_names(vectors: Sequence[SignalNames]) -> SignalNames:
+def concatenate_names(signal_vectors: Sequence[SignalNames]) -> SignalNames:
     """Return the names and units of several vectors one after the other."""
     return SignalNames(
-        tuple(name for each in vectors for name in each.names),
-        tuple(unit for each in vectors for unit in each.units),
+        tuple(
+            signal_name for signal_vector in signal_vectors for signal_name in signal_vector.names
+        ),
+        tuple(
+            signal_unit for signal_vector in signal_vectors for signal_unit in signal_vector.units
+        ),
     )
