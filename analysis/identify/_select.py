@@ -165,7 +165,7 @@ def select(
     """Select the model of beam and damping that a record supports, and report its parameters.
 
     The modal model is fitted to the record without hum, impacts and gaps. Its modes are reported.
-    If its residual is noise, the beam is linear and does not change. Otherwise drag, nonlinear forces,
+    If its residual is noise, the beam is linear and constant. Otherwise drag, nonlinear forces,
     changes along the record and impacts are tested. A uniform beam is tested against the modal
     constants. Orders, coefficients and stiffness are estimated from these constants, with the
     tolerance of the geometry that the measurement states. All structures are also fitted to the
@@ -624,8 +624,8 @@ def _fit_further_effects(
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
     """Test a record for nonlinear and time-varying effects.
 
-    Nonlinear effects are only tested with `test_amplitude_effects`. Return the candidate set with the best explanation, its nonlinear forces, and its changes along
-    the record.
+    Nonlinear effects are only tested with `test_amplitude_effects`. Return the candidate set with
+    the best explanation, its nonlinear forces, and its changes along the record.
     """
     if not test_amplitude_effects:
         candidate_set, temporal_changes = find_temporal_changes(

@@ -68,16 +68,16 @@ class SmallEffect:
 
     @property
     def linear(self) -> bool:
-        """Return whether the torque by this effect is exact to first order in its size."""
+        """Return whether the torque by this effect is proportional to the size of the effect."""
         return self.kind in _EXACT_KINDS
 
     @property
     def large(self) -> bool:
-        """Return whether the effect is so large that it needs a model of its own."""
+        """Return whether the nonlinear effect is so large that it needs a model of its own."""
         return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
 
     def finding(self) -> Finding:
-        """Return the finding that names the effect as not established."""
+        """Return the finding that this effect is possible, but not established."""
         return Finding(
             kind=self.kind,
             sentence=(

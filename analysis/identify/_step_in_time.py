@@ -61,12 +61,12 @@ class StiffnessStep:
 
     @property
     def named(self) -> bool:
-        """Return whether the step explains more of the residual than chance would."""
+        """Return whether the step is significant: its score is above `MIN_REPORTED_SCORE`."""
         return self.score > MIN_REPORTED_SCORE
 
     @property
     def words(self) -> str:
-        """Return the step in words, as part of a sentence."""
+        """Return size and time of the stiffness step in words, as part of a sentence."""
         percent = float(f"{100 * self.relative_change:.1g}")
         return (
             f"a step of the stiffness by about {percent:+g} % near {self.instant_s:.0f} s (each "
@@ -74,7 +74,7 @@ class StiffnessStep:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the step as a JSON-ready dict."""
+        """Return the stiffness step as a dict for JSON."""
         return {
             "name": "step in time",
             "score": self.score,
@@ -121,7 +121,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
 
 
 class _StiffnessStepTorque:
-    """Torque change of the modal model by a stiffness that is higher from an instant on."""
+    """Computation of the torque change if the stiffness of the modal model rises at an instant."""
 
     def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
         self._comparison = comparison

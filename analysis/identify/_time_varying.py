@@ -109,12 +109,12 @@ class TemporalChange:
 
     @property
     def name(self) -> str:
-        """Return the effect in words, as the beginning of a sentence."""
+        """Return the change in words, as the beginning of a sentence."""
         return _EFFECT_NAMES[self.what]
 
     @property
     def certain(self) -> bool:
-        """Return whether no model without this effect explains the record as well."""
+        """Return whether no model without this change explains the record as well."""
         return self.bic_difference < -BIC_DECISIVE
 
 
@@ -248,7 +248,7 @@ def _fit_with_change(
 def _torque_spectra(
     comparison: Comparison, plant: Plant, play_angle: NDArray[np.float64]
 ) -> dict[Effect, NDArray[np.complex128]]:
-    """Return the torque spectrum of each effect per unit size, each of shape (K,)."""
+    """Return the torque spectrum of each possible change per unit of its size, each (K,)."""
     torque_slopes = _torque_slopes(comparison, plant)
     return {
         changing_property: _torque_spectrum(
@@ -259,7 +259,10 @@ def _torque_spectra(
 
 
 def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray[np.float64]]:
-    """Return the torque per relative change of damping, stiffness and gain, each (samples,)."""
+    """Return the torque change in N·m per relative change of damping, stiffness and gain.
+
+    Each has the shape (samples,).
+    """
     _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.prediction.torque(
         plant, _GRADIENT_PARAMETERS
     )
@@ -294,7 +297,7 @@ def _torque_spectrum(
 
 
 def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
-    """Return the torque change by a faster clock, per unit rate difference, shape (samples,).
+    """Return the torque change in N·m by clocks whose rates differ by `_CLOCK_UNIT`, (samples,).
 
     The torque with time stamp t is that at t plus the rate difference times the time since the
     middle of the record. It is computed by its Taylor series. `size` is in units of `_CLOCK_UNIT`.
@@ -313,7 +316,7 @@ def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[
 
 
 def play_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
+    """Return the spectrum of the torque change in N·m by a backlash of `UNIT_PLAY_RAD`, (K,)."""
     return _torque_spectrum(comparison, plant, _play_angle(comparison), "play", 0.0)
 
 
@@ -382,12 +385,12 @@ def memory_torque(
     total_torque = np.zeros(n)
 
     def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the values over time of a quantity with a given spectrum, shape (n,)."""
+        """Convert a Laplace transform to values over time, shape (n,)."""
         time_values: NDArray[np.float64] = np.fft.irfft(spectrum, padded_length)[:n] * time_growth
         return time_values
 
     def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the spectrum of a quantity times w, from the spectrum of the quantity."""
+        """Return the transform of w times a quantity, from the transform of the quantity."""
         weighted_transform: NDArray[np.complex128] = np.fft.rfft(
             w * in_time(spectrum) / time_growth, padded_length
         )
@@ -452,7 +455,7 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 
 
 def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
-    """Return whether one change, and no other model, explains the record.
+    """Return whether the record establishes exactly one change as its explanation.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
     Backlash may be established.

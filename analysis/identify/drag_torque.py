@@ -325,7 +325,7 @@ class DragResponse:
 
     @property
     def _leverage(self) -> Real:
-        """Return the leverage ``L b_i`` of each mode i in m: root torque per modal force."""
+        """Return ``L b_i`` in m², the first moment of the shape of each mode i about the root."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
     def _mean_speed(self, speed_m_s: Real) -> float:
@@ -595,8 +595,8 @@ def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
 def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
     """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest force first. Between the
-    instants the force is the polynomial through all of these forces.
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest
+    force first. Between the instants the force is the polynomial through all of these forces.
     """
     quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
     step_fraction = 0.5 * (quadrature_node + 1)

@@ -244,7 +244,7 @@ class Estimates:
     modal: ModalEstimate | None = None
 
     def doubted(self, flag: str) -> Self:
-        """Return the estimates with a flag on every number that has none.
+        """Return the estimates with a given flag on every number that has no flag yet.
 
         Parameters
         ----------
@@ -292,7 +292,7 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return, for each parameter that is not valid, the reason why."""
+        """Return the reason why a parameter is not valid, for each flagged parameter, by name."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
@@ -491,7 +491,7 @@ def structures(
 def _structure_status(
     candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
-    """Return whether the structure of a candidate is selected, compatible or excluded."""
+    """Return whether the data exclude a candidate's structure: "selected", "compatible", "excluded"."""
     freest_candidate = candidate_set.freest
     if candidate is freest_candidate:
         return "selected"
@@ -519,7 +519,10 @@ def _structure_status(
 def _conditional_estimate(
     candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> ConditionalEstimate | None:
-    """Return the estimates of the simplest compatible structure, or None if there is none."""
+    """Return parameter estimates under the simplest structure that the record does not exclude.
+
+    Return None if no structure is simpler than the reported one.
+    """
     freest_candidate = candidate_set.freest
     compatible_candidates = [
         candidate
@@ -593,7 +596,10 @@ def reported_loss_factor(
 
 
 def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
-    """Yield the modes of a fit with the uncertainties of the fit with both dampings."""
+    """Yield the modes of a fit, with the standard deviations of a fit with both dampings.
+
+    These are larger, since the second damping is free.
+    """
     modes_with_both = {mode.number: mode for mode in with_both.modes}
     for mode in fit.modes:
         mode_with_both = modes_with_both.get(mode.number, mode)

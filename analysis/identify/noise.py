@@ -172,7 +172,7 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
 def noise_power_with_peaks(
     residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Return the noise power with peaks that are narrower than the smoothing blocks, (K,).
+    """Return the noise power of each bin, with peaks narrower than the smoothing blocks, (K,).
 
     Parameters
     ----------
@@ -193,7 +193,7 @@ def noise_power_with_peaks(
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:
-    """Return the borders of the blocks.
+    """Return the borders of the smoothing blocks, as indices of bins.
 
     Their widths increase with frequency from `_MIN_BLOCK_BINS`.
     """
@@ -209,7 +209,10 @@ def _block_borders(bin_count: int) -> NDArray[np.intp]:
 
 
 def _narrow_block_borders(bin_count: int) -> NDArray[np.intp]:
-    """Return the borders of equal blocks of `_NARROW_BLOCK_BINS` bins or a little more."""
+    """Return the borders of equal smoothing blocks, as indices of bins.
+
+    A block has `_NARROW_BLOCK_BINS` bins or a little more.
+    """
     return (
         np.linspace(0, bin_count, max(bin_count // _NARROW_BLOCK_BINS, 1) + 1)
         .round()
@@ -218,7 +221,7 @@ def _narrow_block_borders(bin_count: int) -> NDArray[np.intp]:
 
 
 def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
-    """Return the groups of bins far above the noise, each as a slice with its skirts.
+    """Return the ranges of bins whose power is far above the noise, with neighbouring bins.
 
     A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
     significant the leakage is below the noise.
@@ -236,7 +239,9 @@ def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float6
 
 
 def _lasts_through_record(residual: NDArray[np.complex128], group: slice) -> bool:
-    """Return whether the power in a group of bins lasts through the whole record.
+    """Return whether a narrow-band disturbance lasts through the whole record.
+
+    `group` is the range of its bins.
 
     The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
     """

@@ -53,7 +53,7 @@ class LinearModelError(UserError, ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """Response from motor angle to coupling torque, with the poles for its realisation.
+    """Response from motor angle to coupling torque, with the poles for its state space.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Dynamics:
     delay_s: float = 0.0
 
     def filtered(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the response with the filters of the torque channel, without the delay.
+        """Return the response in N·m/rad with the filters of the torque channel, without delay.
 
         Parameters
         ----------
@@ -111,7 +111,7 @@ class Dynamics:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainDynamics:
-    """Dynamics as a function of parameters with estimated values and covariance.
+    """Motor-to-torque dynamics as a function of parameters with estimates and covariance.
 
     Attributes
     ----------
@@ -135,7 +135,7 @@ class UncertainDynamics:
 
     @property
     def nominal(self) -> Dynamics:
-        """Dynamics for the estimated values of the parameters."""
+        """Return the dynamics for the estimated values of the parameters."""
         return self.dynamics_of(self.by_name(self.values))
 
     def by_name(self, parameter_values: NDArray[np.float64]) -> dict[str, float]:
@@ -153,7 +153,7 @@ class UncertainDynamics:
 
 
 def beam_dynamics(plant: Plant) -> Dynamics:
-    """Return the dynamics of a beam with its ends and channels.
+    """Return the motor-to-torque dynamics of a beam with tip mass, clamp and torque channel.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def _beam_poles(
 def modal_dynamics(
     modal_model: ModalModel, band_hz: tuple[float, float], mode_numbers: Sequence[int]
 ) -> Dynamics:
-    """Return the dynamics of a modal model within the band of its record.
+    """Return the motor-to-torque dynamics of a modal model within the band of its record.
 
     The background is a polynomial in s, which no state space realises: the two powers beyond the
     acceleration are approximated by well-damped pairs of poles above the band.

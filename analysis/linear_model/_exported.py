@@ -65,7 +65,7 @@ class ModelOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSamples:
-    """Random samples of the parameters, and the state space of each sample.
+    """Random samples of the fitted model parameters, and the state space of each sample.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class PosteriorSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """Error of a realisation, and standard deviation of the response, over a band.
+    """Relative error of an exported state space, and relative uncertainty of the response.
 
-    Both are relative to the exact response in continuous time.
+    Both are relative to the exact response in continuous time, over a frequency band.
 
     Attributes
     ----------
@@ -110,23 +110,23 @@ class Accuracy:
 
     @property
     def error_median(self) -> float:
-        """Median relative error of the realisation over the frequencies."""
+        """Return the median over the frequencies of the relative error of the state space."""
         return float(np.median(self.error))
 
     @property
     def std_max(self) -> float:
-        """Largest relative standard deviation of the response, NaN if it is not known."""
+        """Return the largest relative standard deviation of the response, NaN if unknown."""
         return float(self.std.max())
 
     @property
     def std_median(self) -> float:
-        """Median of the relative standard deviation of the response, NaN if it is not known."""
+        """Return the median relative standard deviation of the response, NaN if unknown."""
         return float(np.median(self.std))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearModel:
-    """Exported linear model, with its source, error and uncertainty.
+    """Exported state space of the beam, with the analysis it is from, its error and uncertainty.
 
     Attributes
     ----------
@@ -171,9 +171,9 @@ class LinearModel:
         return (*filter(None, [doubt_note]), *self.identified.beam_notes)
 
     def variables(self) -> dict[str, Any]:
-        """Return the variables of an exported file, by name.
+        """Return the variables that an exported file of the linear model contains, by name.
 
-        Values are strings, numbers, lists of strings or arrays.
+        Their values are strings, numbers, lists of strings or arrays.
         """
         state_space, accuracy, posterior_samples = self.system, self.accuracy, self.posterior
         modal_model = self.identified.modal
@@ -253,7 +253,9 @@ def linear_model(
     options: ModelOptions,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
-    """Realise an identified model: the beam if it predicts the modes, else the modal model.
+    """Convert an identified model to a state space.
+
+    This is the uniform beam if it predicts the measured modes, otherwise the modal model.
 
     Parameters
     ----------
@@ -308,7 +310,7 @@ def linear_model(
 def _accuracy(
     uncertain_dynamics: UncertainDynamics, fit: PoleFit, state_space: StateSpace
 ) -> Accuracy:
-    """Return error and uncertainty of a realisation over its band."""
+    """Return the relative error of a state space over its band, and that of the response."""
     low_hz, high_hz = fit.dynamics.band_hz
     pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
     hz_in_band = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
@@ -330,12 +332,15 @@ def _accuracy(
 def _relative_std(
     uncertain_dynamics: UncertainDynamics, s: NDArray[np.complex128]
 ) -> NDArray[np.float64]:
-    """Return the relative standard deviation of the response with delay (delta method)."""
+    """Return the relative standard deviation of the torque response with delay, shape (len(s),).
+
+    It follows from the covariance of the parameters to first order. NaN without a covariance.
+    """
     if not uncertain_dynamics.names:
         return np.full(s.size, np.nan)
 
     def response(parameter_values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the exact response with filters and delay for given parameters."""
+        """Return the exact torque response in N·m/rad, with filters and delay, at the points s."""
         sampled_dynamics = uncertain_dynamics.dynamics_of(
             uncertain_dynamics.by_name(parameter_values)
         )
@@ -363,7 +368,10 @@ def _draw_posterior(
     pole_structure: PoleStructure,
     options: ModelOptions,
 ) -> PosteriorSamples:
-    """Draw parameters from a normal distribution, and realise each sample with the same states."""
+    """Draw parameters from their normal distribution, and convert each sample to a state space.
+
+    All state spaces have the same states. Raise `LinearModelError` if too few samples allow this.
+    """
     drawn_count = options.samples
     accepted_values: list[NDArray[np.float64]] = []
     sample_systems: list[StateSpace] = []
@@ -391,8 +399,8 @@ def _draw_posterior(
             )
     if len(accepted_values) < drawn_count:
         raise LinearModelError(
-            f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the states "
-            "of the model: its parameters are too uncertain; record more, or add --samples 0."
+            f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the "
+            "states of the model: its parameters are too uncertain; record more, or add --samples 0."
         )
     return PosteriorSamples(
         np.array(accepted_values).reshape(drawn_count, uncertain_dynamics.values.size),
@@ -406,9 +414,9 @@ def _dynamics_of_sample(
     nominal_dynamics: Dynamics,
     pole_structure: PoleStructure,
 ) -> Dynamics | None:
-    """Return the dynamics of sampled parameters.
+    """Return the motor-to-torque dynamics of sampled parameters.
 
-    Return None if they are impossible or need other states.
+    Return None if the parameters are impossible or their model needs other states.
     """
     parameter_values = uncertain_dynamics.by_name(sampled_values)
     if not uncertain_dynamics.is_possible(parameter_values):

@@ -95,7 +95,7 @@ class IdentifiedModel:
 
     @property
     def gate(self) -> tuple[str, float | None]:
-        """Return status and p-value of the uniform-beam test.
+        """Return status and p-value of the test whether a uniform beam predicts the modes.
 
         The p-value is None if it was not tested.
         """
@@ -184,7 +184,7 @@ class IdentifiedModel:
 
     @property
     def _beam_part(self) -> Mapping[str, Any]:
-        """Return the part of the headline that contains the parameters of the exported beam.
+        """Return the section of the reported numbers with the parameters of the exported beam.
 
         This is the exactly uniform beam, if its covariance is stated: parameters with a tolerance
         of the geometry reproduce the resonances less exactly than they were measured.
@@ -221,7 +221,10 @@ class IdentifiedModel:
                 raise self._error("covariance.names", f"{key_name!r} has no such parameter")
 
         def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
-            """Return all parameter values, with logarithms converted."""
+            """Return all beam parameters by name. Given values replace fitted ones.
+
+            A value whose name begins with "ln_" is a logarithm, and is converted.
+            """
             return beam_values | {
                 key_name.removeprefix(_LOGARITHM_PREFIX): math.exp(min(parameter_value, 300.0))
                 if key_name.startswith(_LOGARITHM_PREFIX)
@@ -282,7 +285,7 @@ class IdentifiedModel:
         mode_numbers = stated_mode_numbers if numbers_are_stated else list(range(1, mode_count + 1))
 
         def modal_model_of(sampled_constants: Mapping[str, float]) -> ModalModel:
-            """Return the modal model with given values of its constants."""
+            """Return the modal model with given values of its modal constants, by name."""
             return with_changed_constants(
                 modal_fit,
                 {
@@ -304,7 +307,10 @@ class IdentifiedModel:
     def _covariance(
         self, entry_key: str, headline_entry: object, matrix_key: str
     ) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
-        """Read names and covariance matrix from a part of the headline, or return None."""
+        """Read parameter names and covariance matrix from an entry of the reported numbers.
+
+        Return None if they are not stated. Raise `LinearModelError` if they cannot be used.
+        """
         stated_names = headline_entry.get("names") if isinstance(headline_entry, dict) else None
         stated_matrix = headline_entry.get(matrix_key) if isinstance(headline_entry, dict) else None
         if not isinstance(stated_names, list) or not isinstance(stated_matrix, list):
@@ -329,7 +335,7 @@ class IdentifiedModel:
         return tuple(map(str, stated_names)), (covariance + covariance.T) / 2
 
     def _error(self, headline_key: str, entry_problem: str) -> LinearModelError:
-        """Return the error that a key of the headline cannot be used."""
+        """Return the exception that states why a key of the reported numbers cannot be used."""
         return LinearModelError(
             f"{self.headline_name}.{headline_key}: {entry_problem}; {_ANALYZE_AGAIN_ADVICE}."
         )
@@ -389,7 +395,7 @@ def identified_in_document(path: Path) -> IdentifiedModel:
 
 
 def identified_in_session(path: Path) -> IdentifiedModel:
-    """Analyse a session, and return the identified model.
+    """Analyse the record of a session, and return the identified model.
 
     Parameters
     ----------
@@ -419,12 +425,15 @@ def identified_in_session(path: Path) -> IdentifiedModel:
 
 
 def _doubt_about(reported_entry: object) -> object:
-    """Return why a reported quantity is doubtful, or an empty value if it is not."""
+    """Return why a reported number is doubtful, or a false value if it is not."""
     return reported_entry.get("flag") if isinstance(reported_entry, dict) else None
 
 
 def _band_hz(stated_band: object) -> tuple[float, float]:
-    """Return a stated band, or the default band if the statement cannot be used."""
+    """Return the first and last frequency of a stated band, in hertz.
+
+    Return the default band if the stated one cannot be used.
+    """
     if isinstance(stated_band, list) and len(stated_band) == 2:
         low_hz, high_hz = map(finite_number, stated_band)
         if (
@@ -459,7 +468,7 @@ def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
 
 
 def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
-    """Return the rig with a beam of given parameters."""
+    """Return the rig with a beam of given parameters, by name, and length in metres."""
     density_over_stiffness, stiffness_n_m2 = (
         beam_values["density_over_stiffness"],
         beam_values["bending_stiffness_n_m2"],

@@ -19,14 +19,17 @@ _PoleAndResidue = tuple[complex, complex]
 
 @dataclass(frozen=True, slots=True)
 class _ModalConstant:
-    """One real constant of a mode: functions that return its value, and that change it."""
+    """Kind of constant of a mode, such as its damping ratio.
+
+    `value` computes it from pole and residue. `change` returns both after an added change.
+    """
 
     value: Callable[[complex, complex], float]
     change: Callable[[complex, complex, float], _PoleAndResidue]
 
 
 def _damping_ratio(pole: complex) -> float:
-    """Return the damping ratio of a pole."""
+    """Return the damping ratio of a complex pole, negative for an unstable one."""
     return -pole.real / abs(pole)
 
 
@@ -106,6 +109,6 @@ def with_changed_constants(modal: ModalModel, constant_changes: Mapping[str, flo
 
 
 def _split_name(constant_name: str) -> tuple[str, int]:
-    """Split the name of a constant into its beginning and its number, -1 without a number."""
+    """Split a name such as "ln_frequency_2" into "ln_frequency" and 2, or -1 without number."""
     name_prefix, _, number_text = constant_name.rpartition("_")
     return name_prefix, int(number_text) if number_text.isdecimal() else -1

@@ -34,7 +34,7 @@ _MAX_INTEGRATORS: Final = 2
 def realise_response(
     fit: PoleFit, order: int | None, input_kind: InputKind
 ) -> tuple[PoleStructure, StateSpace]:
-    """Realise a response by a state space with a given number of states, or the fewest.
+    """Approximate a response by a state space with a given number of states, or the fewest.
 
     Parameters
     ----------
@@ -103,7 +103,10 @@ def realise_response(
 
 
 def _real_poles_suffice(fit: PoleFit, pair_count: int, real_pole_count: int) -> bool:
-    """Return whether a number of real poles suffices for the accuracy, with both integrators."""
+    """Return whether a number of real poles suffices for `MAX_RELATIVE_ERROR` of the response.
+
+    The fits have given numbers of conjugate pole pairs, and both integrators.
+    """
     pole_structures = _structures_with_real_poles(pair_count, real_pole_count, _MAX_INTEGRATORS)
     return any(
         fit.solve(pole_structure)[1] <= MAX_RELATIVE_ERROR for pole_structure in pole_structures
@@ -113,7 +116,7 @@ def _real_poles_suffice(fit: PoleFit, pair_count: int, real_pole_count: int) -> 
 def _structures_with_states(
     pair_count: int, state_count: int, input_kind: InputKind
 ) -> Iterator[PoleStructure]:
-    """Yield the structures with a number of pairs and a total number of states.
+    """Yield the pole structures with a number of conjugate pairs and a total number of states.
 
     `state_count` does not count the states that all structures have.
     """
@@ -131,7 +134,10 @@ def _structures_with_states(
 def _structures_with_real_poles(
     pair_count: int, real_pole_count: int, integrator_count: int
 ) -> Iterator[PoleStructure]:
-    """Yield the structures with a number of pairs, of added real poles and of integrators."""
+    """Yield the pole structures with numbers of conjugate pairs, real poles and integrators.
+
+    They differ in the range over which the added real poles are spread.
+    """
     if not 0 <= real_pole_count <= _MAX_REAL_POLES:
         return
     for first_rad_s, last_rad_s in _REAL_POLE_RANGES_RAD_S[: None if real_pole_count else 1]:
@@ -150,7 +156,7 @@ def _best_realisation(
     least_real_poles: Mapping[int, int],
     error_tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
-    """Return the most accurate stable realisation within a tolerance, or None if there is none.
+    """Return the most accurate stable state space within a tolerance, or None if there is none.
 
     `least_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
     real poles.

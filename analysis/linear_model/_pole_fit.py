@@ -79,7 +79,7 @@ _MAX_GROWTH_PER_S: Final = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class PoleStructure:
-    """Numbers and real poles that define the states of a realisation, without its coefficients.
+    """Numbers and real poles that define the states of a state space, without coefficients.
 
     Attributes
     ----------
@@ -134,7 +134,7 @@ class PoleFit:
 
     @cached_property
     def check_points_s(self) -> NDArray[np.complex128]:
-        """Return the points s in rad/s at which the error of a realisation is checked."""
+        """Return the points s in rad/s at which the error of a fitted state space is checked."""
         check_frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINTS)
         return imaginary_axis(
             check_frequency_hz[self._is_apart_from_poles_and_zeros(check_frequency_hz)]
@@ -146,7 +146,7 @@ class PoleFit:
         return self.dynamics.filtered(self.check_points_s)
 
     def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
-        """Return all real poles of a realisation, in rad/s.
+        """Return all real poles of a state space with a given structure, in rad/s.
 
         Parameters
         ----------
@@ -308,7 +308,7 @@ class PoleFit:
     # Points
 
     def _poles_and_zeros(self) -> NDArray[np.complex128]:
-        """Return the poles and zeros of the response, in rad/s."""
+        """Return the complex poles and zeros of the response to be fitted, in rad/s."""
         return np.concatenate([self.dynamics.pairs, self.zeros])
 
     def _dense_frequencies(self, band_hz: tuple[float, float], points: tuple[int, int]) -> Real:
@@ -330,7 +330,10 @@ class PoleFit:
         )
 
     def _is_apart_from_poles_and_zeros(self, frequency_hz: Real) -> NDArray[np.bool_]:
-        """Return which frequencies are far enough from poles and zeros for a relative error."""
+        """Return which frequencies are far enough from poles and zeros to compare the response.
+
+        At a zero the relative error has no meaning.
+        """
         omega_rad_s = 2 * np.pi * frequency_hz
         distance_rad_s = np.abs(1j * omega_rad_s[:, None] - self._poles_and_zeros()).min(
             axis=1, initial=np.inf

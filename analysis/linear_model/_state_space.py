@@ -30,7 +30,7 @@ class SignalNames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateSpace:
-    """Matrices of a linear system, and the delay of its outputs.
+    """Linear system in state space: its matrices, signal names and delay of the output.
 
     Attributes
     ----------
