@@ -48,7 +48,7 @@ _COST_TOLERANCE: Final = 1e-8
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """Minimum of the sum of squares of a structure under one noise spectrum.
+    """Fit of one structure to a record: the minimum of the sum of squares for one noise spectrum.
 
     Attributes
     ----------
@@ -168,7 +168,7 @@ class Refit:
         return torque_amplitudes, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the sizes of the added torque spectra, (c,), and their covariance, (c, c)."""
+        """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
         linearisation = self.objective.linearise(self.x)
         projected = self.objective.project(linearisation, self.noise.weight)
         whitened_spectra = linearisation.columns * self.noise.weight
@@ -205,7 +205,9 @@ class Refit:
         return unexplained_part(columns * noise_weight, explaining_spectra), projected.residual
 
     def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the first-order cost reduction by each added torque spectrum alone, shape (c,).
+        """Return the first-order reduction of the sum of squares by each torque spectrum alone.
+
+        Its shape is (c,).
 
         Parameters
         ----------

@@ -96,7 +96,10 @@ _START_ORDERS: Final = (0.5, 1.5)
 
 
 class CoarseResponse:
-    """Some points of the whole record's frequency response, with their weights."""
+    """Measured frequency response of a record at a few hundred points, with their weights.
+
+    A cost on it is cheap to compute.
+    """
 
     __slots__ = ("_costs", "_frequency_hz", "_measured", "_response", "_weights")
 
@@ -154,13 +157,13 @@ class CoarseResponse:
         )
 
     def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
-        """Return whether two plants are so similar that they belong to the same minimum."""
+        """Return whether the responses of two plants are so similar that they are one minimum."""
         return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
             self.cost(first_plant), self.cost(second_plant)
         )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the coarse cost with its gradient and Gauss-Newton matrix by the unknowns."""
+        """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
         plant, unknown_slopes = unknowns.plant_and_gradient(x)
         predicted_response, *response_gradient = self._response.evaluate(
             plant, unknowns.gradient_names
@@ -263,7 +266,7 @@ of the hum to the beam."""
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """Current point of the descent of one structure on a record: its objective and unknowns."""
+    """Current point of a least-squares fit of one structure: objective and vector of unknowns."""
 
     objective: Objective
     x: NDArray[np.float64]
@@ -298,7 +301,7 @@ class Descent:
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
-        """Re-estimate the angle that follows the reference, and descend again, until it converges.
+        """Re-estimate the motor angle from the reference angle, and descend until it converges.
 
         Return `self` if it has converged already.
         """
@@ -313,7 +316,7 @@ class Descent:
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
-        """Return the narrow-band disturbances found near the modes of the current beam."""
+        """Search for hum, a narrow-band disturbance, near the modes of the current beam."""
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
         torque_amplitudes = self.objective.project(at, noise.weight).amplitudes
@@ -395,7 +398,7 @@ class StructureSearch:
         return self.objective.unknowns
 
     def with_comparison(self, comparison: Comparison) -> StructureSearch:
-        """Return the same search, with the same starts, on other data of the record."""
+        """Return the search with the same starts and minima for other data of the same record."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
     def lowest_coarse_minimum(self) -> Descent:

@@ -464,7 +464,7 @@ def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -
     ----------
     changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
-    one_sweep : bool
+    is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
     if len(changes) != 1 or not changes[0].certain:
@@ -481,7 +481,7 @@ def temporal_change_findings(
     ----------
     changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
-    one_sweep : bool
+    is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
     for change in changes:

@@ -225,7 +225,7 @@ def damping_size(
 
     Parameters
     ----------
-    coefficient, order : str
+    coefficient_name, order_name : str
         "zeta" and "alpha", or "gamma" and "lambda".
     parameter_values : dict
         Values of all parameters, by name.

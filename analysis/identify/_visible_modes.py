@@ -107,7 +107,7 @@ def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: floa
 def _window_half_width_hz(
     comparison: Comparison, frequency_hz: float, damping_ratio: float
 ) -> float:
-    """Return the half width of the window around a mode, in hertz."""
+    """Return the half width in hertz of the frequency window in which a mode is tested."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
     relative_reach = min(
         max(_MIN_RELATIVE_REACH, _REACH_IN_HALF_WIDTHS * damping_ratio), _MAX_RELATIVE_REACH
@@ -120,7 +120,9 @@ def _smooth_response_chi_square(
     whitened_angle: NDArray[np.complex128],
     window_position: NDArray[np.float64],
 ) -> float:
-    """Return the sum of squares that the best smooth response leaves of whitened spectra, (K,).
+    """Return the sum of squares that remains after the best fit of a smooth response.
+
+    Torque and angle are whitened spectra, shape (K,).
 
     `window_position` is the position of each bin within the window, -1 to 1.
     """

@@ -387,7 +387,7 @@ def headline(
 
 
 def headline_of_fit(
-    parameter_name: str,
+    name: str,
     fit: RecordFit,
     visible_numbers: Collection[int],
     reasons: Mapping[str, str] = _EMPTY_MAPPING,
@@ -399,7 +399,7 @@ def headline_of_fit(
 
     Parameters
     ----------
-    parameter_name : str
+    name : str
         Name of the structure in tables.
     fit : RecordFit
         Fit whose parameters are reported.
@@ -426,7 +426,7 @@ def headline_of_fit(
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
         parameter_flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
     return Headline(
-        name=parameter_name,
+        name=name,
         fit=fit,
         parameters={
             each: _reported_parameter(
@@ -458,7 +458,7 @@ def headline_of_fit(
             )
         ),
         with_both=with_both,
-        structures=((parameter_name, "selected"),),
+        structures=((name, "selected"),),
         simpler=None,
         drag_speed_m_s=None,
         explained=unexplained is None,
@@ -491,7 +491,10 @@ def structures(
 def _structure_status(
     candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
-    """Return whether the data exclude a candidate's structure: "selected", "compatible", "excluded"."""
+    """Return "selected" for the reported structure, otherwise "compatible" or "excluded".
+
+    Excluded structures are those that the record contradicts.
+    """
     freest_candidate = candidate_set.freest
     if candidate is freest_candidate:
         return "selected"

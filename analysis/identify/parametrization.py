@@ -92,7 +92,7 @@ class Unknowns:
 
     @classmethod
     def of(cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...]) -> Unknowns:
-        """Return the unknowns of a structure with some settings free.
+        """Return the unknowns of a structure with some settings of the rig free.
 
         Parameters
         ----------
@@ -116,7 +116,10 @@ class Unknowns:
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
-        """Return the names of the free parameters as the prediction uses them for derivatives."""
+        """Return the names of the free parameters as the derivatives of the response use them.
+
+        Beam parameters are logarithms there.
+        """
         return tuple(
             _GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in self.names
         )
@@ -244,7 +247,7 @@ class Unknowns:
         return self._plant_of(parameter_values), parameter_slopes
 
     def _plant_of(self, parameter_values: Mapping[str, float]) -> Plant:
-        """Return the plant with given values of all parameters."""
+        """Return the rig and beam for values of all parameters, by name."""
         density_over_stiffness, stiffness_n_m2 = (
             parameter_values["density_over_stiffness"],
             parameter_values["bending_stiffness_n_m2"],
@@ -270,7 +273,10 @@ class Unknowns:
 
     @cached_property
     def units(self) -> Mapping[str, float]:
-        """Return, for delay and tool inertia, the value that corresponds to 1 of the unknown."""
+        """Return the value of delay and tool inertia for which the unknown is 1, by name.
+
+        The tool inertia is that between torque sensor and beam.
+        """
         nominal_beam = self.nominal.beam
         unknown_units = {
             "delay_s": _DELAY_UNIT_S,
@@ -290,7 +296,7 @@ class Unknowns:
         return MappingProxyType({**self.nominal.parameters, **fixed_values})
 
     def _linear_unknowns(self, plant: Plant) -> dict[str, float]:
-        """Return delay and tool inertia of a plant in the units of the unknowns, by name."""
+        """Return delay and tool inertia of a plant, divided by `units`, by name."""
         parameter_values = plant.parameters
         return {
             parameter_name: parameter_values[parameter_name] / unknown_unit
@@ -309,7 +315,10 @@ class Unknowns:
     def _values_and_derivatives(
         self, x: NDArray[np.float64]
     ) -> tuple[dict[str, float], NDArray[np.float64]]:
-        """Return all parameters for a vector of unknowns, and `estimates_by_unknowns`."""
+        """Return all plant parameters by name, and their derivatives by the unknowns.
+
+        The derivatives are those of `estimates_by_unknowns`.
+        """
         unknown_indices = self._indices
         unknown_values: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
         parameter_values: dict[str, float] = dict(self._fixed_values)
@@ -421,7 +430,7 @@ _MAX_GROWTH_EXPONENT: Final = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Curved steps of a descent from a vector of unknowns, and their limits.
+    """Rule of the steps of a descent: their curve in the space of the unknowns, and limits.
 
     Attributes
     ----------
@@ -446,7 +455,7 @@ class Steps:
 
     @classmethod
     def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
-        """Return the steps for the unknowns of a structure.
+        """Return the rule of the steps for the unknowns of a structure.
 
         Parameters
         ----------
@@ -538,7 +547,7 @@ def _loss_and_phase_after_step(
     *,
     linear: bool,
 ) -> tuple[float, float]:
-    """Return loss and phase of a damping after a step of ``ln loss`` and phase.
+    """Return the loss factor and the phase in rad of a damping after a step of the descent.
 
     The phase changes from `phase_before` to `phase_after`. If no loss up to `largest_loss` gives
     the required phase, the largest loss is combined with the phase that it gives.
@@ -575,11 +584,14 @@ def _loss_and_phase_after_step(
 
 
 def _phase_of_order(order: float, adds_stiffness: bool) -> float:
-    """Return the phase of a damping relative to stiffness or inertia, 0 to pi, from its order."""
+    """Return the phase in rad of a damping of given order relative to stiffness or inertia.
+
+    It is between 0 and pi.
+    """
     phase_rad = math.pi / 2 * float(order)
     return phase_rad if adds_stiffness else math.pi - phase_rad
 
 
 def _order_of_phase(phase: float, adds_stiffness: bool) -> float:
-    """Return the order of a damping from its phase relative to stiffness or inertia."""
+    """Return the order of a damping from its phase in rad relative to stiffness or inertia."""
     return (phase if adds_stiffness else math.pi - phase) / (math.pi / 2)

@@ -80,7 +80,7 @@ class LikelihoodProfile:
 
     @classmethod
     def undetermined(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
-        """Return the profile of an undetermined order: one value, an interval of the whole range.
+        """Return the profile of an order that was not profiled: one value, the whole range 0 to 2.
 
         Parameters
         ----------
@@ -104,7 +104,7 @@ class LikelihoodProfile:
 
     @property
     def identifiable(self) -> bool:
-        """Return whether the record determines this order to a useful precision."""
+        """Return whether the 95 % interval is narrow and closed, and contains one local minimum."""
         is_narrow = self.relative_width <= MAX_IDENTIFIABLE_FRACTION and not (
             self.open_below or self.open_above
         )
@@ -118,7 +118,7 @@ class LikelihoodProfile:
 
 @dataclass(frozen=True, slots=True)
 class ProfileWithPlants:
-    """Profile of one order, with the fitted plants at its local minima.
+    """Likelihood profile of one damping order, with the fitted plants at its local minima.
 
     Attributes
     ----------
@@ -254,7 +254,10 @@ def profile_both_orders(
 
 
 def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) -> bool:
-    """Return whether a refit from the minima of a profile may lower the cost of a candidate."""
+    """Return whether a fit that starts at the minima of a profile may improve a candidate.
+
+    That is so if the profile has other minima, or a lower sum of squares.
+    """
     if len(profile_fit.plants) > 1:
         return True
     free_names = set(profile_fit.structure.free)
@@ -359,13 +362,13 @@ class OrderProfiler:
         self._start_at(first_minimum)
 
     def _start_at(self, free_order_fit: Refit) -> None:
-        """Store a minimum with free order, and continue the profile from it."""
+        """Store a fit with free order as the minimum from which the profile is continued."""
         self._minimum = free_order_fit
         self._minimum_order = float(free_order_fit.x[self._order_index])
         self._store_lower(self._minimum_order, free_order_fit)
 
     def plant(self, order_value: float) -> Plant:
-        """Return the plant that was fitted at a computed value of the order."""
+        """Return the plant that was fitted with the order fixed at a value, already computed."""
         return self._refits[order_value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -491,7 +494,7 @@ class OrderProfiler:
                 outside_order = trial_order
 
     def _order_std(self) -> float:
-        """Return the standard deviation of the order at the minimum, within 1e-4 to 0.25."""
+        """Return the standard deviation of the order at the minimum, limited to 1e-4 to 0.25."""
         (scaled_hessian, hessian_scale), order_index = (
             self._minimum.equations.scaled_hessian(),
             self._order_index,
@@ -544,9 +547,9 @@ class OrderProfiler:
         order_value: float,
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Fit from the unknowns of another refit at a fixed order.
+        """Fit with the order fixed at a value, starting at the unknowns of `start_refit`.
 
-        Return the better of both fits.
+        Return this fit or `first_refit`, whichever has the lower cost.
         """
         start_unknowns = start_refit.x.copy()
         start_unknowns[self._order_index] = order_value
@@ -557,7 +560,7 @@ class OrderProfiler:
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Return the fit without the damping of this order, whose cost holds for any order."""
+        """Return the fit with the smallest damping. Its cost does not depend on the order."""
         damping_coefficient = COEFFICIENT_OF[self.order]
         start_unknowns = self._minimum.x.copy()
         coefficient_index = self._unknowns.names.index(damping_coefficient)
@@ -616,7 +619,9 @@ far larger than the tolerance of the refits."""
 
 
 def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
-    """Return the order values at the local minima within the 95 % limit, the lowest first.
+    """Return the order values at the local minima of the deviance within the 95 % limit.
+
+    The one with the lowest deviance is first.
 
     Parameters
     ----------
@@ -647,7 +652,9 @@ def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> 
 def admitted_interval(
     values: NDArray[np.float64], deviance: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
-    """Return the interval of all order values within the 95 % limit, barriers included.
+    """Return the interval of the order values whose deviance is within the 95 % limit.
+
+    Barriers of higher deviance between them are included.
 
     Parameters
     ----------
@@ -698,7 +705,7 @@ def limit_crossing(inside: float, outside: float, below: float, above: float) ->
 def values_outside_known(
     known: list[float], span: tuple[float, float], spacing: float
 ) -> list[float]:
-    """Return equally spaced values of a span that are outside the range of all known values.
+    """Return equally spaced values within a span, without those between known values.
 
     Parameters
     ----------
@@ -719,7 +726,7 @@ def values_outside_known(
 
 
 def coarse_minima_values(height_by_value: dict[float, float]) -> list[float]:
-    """Return the values at the local minima of a coarse curve, including its ends."""
+    """Return the positions of the local minima of a sampled curve, including its ends."""
     sorted_values = sorted(height_by_value)
     curve_heights = [
         math.inf,
@@ -740,7 +747,10 @@ def coarse_minima_values(height_by_value: dict[float, float]) -> list[float]:
 def _limit_crossing_between(
     values: NDArray[np.float64], deviance: NDArray[np.float64], inside: int, outside: int
 ) -> float:
-    """Interpolate the value at the 95 % limit between two indices of a profile."""
+    """Return the order value at which the deviance crosses the 95 % limit.
+
+    It is interpolated between one index within the limit and one outside.
+    """
     return limit_crossing(
         float(values[inside]),
         float(values[outside]),

@@ -72,7 +72,7 @@ multisine."""
 
 @dataclass(frozen=True, slots=True)
 class Whiteness:
-    """Whiteness test of a residual by its power (Bartlett's cumulative periodogram).
+    """Result of the test whether a residual is white, by Bartlett's cumulative periodogram.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
-        """Return whether the residual is consistent with noise alone."""
+        """Return whether the power of the residual is distributed over frequency as noise is."""
         return self.probability > _NOT_WHITE_PROBABILITY and not self.loud
 
     @property
@@ -110,7 +110,7 @@ class Whiteness:
 
 @dataclass(frozen=True, slots=True)
 class InputRelation:
-    """Test of whether a residual still follows the angle: linear dynamics outside the model.
+    """Result of the test whether a residual follows the angle, by dynamics outside the model.
 
     Attributes
     ----------
@@ -224,7 +224,7 @@ def input_relation(
     first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
 
     def block_sums(bin_values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the sum of values over each block of neighbouring bins."""
+        """Return the sum of values over each group of `_COHERENT_BINS` neighbouring bins."""
         sums_per_block: NDArray[np.complex128] = np.add.reduceat(
             bin_values[: block_count * _COHERENT_BINS], first_bins
         )
@@ -298,7 +298,7 @@ _MIN_BLOCKS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class Harmonic:
-    """Test of a residual at one multiple of the drive frequency of a sweep.
+    """Result of the test for one harmonic of the sweep in a residual.
 
     Attributes
     ----------
@@ -389,7 +389,10 @@ def harmonics(
 
 
 def _analytic_signal(real_samples: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the analytic signal, which has no negative frequencies, shape (n,)."""
+    """Return the analytic signal of real samples without their mean, shape (n,).
+
+    Its spectrum has no negative frequencies.
+    """
     one_sided_spectrum = np.fft.fft(real_samples - real_samples.mean())
     n = real_samples.size
     one_sided_spectrum[(n + 1) // 2 :] = 0

@@ -74,7 +74,7 @@ def parameters_compensate_scales(fit: RecordFit) -> bool:
 def with_scale_uncertainty(
     parameters: Mapping[str, ReportedValue], uncertainty: Mapping[str, float]
 ) -> dict[str, ReportedValue]:
-    """Combine the statistical uncertainties of parameters with those of the scales.
+    """Add the uncertainties of the scales, such as length, to those of the parameters.
 
     Parameters
     ----------
@@ -106,7 +106,11 @@ def with_scale_uncertainty(
 def _relative_scale_uncertainty(
     exponents: Mapping[str, int], uncertainty: Mapping[str, float]
 ) -> float:
-    """Return the relative standard uncertainty of a parameter by the scales."""
+    """Return the relative standard uncertainty of a parameter by those of the scales.
+
+    `exponents` are the powers of the scales, such as length, to which the parameter is
+    proportional.
+    """
     return math.hypot(
         *(
             scale_exponent * uncertainty.get(scale_name, 0.0)
@@ -118,7 +122,10 @@ def _relative_scale_uncertainty(
 def _with_scale_uncertainty(
     quantity: ReportedValue, relative_std: float, *, logarithmic: bool
 ) -> ReportedValue:
-    """Return a value whose 95 % interval includes the uncertainty of the scales, in quadrature."""
+    """Return a reported value whose uncertainty includes that of torque scale and length.
+
+    `relative_std` is the relative uncertainty by these scales. Both are added in quadrature.
+    """
     assert quantity.interval_95 is not None
     estimated_value, (lower_end, upper_end) = quantity.value, quantity.interval_95
     std = math.hypot(quantity.std or 0.0, estimated_value * relative_std)

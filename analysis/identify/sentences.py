@@ -105,7 +105,7 @@ def uniformity(test: UniformBeamTest | None) -> list[str]:
 
 
 def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
-    """Return the sentences on the dampings and on the excluded structures."""
+    """Return the sentences on the dampings that a beam has, and on the excluded structures."""
     if headline.tolerant is not None:
         excluded_names = headline.structures_with_status("excluded")
         return (
@@ -276,7 +276,7 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
 
 
 def _value_and_interval_text(reported_value: ReportedValue) -> str:
-    """Return a value with its 95 % interval as text, rounded to significant digits."""
+    """Return a reported value with its 95 % interval as text, rounded to its uncertainty."""
     if reported_value.interval_95 is None or not reported_value.std:
         return f"{reported_value.value:.4g}"
     lower_end, upper_end = reported_value.interval_95

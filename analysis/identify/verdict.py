@@ -60,7 +60,7 @@ SECOND_DAMPING_REASON: Final = (
 
 @dataclass(frozen=True, slots=True)
 class OrderVerdict:
-    """Verdict on one order of the damping.
+    """Verdict on one damping order: whether it is 1, fractional, open or not identifiable.
 
     Attributes
     ----------
@@ -175,7 +175,7 @@ def _order_status(
     *,
     doubt: str | None,
 ) -> tuple[Status, str | None]:
-    """Return the status of an order, and the reason against it or None."""
+    """Return the status of a damping order, and why it is doubtful or None."""
     freest_candidate, order_name = candidate_set.freest, profile.order
     reason_against = not_reported_reason(candidate_set, visible_numbers)
     if reason_against is not None:
@@ -223,7 +223,7 @@ class CandidateRow:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Conclusions on one record.
+    """Conclusions on one record: structure, damping orders, findings and advice.
 
     Attributes
     ----------

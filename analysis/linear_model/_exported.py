@@ -400,7 +400,8 @@ def _draw_posterior(
     if len(accepted_values) < drawn_count:
         raise LinearModelError(
             f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the "
-            "states of the model: its parameters are too uncertain; record more, or add --samples 0."
+            "states of the model: its parameters are too uncertain; record more, or add "
+            "--samples 0."
         )
     return PosteriorSamples(
         np.array(accepted_values).reshape(drawn_count, uncertain_dynamics.values.size),

@@ -195,7 +195,7 @@ class IdentifiedModel:
         return self.headline
 
     def beam(self) -> UncertainDynamics:
-        """Return the dynamics of the beam, with its ends and channels, and their uncertainty.
+        """Return the dynamics of the fitted beam, and the covariance of its parameters.
 
         Raises
         ------
@@ -250,7 +250,9 @@ class IdentifiedModel:
         )
 
     def modes(self) -> UncertainDynamics:
-        """Return the dynamics of the modal model in the band of the analysis, with uncertainty.
+        """Return the dynamics of the modal model, and the covariance of its constants.
+
+        Both hold in the band of the analysis.
 
         Raises
         ------
