@@ -74,7 +74,7 @@ class Refit:
         unknowns: Unknowns,
         start: NDArray[np.float64],
         noise: NoiseSpectrum,
-        columns: NDArray[np.complex128] | None = None,
+        torque_spectra: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _COST_TOLERANCE,
@@ -83,7 +83,7 @@ class Refit:
     ) -> Refit:
         """Descend from a start vector, after unknown torques are filled with the prediction there.
 
-        `columns`, shape (c, K), are torque spectra of unknown size that are projected out in
+        `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
         addition to the free decay. `hold` names unknowns that keep their start values.
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
@@ -93,7 +93,7 @@ class Refit:
         for fixed_name in hold:
             fixed_index = unknowns.names.index(fixed_name)
             descent_steps.lower[fixed_index] = descent_steps.upper[fixed_index] = x[fixed_index]
-        objective, minimum = Objective(comparison, unknowns, columns).minimum(
+        objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
             x,
             noise.weight,
             descent_steps,
@@ -170,7 +170,7 @@ class Refit:
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
         linearisation = self.objective.linearise(self.x)
-        projected = self.objective.project(linearisation, self.noise.weight)
+        projected_objective = self.objective.project(linearisation, self.noise.weight)
         whitened_spectra = linearisation.columns * self.noise.weight
         # The Jacobian before the projection is needed: after it the columns are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
@@ -186,10 +186,12 @@ class Refit:
         covariance = np.linalg.inv(gram_matrix)[first_column:, first_column:] / np.outer(
             column_scale, column_scale
         )
-        return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
+        return projected_objective.amplitudes[
+            projected_objective.amplitudes.size - len(self.columns) :
+        ], covariance
 
     def unexplained_columns(
-        self, columns: NDArray[np.complex128], *, beam_free: bool = True
+        self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Whiten torque spectra and remove the part that other free terms explain, shape (c, K).
 
@@ -198,26 +200,30 @@ class Refit:
         that are projected out may.
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
-        projected = self.objective.project(linearisation, noise_weight)
+        projected_objective = self.objective.project(linearisation, noise_weight)
         explaining_spectra = linearisation.columns * noise_weight
         if beam_free:
-            explaining_spectra = np.concatenate([projected.jacobian, explaining_spectra])
-        return unexplained_part(columns * noise_weight, explaining_spectra), projected.residual
+            explaining_spectra = np.concatenate([projected_objective.jacobian, explaining_spectra])
+        return unexplained_part(
+            torque_spectra * noise_weight, explaining_spectra
+        ), projected_objective.residual
 
-    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def cost_reduction_by_spectrum(
+        self, torque_spectra: NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
         """Return the first-order reduction of the sum of squares by each torque spectrum alone.
 
         Its shape is (c,).
 
         Parameters
         ----------
-        columns : ndarray of complex, shape (c, K)
+        torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra of unknown size.
         """
-        unexplained, residual = self.unexplained_columns(columns)
-        correlation = (unexplained.conj() @ residual).real
+        unexplained_spectra, residual = self.unexplained_columns(torque_spectra)
+        correlation = (unexplained_spectra.conj() @ residual).real
         unexplained_squares = np.maximum(
-            np.sum(np.abs(unexplained) ** 2, axis=1), np.finfo(float).tiny
+            np.sum(np.abs(unexplained_spectra) ** 2, axis=1), np.finfo(float).tiny
         )
         cost_reductions: NDArray[np.float64] = correlation**2 / unexplained_squares
         return cost_reductions
@@ -263,7 +269,7 @@ class Refit:
 
 
 def unexplained_part(
-    columns: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
+    whitened_spectra: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
@@ -277,6 +283,10 @@ def unexplained_part(
     gram_matrix = (normalized_spectra.conj() @ normalized_spectra.T).real + 1e-12 * np.eye(
         len(normalized_spectra)
     )
-    coefficients = np.linalg.solve(gram_matrix, (normalized_spectra.conj() @ columns.T).real)
-    unexplained_spectra: NDArray[np.complex128] = columns - coefficients.T @ normalized_spectra
+    coefficients = np.linalg.solve(
+        gram_matrix, (normalized_spectra.conj() @ whitened_spectra.T).real
+    )
+    unexplained_spectra: NDArray[np.complex128] = (
+        whitened_spectra - coefficients.T @ normalized_spectra
+    )
     return unexplained_spectra

@@ -45,14 +45,16 @@ _SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0
 """Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
 
 
-def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
+def resonance_shift(
+    coarse_cost: Callable[[Plant], float], unknowns: Unknowns
+) -> NDArray[np.float64]:
     """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
 
     Parameters
     ----------
-    cost : callable
+    coarse_cost : callable
         Function from a plant to its cost, on few points of a frequency response.
     unknowns : Unknowns
         Unknowns of the structure.
@@ -66,7 +68,7 @@ def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArr
         shift_costs = []
         for ratio_shift in _LN_RATIO_SHIFTS:
             aligning_shift[ratio_index] = ratio_shift
-            shift_costs.append(cost(unknowns.plant(moderate_damping_start + aligning_shift)))
+            shift_costs.append(coarse_cost(unknowns.plant(moderate_damping_start + aligning_shift)))
         aligning_shift[ratio_index] = _LN_RATIO_SHIFTS[int(np.argmin(shift_costs))]
     return aligning_shift
 
@@ -182,13 +184,15 @@ class CoarseResponse:
         return float(self._weights @ (response_deviation.real**2 + response_deviation.imag**2))
 
 
-def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
+def initial_guesses(
+    coarse_response: CoarseResponse, unknowns: Unknowns
+) -> list[NDArray[np.float64]]:
     """Return start vectors from which descents reach all relevant minima, each of shape (k,).
 
     The first is the best fit with all orders 1, which is close to most materials and to air. The
     others have the same losses with different orders.
     """
-    aligning_shift = resonance_shift(coarse.cost, unknowns)
+    aligning_shift = resonance_shift(coarse_response.cost, unknowns)
     damping_sizes = [
         _START_LN_SIZES.get(parameter_name, (1.0,)) for parameter_name in unknowns.structure.free
     ]
@@ -196,7 +200,7 @@ def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[
         unknowns.start(np.array(start_vector)) + aligning_shift
         for start_vector in itertools.product(*damping_sizes)
     ]
-    best_start = min(shifted_starts, key=lambda x: coarse.cost(unknowns.plant(x)))
+    best_start = min(shifted_starts, key=lambda x: coarse_response.cost(unknowns.plant(x)))
     start_vectors = [best_start]
     order_indices = [
         i
@@ -213,13 +217,15 @@ def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[
 
 
 def coarse_minima(
-    coarse: CoarseResponse, unknowns: Unknowns, start_vectors: Iterable[NDArray[np.float64]]
+    coarse_response: CoarseResponse,
+    unknowns: Unknowns,
+    start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
     descent_steps = Steps.of(unknowns)
     minima = [
         descend(
-            lambda x: coarse.normal_equations(unknowns, x),
+            lambda x: coarse_response.normal_equations(unknowns, x),
             start_vector,
             descent_steps,
             relative_tolerance=_COARSE_TOLERANCE,
@@ -231,7 +237,7 @@ def coarse_minima(
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
         if not any(
-            coarse.alike(plant, unknowns.plant(known_minimum.x))
+            coarse_response.alike(plant, unknowns.plant(known_minimum.x))
             for known_minimum in distinct_minima
         ):
             distinct_minima.append(minimum)
@@ -382,14 +388,14 @@ class StructureSearch:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse: CoarseResponse) -> StructureSearch:
+    def of(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
         """Search the whole range of the unknowns for minima of the coarse response."""
-        start_vectors = initial_guesses(coarse, objective.unknowns)
+        start_vectors = initial_guesses(coarse_response, objective.unknowns)
         return cls(
             objective,
-            coarse,
+            coarse_response,
             start_vectors[0],
-            coarse_minima(coarse, objective.unknowns, start_vectors),
+            coarse_minima(coarse_response, objective.unknowns, start_vectors),
         )
 
     @property

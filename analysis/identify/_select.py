@@ -368,7 +368,7 @@ def _select_with_known_impacts(
         or _doubt_reason(temporal_changes, is_single_sweep=measurement.is_single_sweep)
     )
     alpha_verdict, lambda_verdict = (
-        order_verdict(candidate_set, each, visible_numbers, doubt=doubt_reason)
+        order_verdict(candidate_set, each, visible_numbers, doubt_reason=doubt_reason)
         for each in order_profiles
     )
     order_verdicts, close_rivals = (alpha_verdict, lambda_verdict), rivals(candidate_set, BIC_TIE)

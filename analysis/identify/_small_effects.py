@@ -134,12 +134,12 @@ def _possible_effects(
     model_torque_nm = comparison.prediction.torque(modal.model)[0]
     largest_torque_nm = float(np.abs(model_torque_nm).max())
     if largest_torque_nm > 0 and math.isfinite(largest_torque_nm):
-        for force_power, description in ((3, "A gain of the torque that depends on its size"),
+        for force_power, effect_words in ((3, "A gain of the torque that depends on its size"),
                              (2, "A gain of the torque that depends on its sign")):  # fmt: skip
             torque_spectrum = comparison.spectrum(
                 model_torque_nm * (model_torque_nm / largest_torque_nm) ** (force_power - 1)
             )
-            yield "nonlinear gain", description, torque_spectrum
+            yield "nonlinear gain", effect_words, torque_spectrum
 
 
 def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:

@@ -101,11 +101,11 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
         spectrum_squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
         spectrum_squares[spectrum_squares == 0] = np.inf
         correlation = -(whitened_spectra @ real_residual)  # the residual is model less measurement
-        scores = correlation**2 / spectrum_squares
-        best_index = int(np.argmax(scores))
-        if scores[best_index] > best_step.score:
+        deviance_reductions = correlation**2 / spectrum_squares
+        best_index = int(np.argmax(deviance_reductions))
+        if deviance_reductions[best_index] > best_step.score:
             best_step = StiffnessStep(
-                score=float(scores[best_index]),
+                score=float(deviance_reductions[best_index]),
                 instant_s=comparison.first_s
                 + float(sample_indices[best_index]) / comparison.decimation.rate_hz,
                 relative_change=float(correlation[best_index] / spectrum_squares[best_index]),
@@ -131,7 +131,7 @@ class _StiffnessStepTorque:
         s = decay_rate + 2j * np.pi * rate_hz / self._length * np.arange(self._length // 2 + 1)
         self._decay = np.exp(-decay_rate * np.arange(sample_count) / rate_hz)
         angle_transform = np.fft.rfft(comparison.angle_rad * self._decay, self._length)
-        vibrations, torque_per_force = [], []
+        mode_vibrations, torque_per_force = [], []
         for mode_index, pole, residue in zip(
             fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
         ):
@@ -139,23 +139,26 @@ class _StiffnessStepTorque:
                 # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.
                 omega_squared, modal_inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
                 mode_response = s * s / (s * s - 2 * pole.real * s + omega_squared)
-                vibrations.append(
+                mode_vibrations.append(
                     np.fft.irfft(angle_transform * mode_response, self._length)[:sample_count]
                 )
                 phase_factor = residue / (1j * abs(residue))
                 torque_per_force.append(
                     phase_factor * modal_inertia * omega_squared * mode_response
                 )
-        self._vibrations, self._torque_per_force = np.array(vibrations), np.array(torque_per_force)
+        self._vibrations, self._torque_per_force = (
+            np.array(mode_vibrations),
+            np.array(torque_per_force),
+        )
 
-    def spectrum(self, instant: int) -> NDArray[np.complex128]:
+    def spectrum(self, sample_index: int) -> NDArray[np.complex128]:
         """Return the torque spectrum of a step per unit relative change, shape (K,).
 
-        `instant` is the index of the sample at which the stiffness steps.
+        `sample_index` is the index of the sample at which the stiffness steps.
         """
         retained_samples = self._comparison.retained
         later_vibrations = self._vibrations.copy()
-        later_vibrations[:, : retained_samples.start + instant] = 0.0
+        later_vibrations[:, : retained_samples.start + sample_index] = 0.0
         force_transforms = np.fft.rfft(later_vibrations, self._length)
         growing_torque = np.fft.irfft(
             np.sum(force_transforms * self._torque_per_force, axis=0), self._length

@@ -172,12 +172,16 @@ def find_temporal_changes(
     ), equivalent_changes
 
 
-def _has_possible_size(change: TemporalChange) -> bool:
+def _has_possible_size(temporal_change: TemporalChange) -> bool:
     """Return whether the size of a change is possible.
 
     Backlash is positive, and other changes are below 100 %.
     """
-    return change.size > 0 if change.what == "play" else abs(change.size) < 1
+    return (
+        temporal_change.size > 0
+        if temporal_change.what == "play"
+        else abs(temporal_change.size) < 1
+    )
 
 
 def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
@@ -216,33 +220,33 @@ def _promising_changes(
 def _fit_with_change(
     candidate_set: CandidateSet,
     candidate: Candidate,
-    effect: Effect,
+    changing_property: Effect,
     play_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
     """Fit a candidate with one change along the record. Return the fit and its BIC."""
-    refit = candidate_set.refit(candidate, 1)
-    beam_unknowns = refit.objective.unknowns
+    change_refit = candidate_set.refit(candidate, 1)
+    beam_unknowns = change_refit.objective.unknowns
     change_size = 0.0
     for _ in range(_MAX_SIZE_FITS):
         change_spectrum = _torque_spectrum(
-            candidate_set.comparison, refit.plant, play_angle, effect, change_size
+            candidate_set.comparison, change_refit.plant, play_angle, changing_property, change_size
         )
         added_spectra = np.concatenate([candidate_set.columns, change_spectrum[None]])
-        cost_before = refit.cost
-        refit = Refit.descend(
+        cost_before = change_refit.cost
+        change_refit = Refit.descend(
             candidate_set.comparison,
             beam_unknowns,
-            refit.x,
+            change_refit.x,
             candidate_set.noise,
             added_spectra,
             max_evaluations=DESCENT_EVALUATIONS,
         )
-        previous_size, change_size = change_size, float(refit.amplitudes()[0][-1])
+        previous_size, change_size = change_size, float(change_refit.amplitudes()[0][-1])
         is_converged = abs(change_size - previous_size) < _SIZE_TOLERANCE * abs(change_size)
-        if is_converged and abs(candidate.values * math.log(cost_before / refit.cost)) < 1:
+        if is_converged and abs(candidate.values * math.log(cost_before / change_refit.cost)) < 1:
             break
-    refit_deviance = candidate.values * math.log(refit.cost / candidate.values)
-    return refit, refit_deviance + (candidate.parameters + 1) * math.log(candidate.values)
+    refit_deviance = candidate.values * math.log(change_refit.cost / candidate.values)
+    return change_refit, refit_deviance + (candidate.parameters + 1) * math.log(candidate.values)
 
 
 def _torque_spectra(
@@ -277,30 +281,33 @@ def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
     play_angle: NDArray[np.float64],
-    effect: Effect,
-    size: float,
-    slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
+    changing_property: Effect,
+    change_size: float,
+    torque_slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
     """Return the torque spectrum of an effect at a given size, divided by that size, shape (K,).
 
-    `slopes` is the result of `_torque_slopes`, if it is known already.
+    `torque_slopes` is the result of `_torque_slopes`, if it is known already.
     """
-    if effect == "play":
+    if changing_property == "play":
         return comparison.spectrum(comparison.prediction.with_angle(play_angle).torque(plant)[0])
-    if effect == "clock":
-        return comparison.spectrum(_clock_torque(comparison, plant, size))
+    if changing_property == "clock":
+        return comparison.spectrum(_clock_torque(comparison, plant, change_size))
     unit_ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    torque_change = unit_ramp * (slopes or _torque_slopes(comparison, plant))[effect]
-    if effect != "gain":
-        torque_change += memory_torque(comparison, plant, unit_ramp, effect, size)
+    torque_change = (
+        unit_ramp * (torque_slopes or _torque_slopes(comparison, plant))[changing_property]
+    )
+    if changing_property != "gain":
+        torque_change += memory_torque(comparison, plant, unit_ramp, changing_property, change_size)
     return comparison.spectrum(torque_change)
 
 
-def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
+def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> NDArray[np.float64]:
     """Return the torque change in N·m by clocks whose rates differ by `_CLOCK_UNIT`, (samples,).
 
     The torque with time stamp t is that at t plus the rate difference times the time since the
-    middle of the record. It is computed by its Taylor series. `size` is in units of `_CLOCK_UNIT`.
+    middle of the record. It is computed by its Taylor series. `change_size` is in
+    units of `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
@@ -308,10 +315,10 @@ def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[
     response_derivative = response_grid.evaluate(plant)[0]
     taylor_factor = offset_s
     torque_change = np.zeros(offset_s.size)
-    for term_number in range(1, _TAYLOR_TERMS + 1 if size else 2):
+    for term_number in range(1, _TAYLOR_TERMS + 1 if change_size else 2):
         response_derivative = response_derivative * response_grid.s
         torque_change += taylor_factor * prediction.in_time(response_derivative)
-        taylor_factor = taylor_factor * size * offset_s / (term_number + 1)
+        taylor_factor = taylor_factor * change_size * offset_s / (term_number + 1)
     return torque_change
 
 
@@ -357,15 +364,16 @@ _STRESS_TOLERANCE: Final = 1e-4
 def memory_torque(
     comparison: Comparison,
     plant: Plant,
-    change: NDArray[np.float64],
-    effect: Literal["damping", "stiffness"],
-    size: float = 0.0,
+    relative_change: NDArray[np.float64],
+    changing_property: Literal["damping", "stiffness"],
+    change_size: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return the torque change by past values of a changing property, per unit size, (samples,).
 
-    This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
-    retained samples, constant before and after. For `effect` of "stiffness" the mass is constant.
-    `size` is e.
+    This is the torque beyond the instantaneous derivative. `relative_change`, shape (samples,), is
+    w at the retained samples, constant before and after. For `changing_property` of "stiffness" the
+    mass is constant.
+    `change_size` is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
     padded_length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
@@ -373,26 +381,30 @@ def memory_torque(
     s = decay_rate + 2j * np.pi * rate_hz / padded_length * np.arange(padded_length // 2 + 1)
     time_growth = np.exp(decay_rate * np.arange(n) / rate_hz)
     retained_samples = comparison.retained
-    w = np.interp(np.arange(n), np.arange(retained_samples.start, retained_samples.stop), change)
+    w = np.interp(
+        np.arange(n), np.arange(retained_samples.start, retained_samples.stop), relative_change
+    )
     damping, beam = plant.damping, plant.beam
     internal_damping = damping.zeta * s**damping.alpha
     external_damping = damping.gamma * s**damping.lambda_
     inertial_term = beam.density_over_stiffness * s * s + external_damping
-    changing_factor = internal_damping + 1 if effect == "stiffness" else internal_damping
+    changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
     angle_transform = np.fft.rfft(
         comparison.angle_rad / time_growth, padded_length
     ) * torque_channel_response(plant, s)
     total_torque = np.zeros(n)
 
-    def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Convert a Laplace transform to values over time, shape (n,)."""
-        time_values: NDArray[np.float64] = np.fft.irfft(spectrum, padded_length)[:n] * time_growth
+        time_values: NDArray[np.float64] = (
+            np.fft.irfft(laplace_transform, padded_length)[:n] * time_growth
+        )
         return time_values
 
-    def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def weighted(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the transform of w times a quantity, from the transform of the quantity."""
         weighted_transform: NDArray[np.complex128] = np.fft.rfft(
-            w * in_time(spectrum) / time_growth, padded_length
+            w * in_time(laplace_transform) / time_growth, padded_length
         )
         return weighted_transform
 
@@ -406,19 +418,19 @@ def memory_torque(
         )
         constant_stress = modal_stress = stress_per_angle * angle_transform
         vibration_change = np.zeros_like(modal_stress)
-        for _ in range(_MAX_SIZE_ORDER if size else 1):
+        for _ in range(_MAX_SIZE_ORDER if change_size else 1):
             vibration_change = -modal_compliance * weighted(modal_stress)
             previous_stress, modal_stress = (
                 modal_stress,
                 constant_stress
-                + size * (changing_factor * k + external_damping) * vibration_change,
+                + change_size * (changing_factor * k + external_damping) * vibration_change,
             )
             if (
                 np.abs(modal_stress - previous_stress).max()
                 < _STRESS_TOLERANCE * np.abs(constant_stress).max()
             ):
                 break
-        modal_deflection = (1 - rigid_response) * angle_transform + size * vibration_change
+        modal_deflection = (1 - rigid_response) * angle_transform + change_size * vibration_change
         torque_part = in_time(inertial_term * vibration_change) + w * in_time(
             external_damping * modal_deflection
         )
@@ -454,7 +466,7 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 """Kind of the finding on each effect."""
 
 
-def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
+def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
     """Return whether the record establishes exactly one change as its explanation.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
@@ -462,34 +474,34 @@ def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -
 
     Parameters
     ----------
-    changes : tuple of TemporalChange
+    equivalent_changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    if len(changes) != 1 or not changes[0].certain:
+    if len(equivalent_changes) != 1 or not equivalent_changes[0].certain:
         return False
-    return changes[0].what == "play" or not is_single_sweep
+    return equivalent_changes[0].what == "play" or not is_single_sweep
 
 
 def temporal_change_findings(
-    changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
 ) -> Iterator[Finding]:
     """Yield a finding on each change along the record.
 
     Parameters
     ----------
-    changes : tuple of TemporalChange
+    equivalent_changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    for change in changes:
+    for change in equivalent_changes:
         finding = _established_finding(change)
-        if established(changes, is_single_sweep=is_single_sweep):
+        if established(equivalent_changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
-            rival_names = "the others named" if len(changes) > 1 else "any other model"
+            rival_names = "the others named" if len(equivalent_changes) > 1 else "any other model"
             yield replace(
                 finding,
                 sentence=(
@@ -501,13 +513,13 @@ def temporal_change_findings(
             )
 
 
-def _size_text(change: TemporalChange) -> str:
+def _size_text(temporal_change: TemporalChange) -> str:
     """Return the size of a change as text with its unit."""
-    if change.what == "play":
-        return f"{1e3 * change.size:.2g} mrad"
-    if change.what == "clock":
-        return f"the torque's by {1e6 * change.size:+.3g} ppm"
-    return f"{100 * change.size:+.2g} % from beginning to end"
+    if temporal_change.what == "play":
+        return f"{1e3 * temporal_change.size:.2g} mrad"
+    if temporal_change.what == "clock":
+        return f"the torque's by {1e6 * temporal_change.size:+.3g} ppm"
+    return f"{100 * temporal_change.size:+.2g} % from beginning to end"
 
 
 _DISPLAY_FACTORS: Final[Mapping[Effect, float]] = {"play": 1e3, "clock": 1e6}
@@ -520,20 +532,20 @@ _TWO_WAY_SWEEP_ADVICE: Final = (
 """Advice to sweep in both directions, without its first letter."""
 
 
-def _established_finding(change: TemporalChange) -> Finding:
+def _established_finding(temporal_change: TemporalChange) -> Finding:
     """Return the finding that a change along the record is established."""
-    size_half_width = NORMAL_95 * change.std
-    is_backlash = change.what == "play"
-    remedy = f"S{_TWO_WAY_SWEEP_ADVICE}"
+    size_half_width = NORMAL_95 * temporal_change.std
+    is_backlash = temporal_change.what == "play"
+    remedy_text = f"S{_TWO_WAY_SWEEP_ADVICE}"
     if is_backlash:
-        remedy = "Remove the backlash in gear and clamp."
-    elif change.what == "clock":
-        remedy = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
+        remedy_text = "Remove the backlash in gear and clamp."
+    elif temporal_change.what == "clock":
+        remedy_text = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
     return Finding(
-        kind=_FINDING_KINDS[change.what],
+        kind=_FINDING_KINDS[temporal_change.what],
         sentence=(
-            f"{_EFFECT_NAMES[change.what]}: {_size_text(change)} "
-            f"(± {_DISPLAY_FACTORS.get(change.what, 100.0) * size_half_width:.1g}; 95 %). "
+            f"{_EFFECT_NAMES[temporal_change.what]}: {_size_text(temporal_change)} "
+            f"(± {_DISPLAY_FACTORS.get(temporal_change.what, 100.0) * size_half_width:.1g}; 95 %). "
             "It was fitted too"
             + (
                 ", to first order in its size."
@@ -541,8 +553,8 @@ def _established_finding(change: TemporalChange) -> Finding:
                 else "; all parameters are those at the middle of the record."
             )
         ),
-        value=change.size,
-        interval=(change.size - size_half_width, change.size + size_half_width),
+        value=temporal_change.size,
+        interval=(temporal_change.size - size_half_width, temporal_change.size + size_half_width),
         unit="rad" if is_backlash else "1",
-        remedy=remedy,
+        remedy=remedy_text,
     )

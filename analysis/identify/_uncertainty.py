@@ -42,7 +42,7 @@ _MAX_LN_PIVOT_FREQUENCY: Final = 50.0
 
 
 def covariance_of_unknowns(
-    jacobian: NDArray[np.complex128], scatter: float, at_bound: NDArray[np.bool_]
+    jacobian: NDArray[np.complex128], residual_variance: float, at_bound: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
@@ -50,7 +50,7 @@ def covariance_of_unknowns(
     ----------
     jacobian : ndarray of complex, shape (k, K)
         Derivatives of the whitened residual by the unknowns.
-    scatter : float
+    residual_variance : float
         Variance of real and imaginary parts of the whitened residual.
     at_bound : ndarray of bool, shape (k,)
         True for unknowns at a bound.
@@ -62,18 +62,20 @@ def covariance_of_unknowns(
     is_determined : ndarray of bool, shape (k,)
         True for unknowns that the data determine.
     """
-    hessian = (jacobian.conj() @ jacobian.T).real
-    hessian_scale = np.sqrt(np.diag(hessian))
+    hessian_matrix = (jacobian.conj() @ jacobian.T).real
+    hessian_scale = np.sqrt(np.diag(hessian_matrix))
     is_determined = ~at_bound & (hessian_scale > 0) & np.isfinite(hessian_scale)
-    covariance = np.zeros_like(hessian)
+    covariance = np.zeros_like(hessian_matrix)
     if not is_determined.any():
         return covariance, is_determined
     determined_block = np.ix_(is_determined, is_determined)
     scale_products = np.outer(hessian_scale[is_determined], hessian_scale[is_determined])
-    scaled_hessian = hessian[determined_block] / scale_products
+    scaled_hessian = hessian_matrix[determined_block] / scale_products
     if np.linalg.cond(scaled_hessian) > _MAX_CONDITION_NUMBER:
         return covariance, np.zeros_like(is_determined)
-    covariance[determined_block] = scatter * np.linalg.inv(scaled_hessian) / scale_products
+    covariance[determined_block] = (
+        residual_variance * np.linalg.inv(scaled_hessian) / scale_products
+    )
     return covariance, is_determined
 
 
@@ -177,18 +179,18 @@ def parameter_uncertainty(
 # Intervals
 
 
-def interval(parameter_name: str, value: float, std: float) -> tuple[float, float]:
+def interval(parameter_name: str, parameter_value: float, std: float) -> tuple[float, float]:
     """Return the 95 % interval of a parameter.
 
     `std` is the standard deviation of the logarithm for parameters in `LOGARITHMIC_PARAMETERS`.
     """
     half_width = NORMAL_95 * std
     if parameter_name in LOGARITHMIC_PARAMETERS:
-        return value * math.exp(-half_width), value * math.exp(half_width)
-    return value - half_width, value + half_width
+        return parameter_value * math.exp(-half_width), parameter_value * math.exp(half_width)
+    return parameter_value - half_width, parameter_value + half_width
 
 
-def interval_from_zero(value: float, std: float) -> tuple[float, float]:
+def interval_from_zero(estimated_value: float, std: float) -> tuple[float, float]:
     """Return the 95 % interval of a quantity that cannot be negative.
 
     It is the non-negative part of the symmetric interval. So it begins at 0 if the estimate is
@@ -197,13 +199,13 @@ def interval_from_zero(value: float, std: float) -> tuple[float, float]:
 
     Parameters
     ----------
-    value : float
+    estimated_value : float
         Estimate, not negative.
     std : float
         Standard deviation without the bound at 0.
     """
     half_width = NORMAL_95 * std
-    return max(value - half_width, 0.0), value + half_width
+    return max(estimated_value - half_width, 0.0), estimated_value + half_width
 
 
 # Loss factor at its pivot frequency
@@ -323,7 +325,7 @@ def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.flo
 def ringing(
     poles: Sequence[Pole],
     projected: Projected,
-    scatter: float,
+    residual_variance: float,
     projected_spectra: NDArray[np.complex128],
     hum_spectra: NDArray[np.complex128],
 ) -> Ringing:
@@ -333,7 +335,7 @@ def ringing(
     bins, which the free decay would partly explain. So only the reduction of the sum of squares in
     addition to the hum counts. `projected_spectra`, shape (m, K), are the whitened spectra of the
     free decays and of the other projected terms. `hum_spectra`, shape (h, K), are the whitened
-    spectra of the lines. `scatter` is the variance of real and imaginary parts of the residual.
+    spectra of the lines. `residual_variance` is that of real and imaginary parts of the residual.
     """
     decay_count = count_decay_spectra(poles)
     projected_spectra, decay_amplitudes = (
@@ -352,18 +354,20 @@ def ringing(
             _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares
         )
         decay_amplitudes = best_factors[: decay_amplitudes.size]
-    amplitudes: dict[int, float] = {}
+    mode_amplitudes: dict[int, float] = {}
     first_column = 0
-    for pole in poles:
-        column_count = 2 if pole.oscillates else 1
+    for decay_pole in poles:
+        column_count = 2 if decay_pole.oscillates else 1
         mode_amplitude = float(
             np.linalg.norm(decay_amplitudes[first_column : first_column + column_count])
         )
-        amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), mode_amplitude)
+        mode_amplitudes[decay_pole.mode] = max(
+            mode_amplitudes.get(decay_pole.mode, 0.0), mode_amplitude
+        )
         first_column += column_count
     return Ringing(
-        amplitude_nm=tuple(amplitudes.values()),
-        chi_square=explained_squares / scatter,
+        amplitude_nm=tuple(mode_amplitudes.values()),
+        chi_square=explained_squares / residual_variance,
         degrees_of_freedom=decay_amplitudes.size,
     )
 

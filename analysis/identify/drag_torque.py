@@ -201,11 +201,11 @@ class DragResponse:
         n = angle_rad.size
         self.plant, self._samples, self._rate_hz = plant, n, rate_hz
         self._length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
-        self._sigma = sigma = _DECAY_EXPONENT * rate_hz / self._length
+        self._sigma = decay_rate_per_s = _DECAY_EXPONENT * rate_hz / self._length
         bin_indices = np.arange(self._length // 2 + 1)
-        self.s = s = sigma + 2j * np.pi * rate_hz / self._length * bin_indices
+        self.s = s = decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
         fine_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
-        self._growth = np.exp(sigma * fine_time_s)
+        self._growth = np.exp(decay_rate_per_s * fine_time_s)
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
@@ -365,13 +365,13 @@ class DragResponse:
             -HALF_AIR_DENSITY_KG_PER_M3 * law.slowing,
         )
         multiply_step, multiply_force = step_matrix.dot, state_by_force.dot
-        add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
+        add, multiply, take_absolute, take_cube_root = np.add, np.multiply, np.absolute, np.cbrt
         for point_speed in speed_m_s:
             multiply_step(modal_state, step_output)
             add(point_speed, drag_speed_change, point_speed)
-            absolute(point_speed, speed_magnitude)
+            take_absolute(point_speed, speed_magnitude)
             if slowing_factor:
-                cbrt(speed_magnitude, force_per_m)
+                take_cube_root(speed_magnitude, force_per_m)
                 multiply(force_per_m, slowing_factor, force_per_m)
                 multiply(speed_magnitude, constant_factor, speed_magnitude)
                 add(force_per_m, speed_magnitude, speed_magnitude)
@@ -566,12 +566,12 @@ class DragResponse:
         )
         return torque_spectrum
 
-    def _oversampled_values(self, spectrum: Complex) -> Real:
+    def _oversampled_values(self, laplace_transform: Complex) -> Real:
         """Convert a Laplace transform to values over time, at three times the sampling rate.
 
         Their shape is (..., 3 m).
         """
-        fine_samples = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
+        fine_samples = np.fft.irfft(_OVERSAMPLING * laplace_transform, _OVERSAMPLING * self._length)
         oversampled_values: Real = fine_samples[..., : self._growth.size] * self._growth
         return oversampled_values
 
@@ -696,19 +696,19 @@ class DragExpansion:
         torque_jacobian : ndarray of complex, shape (k, K)
             Derivatives of the change by the unknowns.
         """
-        spectra, parameter_steps, step_slopes = [], [], []
+        derivative_spectra, parameter_steps, step_slopes = [], [], []
         own_poles = {
             pole.mode: pole.at_rad_s for pole in mode_poles(self.plant, len(self.by_pole), ())
         }
         for pole in poles:
             if pole.mode in self.by_pole and pole.oscillates and pole.mode in own_poles:
                 pole_step = pole.at_rad_s - own_poles[pole.mode]
-                remainder, remainder_slopes = self._torque_beyond_first_order(
+                higher_order_torque, remainder_slopes = self._torque_beyond_first_order(
                     pole.mode, own_poles[pole.mode], pole.at_rad_s
                 )
                 by_pole = self.by_pole[pole.mode]
                 # Derivatives at the pole of the other beam; the remainder itself is a separate row.
-                spectra += [*by_pole, *remainder_slopes, remainder]
+                derivative_spectra += [*by_pole, *remainder_slopes, higher_order_torque]
                 parameter_steps += [pole_step.real, pole_step.imag, 0.0, 0.0, -1.0]
                 pole_slopes = [pole.derivative.real, pole.derivative.imag]
                 step_slopes += [
@@ -716,7 +716,7 @@ class DragExpansion:
                     *(-pole_slope for pole_slope in pole_slopes),
                     np.zeros(parameter_slopes.shape[1]),
                 ]
-        spectra.append(self.by_ln_density)
+        derivative_spectra.append(self.by_ln_density)
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
         parameter_steps.append(np.log(other_density / own_density))
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
@@ -726,17 +726,17 @@ class DragExpansion:
         for by_external, damping_change in zip(
             self.by_external, self._external_damping_change(plant), strict=True
         ):
-            spectra += list(by_external)
+            derivative_spectra += list(by_external)
             parameter_steps += damping_change[:, 0].tolist()
             step_slopes += list(
                 damping_change[:, 1:]
                 @ _parameter_rows(parameter_slopes, parameter_names, _EXTERNAL_PARAMETERS)
             )
-        spectra.append(self.by_delay)
+        derivative_spectra.append(self.by_delay)
         parameter_steps.append(plant.delay_s - self.plant.delay_s)
         step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
-        real_spectra = np.array(spectra).view(np.float64)
+        real_spectra = np.array(derivative_spectra).view(np.float64)
         torque_change: Complex = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
         torque_jacobian: Complex = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
         return torque_change, torque_jacobian

@@ -61,26 +61,28 @@ def count_decay_spectra(poles: Sequence[Pole]) -> int:
 
 
 def mode_poles(
-    plant: Plant, count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
+    plant: Plant, mode_count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
 ) -> tuple[Pole, ...]:
-    """Return the poles of the first `count` modes with derivatives. A mode may have none.
+    """Return the poles of the first `mode_count` modes with derivatives. A mode may have none.
 
     Parameters
     ----------
     plant : Plant
         Rig and beam.
-    count : int
+    mode_count : int
         Number of modes.
     wrt : sequence of str
         Parameters of the derivatives, by the names of `ResponseGrid`. Some do not affect a pole.
     near_rad_s : sequence of complex, optional
         Approximate poles in the order of the modes, if all are known.
     """
-    start_poles = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
+    start_poles = np.array(near_rad_s) if len(near_rad_s) == mode_count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
-        return _loaded_poles(plant, count, wrt, start_poles)
-    z = eigenvalues(count).copy()
-    for mode_index, stiffness_offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
+        return _loaded_poles(plant, mode_count, wrt, start_poles)
+    z = eigenvalues(mode_count).copy()
+    for mode_index, stiffness_offset in enumerate(
+        plant.stiffness_offsets[: mode_count - 1], start=1
+    ):
         z[mode_index] *= (1 + stiffness_offset) ** 0.25
     found_poles = []
     for i, pole_pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, start_poles)):
@@ -98,7 +100,7 @@ def mode_poles(
 
 
 def _loaded_poles(
-    plant: Plant, count: int, wrt: Sequence[str], start_poles: NDArray[np.complex128] | None
+    plant: Plant, mode_count: int, wrt: Sequence[str], start_poles: NDArray[np.complex128] | None
 ) -> tuple[Pole, ...]:
     """Return the poles of a uniform beam with a tip mass or an elastic clamp, with derivatives."""
     loaded_beam = LoadedBeam(
@@ -107,7 +109,7 @@ def _loaded_poles(
     mode_and_pole = [
         (mode_number, pole)
         for mode_number, pole_pair in enumerate(
-            loaded_beam.poles(eigenvalues(count), start_poles), start=1
+            loaded_beam.poles(eigenvalues(mode_count), start_poles), start=1
         )
         if not np.isnan(pole_pair).any()
         for pole in pole_pair[: 1 if pole_pair[0].imag else 2]
@@ -136,9 +138,9 @@ class DecaySpectra:
 
     __slots__ = ("_duration_s", "_period_s", "_sample_rotation")
 
-    def __init__(self, samples: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
+    def __init__(self, sample_count: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
         self._period_s = 1 / rate_hz
-        self._duration_s = samples / rate_hz
+        self._duration_s = sample_count / rate_hz
         self._sample_rotation = np.exp(-1j * omega_rad_s * self._period_s)
 
     def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
@@ -264,13 +266,13 @@ class LaterDecaySpectra(DecaySpectra):
 
     def __init__(
         self,
-        samples: int,
+        sample_count: int,
         rate_hz: float,
         omega_rad_s: NDArray[np.float64],
         first_s: float,
         tick_s: float,
     ) -> None:
-        super().__init__(samples, rate_hz, omega_rad_s)
+        super().__init__(sample_count, rate_hz, omega_rad_s)
         self._duration_s -= first_s
         self._tick_s = tick_s
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)

@@ -90,7 +90,7 @@ class ReportedValue:
 
     Attributes
     ----------
-    value : float
+    estimated_value : float
         Estimate in SI units.
     std : float or None
         Standard deviation. None if the data do not determine it.
@@ -298,7 +298,7 @@ class Headline(Estimates):
     @property
     def visible_modes(self) -> tuple[int, ...]:
         """Return the numbers of the modes that the record shows."""
-        return tuple(mode.number for mode in self.modes if mode.shown)
+        return tuple(reported_mode.number for reported_mode in self.modes if reported_mode.shown)
 
     def with_stiffness_law_flag(self) -> Headline:
         """Return the headline with a flag on numbers that depend on the assumed stiffness law."""
@@ -329,7 +329,7 @@ class Headline(Estimates):
 
 def headline(
     candidate_set: CandidateSet,
-    orders: tuple[OrderVerdict, OrderVerdict],
+    order_verdicts: tuple[OrderVerdict, OrderVerdict],
     visible_numbers: tuple[int, ...],
     *,
     unexplained: str | None,
@@ -340,7 +340,7 @@ def headline(
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     visible_numbers : tuple of int
         Numbers of the visible modes.
@@ -348,13 +348,15 @@ def headline(
         Reason against every number. None if the residual is noise only.
     """
     freest = candidate_set.freest
-    fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
+    fractional_orders = frozenset(
+        each.order for each in order_verdicts if each.status == "fractional"
+    )
     order_reasons: dict[str, str] = {
-        each.order: each.reason for each in orders if each.reason is not None
+        each.order: each.reason for each in order_verdicts if each.reason is not None
     }
     order_intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
-        for each in orders
+        for each in order_verdicts
         if each.profile.is_computed and each.order in freest.structure.free
     }
     reported_headline = headline_of_fit(
@@ -390,8 +392,8 @@ def headline_of_fit(
     name: str,
     fit: RecordFit,
     visible_numbers: Collection[int],
-    reasons: Mapping[str, str] = _EMPTY_MAPPING,
-    intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
+    order_reasons: Mapping[str, str] = _EMPTY_MAPPING,
+    order_intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained: str | None = None,
     both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
@@ -405,9 +407,9 @@ def headline_of_fit(
         Fit whose parameters are reported.
     visible_numbers : collection of int
         Numbers of the modes that the record shows.
-    reasons : mapping of str to str
+    order_reasons : mapping of str to str
         Reasons against "alpha" or "lambda", which also apply to the coefficients.
-    intervals : mapping of str to (float, float)
+    order_intervals : mapping of str to (float, float)
         95 % intervals of orders, used instead of those of the fit.
     unexplained : str, optional
         Reason against all numbers.
@@ -416,11 +418,11 @@ def headline_of_fit(
     """
     with_both, uses_both = both or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
-    if SECOND_DAMPING_REASON in reasons.values():
+    if SECOND_DAMPING_REASON in order_reasons.values():
         damping_reason = SECOND_DAMPING_REASON
     parameter_flags: dict[str, str] = {
         parameter_name: order_reason
-        for order_name, order_reason in reasons.items()
+        for order_name, order_reason in order_reasons.items()
         for parameter_name in (order_name, COEFFICIENT_OF[order_name])
     }
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
@@ -430,7 +432,7 @@ def headline_of_fit(
         fit=fit,
         parameters={
             each: _reported_parameter(
-                fit, each, unexplained or parameter_flags.get(each), intervals.get(each)
+                fit, each, unexplained or parameter_flags.get(each), order_intervals.get(each)
             )
             for each in fit.parameters
             if fit.structure.has(each)
@@ -439,21 +441,21 @@ def headline_of_fit(
             # A loss factor is valid without its order. A coefficient is valid with its order only.
             reported_loss_factor(
                 each,
-                size,
+                loss_factor,
                 unexplained
                 or (
-                    reasons.get(DAMPING_PARAMETER_NAMES[each][1])
-                    if size.omega_rad_s is None
+                    order_reasons.get(DAMPING_PARAMETER_NAMES[each][1])
+                    if loss_factor.omega_rad_s is None
                     else None
                 )
                 or damping_reason,
             )
-            for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
-            if size is not None
+            for each, loss_factor in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
+            if loss_factor is not None
         ),
         modes=tuple(
-            _reported_mode(mode, visible_numbers, unexplained)
-            for mode in (
+            _reported_mode(mode_estimate, visible_numbers, unexplained)
+            for mode_estimate in (
                 _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
             )
         ),
@@ -538,9 +540,9 @@ def _conditional_estimate(
     simplest_candidate = min(compatible_candidates, key=lambda candidate: candidate.bic)
     fixed_orders = {
         order_name: simplest_candidate.structure.fixed[order_name]  # type: ignore[index]
-        for order_name, coefficient in COEFFICIENT_OF.items()
+        for order_name, coefficient_name in COEFFICIENT_OF.items()
         if order_name in simplest_candidate.structure.fixed
-        and coefficient in simplest_candidate.structure.free
+        and coefficient_name in simplest_candidate.structure.free
     }
     return ConditionalEstimate(
         name=simplest_candidate.name,
@@ -555,12 +557,15 @@ def _conditional_estimate(
 
 
 def _reported_parameter(
-    fit: RecordFit, parameter_name: str, reason: str | None, interval: tuple[float, float] | None
+    fit: RecordFit,
+    parameter_name: str,
+    doubt_reason: str | None,
+    order_interval: tuple[float, float] | None,
 ) -> ReportedValue:
     """Return the reported value of one parameter of a fit, with its interval and flag."""
     is_free = parameter_name in fit.interval
-    interval_95 = interval or fit.interval.get(parameter_name)
-    invalid_reason = reason
+    interval_95 = order_interval or fit.interval.get(parameter_name)
+    invalid_reason = doubt_reason
     if invalid_reason is None and parameter_name in fit.at_bounds and interval_95 is None:
         invalid_reason = _AT_BOUND_FLAG
     if invalid_reason is None and is_free and interval_95 is None:
@@ -574,7 +579,7 @@ def _reported_parameter(
 
 
 def reported_loss_factor(
-    damping: Damping, size: DampingSize, reason: str | None
+    damping: Damping, damping_size: DampingSize, invalid_reason: str | None
 ) -> ReportedLossFactor:
     """Return the reported loss factor of a damping, with its 95 % interval.
 
@@ -582,19 +587,21 @@ def reported_loss_factor(
     ----------
     damping : str
         "internal" or "external".
-    size : DampingSize
+    damping_size : DampingSize
         Estimated loss factor.
-    reason : str or None
+    invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     """
     # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
-    relative_half_width = NORMAL_95 * size.std / size.value
+    relative_half_width = NORMAL_95 * damping_size.std / damping_size.value
     interval_95 = (
-        size.value * math.exp(-relative_half_width),
-        size.value * math.exp(min(relative_half_width, 300.0)),
+        damping_size.value * math.exp(-relative_half_width),
+        damping_size.value * math.exp(min(relative_half_width, 300.0)),
     )
     return ReportedLossFactor(
-        damping, size.omega_rad_s, ReportedValue(size.value, size.std, interval_95, reason)
+        damping,
+        damping_size.omega_rad_s,
+        ReportedValue(damping_size.value, damping_size.std, interval_95, invalid_reason),
     )
 
 
@@ -614,22 +621,24 @@ def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Itera
 
 
 def _reported_mode(
-    mode: ModeEstimate, visible_numbers: Collection[int], reason: str | None
+    mode_estimate: ModeEstimate, visible_numbers: Collection[int], invalid_reason: str | None
 ) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
-    is_visible_mode = mode.number in visible_numbers
-    if reason is None and not is_visible_mode:
-        reason = "computed from the model: the record does not show this mode"
+    is_visible_mode = mode_estimate.number in visible_numbers
+    if invalid_reason is None and not is_visible_mode:
+        invalid_reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
-        mode.number,
-        symmetric_value(mode.frequency_hz, mode.frequency_std_hz, reason),
-        symmetric_value(mode.damping_ratio, mode.damping_ratio_std, reason),
+        mode_estimate.number,
+        symmetric_value(mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason),
+        symmetric_value(
+            mode_estimate.damping_ratio, mode_estimate.damping_ratio_std, invalid_reason
+        ),
         is_visible_mode,
     )
 
 
 def symmetric_value(
-    value: float, std: float, reason: str | None, half_width: float = NORMAL_95
+    estimated_value: float, std: float, invalid_reason: str | None, half_width: float = NORMAL_95
 ) -> ReportedValue:
     """Return a reported value with a symmetric 95 % interval.
 
@@ -637,12 +646,15 @@ def symmetric_value(
     ----------
     value, std : float
         Estimate and its standard deviation.
-    reason : str or None
+    invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     half_width : float
         Half width of the interval, in standard deviations.
     """
     interval_half_width = half_width * std
     return ReportedValue(
-        value, std, (value - interval_half_width, value + interval_half_width), reason
+        estimated_value,
+        std,
+        (estimated_value - interval_half_width, estimated_value + interval_half_width),
+        invalid_reason,
     )

@@ -91,7 +91,7 @@ class NoiseSpectrum:
 def estimate_noise(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
-    samples: int,
+    sample_count: int,
     known_fraction: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
 ) -> NoiseSpectrum:
@@ -100,10 +100,10 @@ def estimate_noise(
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
-        Fourier transform of `samples` samples in N·m, on neighbouring bins.
+        Fourier transform of `sample_count` samples in N·m, on neighbouring bins.
     frequency_hz : ndarray, shape (K,)
         Frequencies of the bins.
-    samples : int
+    sample_count : int
         Number of samples of the residual.
     known_fraction : float
         Fraction of the samples at which the residual is known. It is 0 at the others.
@@ -131,7 +131,7 @@ def estimate_noise(
         noise_lines.append(
             NoiseLine(
                 frequency_hz=float(line_power @ frequency_hz[line_bins] / line_power.sum()),
-                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (samples * known_fraction)),
+                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (sample_count * known_fraction)),
             )
         )
     return NoiseSpectrum(noise_power, is_compared, tuple(noise_lines))
@@ -170,7 +170,9 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
 
 
 def noise_power_with_peaks(
-    residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
+    residual: NDArray[np.complex128],
+    smooth_noise_power: NDArray[np.float64],
+    is_peak_allowed: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Return the noise power of each bin, with peaks narrower than the smoothing blocks, (K,).
 
@@ -178,18 +180,22 @@ def noise_power_with_peaks(
     ----------
     residual : ndarray of complex, shape (K,)
         Spectrum of the residual on neighbouring bins.
-    power : ndarray, shape (K,)
+    smooth_noise_power : ndarray, shape (K,)
         Smooth power of the residual, as `smooth_power` returns it.
-    where : ndarray of bool, shape (K,)
+    is_peak_allowed : ndarray of bool, shape (K,)
         True for bins at which a peak is possible.
     """
-    power_ratio = (residual.real**2 + residual.imag**2) / power
+    power_ratio = (residual.real**2 + residual.imag**2) / smooth_noise_power
     local_ratio = np.convolve(power_ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
     # Include all bins within the averaging width around each significant one.
     is_peak = (
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
-    return np.where(is_peak & where, power * np.maximum(local_ratio, 1.0), power)
+    return np.where(
+        is_peak & is_peak_allowed,
+        smooth_noise_power * np.maximum(local_ratio, 1.0),
+        smooth_noise_power,
+    )
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:
@@ -220,13 +226,15 @@ def _narrow_block_borders(bin_count: int) -> NDArray[np.intp]:
     )
 
 
-def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
+def _find_line_groups(
+    residual: NDArray[np.complex128], noise_power: NDArray[np.float64]
+) -> list[slice]:
     """Return the ranges of bins whose power is far above the noise, with neighbouring bins.
 
     A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
     significant the leakage is below the noise.
     """
-    loud_bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * power)
+    loud_bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * noise_power)
     if loud_bins.size == 0:
         return []
     bin_groups = np.split(loud_bins, np.flatnonzero(np.diff(loud_bins) > _DURATION_BINS // 2) + 1)
@@ -238,14 +246,16 @@ def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float6
     return groups_with_skirts
 
 
-def _lasts_through_record(residual: NDArray[np.complex128], group: slice) -> bool:
+def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) -> bool:
     """Return whether a narrow-band disturbance lasts through the whole record.
 
-    `group` is the range of its bins.
+    `line_bins` is the range of its bins.
 
     The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
     """
-    bins_around = residual[max(group.start - _DURATION_BINS, 0) : group.stop + _DURATION_BINS]
+    bins_around = residual[
+        max(line_bins.start - _DURATION_BINS, 0) : line_bins.stop + _DURATION_BINS
+    ]
     padded_length = _RECORD_PARTS * (-(-4 * bins_around.size // _RECORD_PARTS))
     power_envelope = np.abs(np.fft.ifft(bins_around, padded_length)) ** 2
     mean_power_of_eighths = power_envelope.reshape(_RECORD_PARTS, -1).mean(axis=1)

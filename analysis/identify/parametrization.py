@@ -91,7 +91,9 @@ class Unknowns:
     omega_rad_s: tuple[float, float]
 
     @classmethod
-    def of(cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...]) -> Unknowns:
+    def of(
+        cls, structure: Structure, nominal: Plant, free_settings: tuple[Setting, ...]
+    ) -> Unknowns:
         """Return the unknowns of a structure with some settings of the rig free.
 
         Parameters
@@ -100,13 +102,15 @@ class Unknowns:
             Structure that states which damping parameters are free.
         nominal : Plant
             Beam and rig as the file states them.
-        free : tuple of str
+        free_settings : tuple of str
             Names of the settings that are estimated.
         """
         first_omega_rad_s, second_omega_rad_s = map(
             float, undamped_frequencies_rad_s(nominal.beam, 2)
         )
-        ordered_settings = tuple(setting_name for setting_name in SETTINGS if setting_name in free)
+        ordered_settings = tuple(
+            setting_name for setting_name in SETTINGS if setting_name in free_settings
+        )
         return cls(structure, nominal, ordered_settings, (first_omega_rad_s, second_omega_rad_s))
 
     @cached_property
@@ -144,17 +148,17 @@ class Unknowns:
         )
         return np.array(lower_bounds), np.array(upper_bounds)
 
-    def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def start(self, damping_sizes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns for given damping sizes, with nominal settings, shape (k,).
 
         Parameters
         ----------
-        sizes : ndarray, shape (len(structure.free),)
+        damping_sizes : ndarray, shape (len(structure.free),)
             Those of ``ln z``, ``alpha``, ``ln g`` and ``lambda`` that are free.
         """
         unknown_values: dict[str, float] = {
             **dict(self.structure.fixed.items()),
-            **dict(zip(self.structure.free, sizes.tolist(), strict=True)),
+            **dict(zip(self.structure.free, damping_sizes.tolist(), strict=True)),
             "density_over_stiffness": 0.0,
             "bending_stiffness_n_m2": 0.0,
             **self._linear_unknowns(self.nominal),
@@ -386,24 +390,24 @@ class Unknowns:
         self,
         ln_size: float,
         order: float,
-        sign: float,
+        term_sign: float,
         loss_name: str,
         order_name: str,
-        slope: float,
+        ln_size_slope: float,
     ) -> NDArray[np.float64]:
         """Return ``ln |1 ± signed_size exp(j order pi/2)|`` with its derivatives by the unknowns.
 
-        The result has the shape (k + 1,): the derivatives, then the value. `slope` is the
+        The result has the shape (k + 1,): the derivatives, then the value. `ln_size_slope` is the
         derivative of `ln_size` by the order at constant loss.
         """
-        signed_size, order_phase_rad = sign * math.exp(ln_size), _QUARTER_TURN_RAD * order
+        signed_size, order_phase_rad = term_sign * math.exp(ln_size), _QUARTER_TURN_RAD * order
         squared_factor = 1 + 2 * signed_size * math.cos(order_phase_rad) + signed_size * signed_size
         by_ln_size = signed_size * (math.cos(order_phase_rad) + signed_size) / squared_factor
         derivatives_and_value = np.zeros(len(self.names) + 1)
         derivatives_and_value[self._indices[loss_name]] = by_ln_size
         if order_name in self._indices:
             by_phase = -_QUARTER_TURN_RAD * signed_size * math.sin(order_phase_rad) / squared_factor
-            derivatives_and_value[self._indices[order_name]] = by_ln_size * slope + by_phase
+            derivatives_and_value[self._indices[order_name]] = by_ln_size * ln_size_slope + by_phase
         derivatives_and_value[-1] = math.log(squared_factor) / 2
         return derivatives_and_value
 
@@ -500,22 +504,22 @@ class Steps:
             )
         return smallest_steps, largest_steps
 
-    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def end(self, x: NDArray[np.float64], unknown_step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns after a step along the curve, within the bounds, shape (k,).
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Unknowns before the step.
-        step : ndarray, shape (k,)
+        unknown_step : ndarray, shape (k,)
             Step within the `limits`, tangent to the curve at `x`.
         """
-        end = np.clip(x + step, self.lower, self.upper)
+        end = np.clip(x + unknown_step, self.lower, self.upper)
         for i in self.losses:
-            if step[i] > 0 and math.exp(x[i]) < self.linear_below:
-                end[i] = min(x[i] + math.log1p(step[i]), self.upper[i])
+            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_below:
+                end[i] = min(x[i] + math.log1p(unknown_step[i]), self.upper[i])
         for i, j, adds_stiffness in self.dampings:
-            if step[i] != 0:
+            if unknown_step[i] != 0:
                 phase_before, phase_after = (
                     _phase_of_order(x[j], adds_stiffness),
                     _phase_of_order(end[j], adds_stiffness),
@@ -525,11 +529,11 @@ class Steps:
                 is_linear = loss_factor < self.linear_below
                 loss_factor, phase_rad = _loss_and_phase_after_step(
                     loss_factor,
-                    float(step[i]),
+                    float(unknown_step[i]),
                     phase_before,
                     phase_after,
                     largest_loss,
-                    linear=is_linear,
+                    is_linear=is_linear,
                 )
                 end[i] = math.log(loss_factor) if loss_factor > 0 else self.lower[i]
                 if phase_rad != phase_after:
@@ -539,45 +543,45 @@ class Steps:
 
 
 def _loss_and_phase_after_step(
-    loss: float,
-    step: float,
+    loss_factor: float,
+    ln_loss_step: float,
     phase_before: float,
     phase_after: float,
     largest_loss: float,
     *,
-    linear: bool,
+    is_linear: bool,
 ) -> tuple[float, float]:
     """Return the loss factor and the phase in rad of a damping after a step of the descent.
 
     The phase changes from `phase_before` to `phase_after`. If no loss up to `largest_loss` gives
     the required phase, the largest loss is combined with the phase that it gives.
     """
-    damping_size = loss / math.sin(phase_before)
+    damping_size = loss_factor / math.sin(phase_before)
     real_part = 1 + damping_size * math.cos(phase_before)
     # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
     ln_tan_step = (
-        step + damping_size / math.sin(phase_before) * (phase_after - phase_before)
-    ) / math.hypot(real_part, loss)
-    if ln_tan_step <= -1 and loss < VANISHING_LOSS:
+        ln_loss_step + damping_size / math.sin(phase_before) * (phase_after - phase_before)
+    ) / math.hypot(real_part, loss_factor)
+    if ln_tan_step <= -1 and loss_factor < VANISHING_LOSS:
         return (
             0.0,
             phase_after,
         )  # a step in proportion to the effect would change the sign of the loss
-    loss_angle_rad = math.atan2(loss, real_part)
+    loss_angle_rad = math.atan2(loss_factor, real_part)
     growth_factor = (
         1 + ln_tan_step
-        if linear and ln_tan_step > 0
+        if is_linear and ln_tan_step > 0
         else math.exp(min(ln_tan_step, _MAX_GROWTH_EXPONENT))
     )
     loss_angle_rad = 2 * math.atan(math.tan(loss_angle_rad / 2) * growth_factor)
     if loss_angle_rad < phase_after:
-        loss = (
+        loss_factor = (
             math.sin(loss_angle_rad)
             / math.sin(phase_after - loss_angle_rad)
             * math.sin(phase_after)
         )
-        if loss <= largest_loss:
-            return loss, phase_after
+        if loss_factor <= largest_loss:
+            return loss_factor, phase_after
     return largest_loss, loss_angle_rad + math.asin(
         min(math.sin(loss_angle_rad) ** 2 / largest_loss, 1.0)
     )
@@ -592,6 +596,6 @@ def _phase_of_order(order: float, adds_stiffness: bool) -> float:
     return phase_rad if adds_stiffness else math.pi - phase_rad
 
 
-def _order_of_phase(phase: float, adds_stiffness: bool) -> float:
+def _order_of_phase(phase_rad: float, adds_stiffness: bool) -> float:
     """Return the order of a damping from its phase in rad relative to stiffness or inertia."""
-    return (phase if adds_stiffness else math.pi - phase) / (math.pi / 2)
+    return (phase_rad if adds_stiffness else math.pi - phase_rad) / (math.pi / 2)

@@ -171,7 +171,7 @@ def profile(
         profiler.extend_from_other_minima()
     order_values, deviances = profiler.curve()
     minimum_values = local_minima(order_values, deviances)
-    interval, open_below, open_above = admitted_interval(order_values, deviances)
+    order_interval, open_below, open_above = admitted_interval(order_values, deviances)
     lowest_cost = min(profiler.costs.values())
     return ProfileWithPlants(
         profile=LikelihoodProfile(
@@ -181,7 +181,7 @@ def profile(
             deviance=tuple(deviances.tolist()),
             estimate=minimum_values[0],
             local_minima=minimum_values,
-            interval=interval,
+            interval=order_interval,
             open_below=open_below,
             open_above=open_above,
             gain=0.0
@@ -374,8 +374,8 @@ class OrderProfiler:
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the computed order values, increasing, and their deviances, each of shape (n,)."""
         order_values = np.array(sorted(self.costs))
-        costs = np.array([self.costs[order_value] for order_value in order_values])
-        return order_values, self._value_count * np.log(costs / costs.min())
+        order_costs = np.array([self.costs[order_value] for order_value in order_values])
+        return order_values, self._value_count * np.log(order_costs / order_costs.min())
 
     def extend_both_ways(self) -> None:
         """Extend the profile in both directions from the current minimum."""
@@ -395,9 +395,11 @@ class OrderProfiler:
             if not is_special_case:
                 continue
             (lower_end, upper_end), *_ = admitted_interval(*self.curve())
-            deviance = self._value_count * math.log(candidate.fit.cost / min(self.costs.values()))
+            candidate_deviance = self._value_count * math.log(
+                candidate.fit.cost / min(self.costs.values())
+            )
             if (
-                deviance < CHI_SQUARE_95
+                candidate_deviance < CHI_SQUARE_95
                 and not lower_end <= candidate.fit.parameters[self.order] <= upper_end
             ):
                 start_unknowns = self._unknowns.vector(candidate.fit.plant)
@@ -571,7 +573,7 @@ class OrderProfiler:
 
     def _descend(
         self,
-        start: NDArray[np.float64],
+        start_unknowns: NDArray[np.float64],
         max_evaluations: int,
         *,
         hold: tuple[str, ...] = (),
@@ -582,7 +584,7 @@ class OrderProfiler:
         return Refit.descend(
             candidate_set.comparison,
             self._unknowns,
-            start,
+            start_unknowns,
             candidate_set.noise,
             candidate_set.columns,
             max_evaluations=max_evaluations,
@@ -618,39 +620,41 @@ MIN_BARRIER_DEVIANCE: Final = 0.5
 far larger than the tolerance of the refits."""
 
 
-def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
+def local_minima(
+    order_values: NDArray[np.float64], deviances: NDArray[np.float64]
+) -> tuple[float, ...]:
     """Return the order values at the local minima of the deviance within the 95 % limit.
 
     The one with the lowest deviance is first.
 
     Parameters
     ----------
-    values : ndarray of float, shape (n,)
+    order_values : ndarray of float, shape (n,)
         Values of the order, increasing.
-    deviance : ndarray of float, shape (n,)
+    deviances : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
     """
-    padded_deviance = np.concatenate([[np.inf], deviance, [np.inf]])
+    padded_deviance = np.concatenate([[np.inf], deviances, [np.inf]])
     minimum_indices = np.flatnonzero(
         (padded_deviance[1:-1] <= padded_deviance[:-2])
         & (padded_deviance[1:-1] < padded_deviance[2:])
     )
-    minimum_indices = minimum_indices[deviance[minimum_indices] < CHI_SQUARE_95]
+    minimum_indices = minimum_indices[deviances[minimum_indices] < CHI_SQUARE_95]
     distinct_indices: list[int] = []
-    for low in minimum_indices[np.argsort(deviance[minimum_indices], kind="stable")].tolist():
+    for low in minimum_indices[np.argsort(deviances[minimum_indices], kind="stable")].tolist():
         barrier_deviances = (
-            deviance[min(low, k) : max(low, k) + 1].max() for k in distinct_indices
+            deviances[min(low, k) : max(low, k) + 1].max() for k in distinct_indices
         )
         if all(
-            barrier_deviance > deviance[low] + MIN_BARRIER_DEVIANCE
+            barrier_deviance > deviances[low] + MIN_BARRIER_DEVIANCE
             for barrier_deviance in barrier_deviances
         ):
             distinct_indices.append(low)
-    return tuple(values[distinct_indices].tolist())
+    return tuple(order_values[distinct_indices].tolist())
 
 
 def admitted_interval(
-    values: NDArray[np.float64], deviance: NDArray[np.float64]
+    order_values: NDArray[np.float64], deviances: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
     """Return the interval of the order values whose deviance is within the 95 % limit.
 
@@ -658,9 +662,9 @@ def admitted_interval(
 
     Parameters
     ----------
-    values : ndarray of float, shape (n,)
+    order_values : ndarray of float, shape (n,)
         Values of the order, increasing.
-    deviance : ndarray of float, shape (n,)
+    deviances : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
 
     Returns
@@ -670,54 +674,63 @@ def admitted_interval(
     open_below, open_above : bool
         Whether the deviance stays within the limit down to the first, and up to the last value.
     """
-    inside_indices = np.flatnonzero(deviance <= CHI_SQUARE_95)
+    inside_indices = np.flatnonzero(deviances <= CHI_SQUARE_95)
     first_inside, last_inside = int(inside_indices[0]), int(inside_indices[-1])
     lower_end = (
-        values[0]
+        order_values[0]
         if first_inside == 0
-        else _limit_crossing_between(values, deviance, first_inside, first_inside - 1)
+        else _limit_crossing_between(order_values, deviances, first_inside, first_inside - 1)
     )
     upper_end = (
-        values[-1]
-        if last_inside == values.size - 1
-        else _limit_crossing_between(values, deviance, last_inside, last_inside + 1)
+        order_values[-1]
+        if last_inside == order_values.size - 1
+        else _limit_crossing_between(order_values, deviances, last_inside, last_inside + 1)
     )
-    return (float(lower_end), float(upper_end)), first_inside == 0, last_inside == values.size - 1
+    return (
+        (float(lower_end), float(upper_end)),
+        first_inside == 0,
+        last_inside == order_values.size - 1,
+    )
 
 
-def limit_crossing(inside: float, outside: float, below: float, above: float) -> float:
+def limit_crossing(
+    inside_value: float, outside_value: float, deviance_inside: float, deviance_outside: float
+) -> float:
     """Interpolate the value at which a deviance crosses the 95 % limit.
 
     The square root of the deviance is almost linear in the value.
 
     Parameters
     ----------
-    inside, outside : float
+    inside_value, outside_value : float
         Values on either side of the limit.
-    below, above : float
+    deviance_inside, deviance_outside : float
         Deviances at these values.
     """
-    root_inside, root_outside = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
+    root_inside, root_outside = (
+        math.sqrt(max(deviance_inside, 0.0)),
+        math.sqrt(max(deviance_outside, 0.0)),
+    )
     crossing_fraction = (math.sqrt(CHI_SQUARE_95) - root_inside) / (root_outside - root_inside)
-    return inside + crossing_fraction * (outside - inside)
+    return inside_value + crossing_fraction * (outside_value - inside_value)
 
 
 def values_outside_known(
-    known: list[float], span: tuple[float, float], spacing: float
+    known_values: list[float], value_range: tuple[float, float], spacing: float
 ) -> list[float]:
     """Return equally spaced values within a span, without those between known values.
 
     Parameters
     ----------
-    known : list of float
+    known_values : list of float
         Values at which the profile is known.
-    span : tuple of float
+    value_range : tuple of float
         First and last value of the span.
     spacing : float
         Distance between neighbouring values.
     """
-    spaced_values = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
-    smallest_known, largest_known = min(known), max(known)
+    spaced_values = np.arange(value_range[0] + spacing / 2, value_range[1], spacing).tolist()
+    smallest_known, largest_known = min(known_values), max(known_values)
     return [
         spaced_value
         for spaced_value in spaced_values
@@ -745,15 +758,18 @@ def coarse_minima_values(height_by_value: dict[float, float]) -> list[float]:
 
 
 def _limit_crossing_between(
-    values: NDArray[np.float64], deviance: NDArray[np.float64], inside: int, outside: int
+    order_values: NDArray[np.float64],
+    deviances: NDArray[np.float64],
+    inside_index: int,
+    outside_index: int,
 ) -> float:
     """Return the order value at which the deviance crosses the 95 % limit.
 
     It is interpolated between one index within the limit and one outside.
     """
     return limit_crossing(
-        float(values[inside]),
-        float(values[outside]),
-        float(deviance[inside]),
-        float(deviance[outside]),
+        float(order_values[inside_index]),
+        float(order_values[outside_index]),
+        float(deviances[inside_index]),
+        float(deviances[outside_index]),
     )

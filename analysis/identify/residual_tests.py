@@ -33,9 +33,9 @@ SIGNIFICANT_STD: Final = 5.0
 tests together."""
 
 
-def largest_deviate_limit(count: int) -> float:
-    """Return the significance limit of x²/2 for the largest x of `count` normal deviates."""
-    return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
+def largest_deviate_limit(deviate_count: int) -> float:
+    """Return the significance limit of x²/2 for the largest of several normal deviates x."""
+    return SIGNIFICANT_STD**2 / 2 + math.log(max(deviate_count, 1))
 
 
 # Whiteness, and coherence with the input
@@ -197,26 +197,26 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
 
 def input_relation(
     residual: NDArray[np.complex128],
-    angle: NDArray[np.complex128],
+    angle_transform: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
 ) -> InputRelation:
     """Test whether a residual is linearly related to the angle.
 
     Parameters
     ----------
-    residual, angle : ndarray of complex, shape (K,)
+    residual, angle_transform : ndarray of complex, shape (K,)
         Whitened residual, and Fourier transform of the angle.
     frequency_hz : ndarray, shape (K,)
         Frequencies of the bins, equally spaced.
     """
     # Where the motor was not driven, the angle is the response of the loop to the torque's noise.
     # Such bins would show a relation of residual and angle, so they have almost no weight here.
-    angle_power_per_bin = np.abs(angle) ** 2
+    angle_power_per_bin = np.abs(angle_transform) ** 2
     averaged_bins = min(_AVERAGING_BINS, angle_power_per_bin.size)
     mean_power = np.convolve(
         angle_power_per_bin, np.full(averaged_bins, 1 / averaged_bins), mode="same"
     )
-    normalized_angle = angle / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
+    normalized_angle = angle_transform / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
     # The limit keeps a hum, which is no linear dynamics, from dominating.
     limited_residual = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
     cross_spectrum = limited_residual * normalized_angle.conj()

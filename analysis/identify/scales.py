@@ -72,15 +72,15 @@ def parameters_compensate_scales(fit: RecordFit) -> bool:
 
 
 def with_scale_uncertainty(
-    parameters: Mapping[str, ReportedValue], uncertainty: Mapping[str, float]
+    reported_parameters: Mapping[str, ReportedValue], scale_uncertainty: Mapping[str, float]
 ) -> dict[str, ReportedValue]:
     """Add the uncertainties of the scales, such as length, to those of the parameters.
 
     Parameters
     ----------
-    parameters : mapping of str to ReportedValue
+    reported_parameters : mapping of str to ReportedValue
         Parameters with statistical uncertainties, by the names of `RecordFit`.
-    uncertainty : mapping of str to float
+    scale_uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale" and "length", if stated.
 
     Returns
@@ -93,43 +93,43 @@ def with_scale_uncertainty(
         parameter_name: _with_scale_uncertainty(
             reported_value, relative_std, logarithmic=parameter_name in LOGARITHMIC_PARAMETERS
         )
-        for parameter_name, reported_value in parameters.items()
+        for parameter_name, reported_value in reported_parameters.items()
         if reported_value.interval_95 is not None
         and (
             relative_std := _relative_scale_uncertainty(
-                SCALE_EXPONENTS.get(parameter_name, {}), uncertainty
+                SCALE_EXPONENTS.get(parameter_name, {}), scale_uncertainty
             )
         )
     }
 
 
 def _relative_scale_uncertainty(
-    exponents: Mapping[str, int], uncertainty: Mapping[str, float]
+    scale_exponents: Mapping[str, int], scale_uncertainty: Mapping[str, float]
 ) -> float:
     """Return the relative standard uncertainty of a parameter by those of the scales.
 
-    `exponents` are the powers of the scales, such as length, to which the parameter is
+    `scale_exponents` are the powers of the scales, such as length, to which the parameter is
     proportional.
     """
     return math.hypot(
         *(
-            scale_exponent * uncertainty.get(scale_name, 0.0)
-            for scale_name, scale_exponent in exponents.items()
+            scale_exponent * scale_uncertainty.get(scale_name, 0.0)
+            for scale_name, scale_exponent in scale_exponents.items()
         )
     )
 
 
 def _with_scale_uncertainty(
-    quantity: ReportedValue, relative_std: float, *, logarithmic: bool
+    reported_value: ReportedValue, relative_std: float, *, is_logarithmic: bool
 ) -> ReportedValue:
     """Return a reported value whose uncertainty includes that of torque scale and length.
 
     `relative_std` is the relative uncertainty by these scales. Both are added in quadrature.
     """
-    assert quantity.interval_95 is not None
-    estimated_value, (lower_end, upper_end) = quantity.value, quantity.interval_95
-    std = math.hypot(quantity.std or 0.0, estimated_value * relative_std)
-    if logarithmic:
+    assert reported_value.interval_95 is not None
+    estimated_value, (lower_end, upper_end) = reported_value.value, reported_value.interval_95
+    std = math.hypot(reported_value.std or 0.0, estimated_value * relative_std)
+    if is_logarithmic:
         ln_below, ln_above = (
             math.hypot(math.log(end / estimated_value), NORMAL_95 * relative_std)
             for end in (lower_end, upper_end)
@@ -146,7 +146,7 @@ def _with_scale_uncertainty(
         )
         # The interval of a quantity that cannot be negative ends at 0.
         interval_95 = max(interval_95[0], 0.0), interval_95[1]
-    return replace(quantity, std=std, interval_95=interval_95)
+    return replace(reported_value, std=std, interval_95=interval_95)
 
 
 @dataclass(frozen=True, slots=True)
@@ -178,7 +178,7 @@ class DensityCheck:
 
 
 def density_check(
-    fit: RecordFit, stated_kg_per_m: float, uncertainty: Mapping[str, float]
+    fit: RecordFit, stated_kg_per_m: float, scale_uncertainty: Mapping[str, float]
 ) -> DensityCheck | None:
     """Compare the mass per length of the beam from a fit with the stated one.
 
@@ -188,7 +188,7 @@ def density_check(
         Fit to the record.
     stated_kg_per_m : float
         Mass per length that the file states.
-    uncertainty : mapping of str to float
+    scale_uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale", "length" and "density".
 
     Returns
@@ -197,17 +197,21 @@ def density_check(
         None unless all three uncertainties are stated and the fit determines rho/EI and EI.
     """
     is_density_determined = all(name in fit.determined for name in _COMPENSATING_PARAMETERS)
-    if not is_density_determined or not uncertainty.keys() >= {*_DENSITY_EXPONENTS, "density"}:
+    if not is_density_determined or not scale_uncertainty.keys() >= {
+        *_DENSITY_EXPONENTS,
+        "density",
+    }:
         return None
     parameter_indices = [fit.determined.index(name) for name in _COMPENSATING_PARAMETERS]
     statistical_variance = float(fit.covariance[np.ix_(parameter_indices, parameter_indices)].sum())
     found_kg_per_m = fit.parameters[_DENSITY_OVER_STIFFNESS] * fit.parameters[_BENDING_STIFFNESS]
     relative_std = math.sqrt(
-        statistical_variance + _relative_scale_uncertainty(_DENSITY_EXPONENTS, uncertainty) ** 2
+        statistical_variance
+        + _relative_scale_uncertainty(_DENSITY_EXPONENTS, scale_uncertainty) ** 2
     )
     return DensityCheck(
         found_kg_per_m,
         found_kg_per_m * relative_std,
         stated_kg_per_m,
-        stated_kg_per_m * uncertainty["density"],
+        stated_kg_per_m * scale_uncertainty["density"],
     )

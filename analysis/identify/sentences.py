@@ -50,7 +50,7 @@ LOSS_NAMES: Final[Mapping[Order, str]] = {
 
 
 def headline_sentences(
-    headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
+    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
 ) -> list[str]:
     """Return the sentences on modes, damping and conditions of the reported numbers.
 
@@ -58,7 +58,7 @@ def headline_sentences(
     ----------
     headline : Headline
         Headline of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     without_rival : bool
         Whether no other model explains the record as well.
@@ -66,11 +66,16 @@ def headline_sentences(
     if len(headline.visible_modes) < _MIN_MODES_TO_SEPARATE_DAMPINGS:
         sentences = [f"{ONE_MODE_REASON.capitalize()}, nor does it determine their orders."]
     else:
-        sentences = [*uniformity(headline.uniform_beam), *_damping_sentences(headline, orders)]
+        sentences = [
+            *uniformity(headline.uniform_beam),
+            *_damping_sentences(headline, order_verdicts),
+        ]
     if headline.tolerant is None:
-        sentences += [order_sentence(order_verdict) for order_verdict in orders]
+        sentences += [order_sentence(order_verdict) for order_verdict in order_verdicts]
     else:
-        sentences += [order_slope_sentence(headline, order_verdict) for order_verdict in orders]
+        sentences += [
+            order_slope_sentence(headline, order_verdict) for order_verdict in order_verdicts
+        ]
         sentences += _exact_order_sentences(headline)
     if headline.explained:
         sentences.append(
@@ -81,19 +86,19 @@ def headline_sentences(
     return sentences
 
 
-def uniformity(test: UniformBeamTest | None) -> list[str]:
+def uniformity(beam_test: UniformBeamTest | None) -> list[str]:
     """Return the sentence on the uniform-beam test, or no sentence if there was no test.
 
     Parameters
     ----------
-    test : UniformBeamTest or None
+    beam_test : UniformBeamTest or None
         Test on the record. None if no mode is visible.
     """
-    if test is None or test.p_value is None:
+    if beam_test is None or beam_test.p_value is None:
         return []
-    mode_list = listed([str(mode_number) for mode_number in test.modes])
-    chance_text = test.summary.chance
-    if test.status == "passed":
+    mode_list = listed([str(mode_number) for mode_number in beam_test.modes])
+    chance_text = beam_test.summary.chance
+    if beam_test.status == "passed":
         return [
             "A uniform beam predicts frequencies, damping ratios and residues of modes "
             f"{mode_list} ({chance_text})."
@@ -104,7 +109,9 @@ def uniformity(test: UniformBeamTest | None) -> list[str]:
     ]
 
 
-def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
+def _damping_sentences(
+    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict]
+) -> list[str]:
     """Return the sentences on the dampings that a beam has, and on the excluded structures."""
     if headline.tolerant is not None:
         excluded_names = headline.structures_with_status("excluded")
@@ -115,7 +122,7 @@ def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerd
         )
     reported_structure = headline.fit.structure
     damping_phrase = _DAMPING_PHRASES[reported_structure.name]
-    if any(each.reason == SECOND_DAMPING_REASON for each in orders):
+    if any(each.reason == SECOND_DAMPING_REASON for each in order_verdicts):
         damping_phrase = damping_phrase.replace("only", "alone would do")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
     excluded_names = headline.structures_with_status("excluded")
@@ -157,12 +164,12 @@ def order_slope_sentence(headline: Headline, verdict: OrderVerdict) -> str:
 
 def loss_slope_sentence(
     order: Order,
-    value: float,
-    interval: tuple[float, float],
+    order_value: float,
+    order_interval: tuple[float, float],
     shown_hz: Sequence[float],
     estimate: TolerantEstimate,
     status: Status,
-    reason: str | None,
+    doubt_reason: str | None,
 ) -> str:
     """Return the sentence on the growth of a loss over the visible modes, and its conditions.
 
@@ -170,9 +177,9 @@ def loss_slope_sentence(
     ----------
     order : str
         "alpha" or "lambda".
-    value : float
+    order_value : float
         Estimate of the order.
-    interval : (float, float)
+    order_interval : (float, float)
         95 % interval of the order.
     shown_hz : sequence of float
         Frequencies of the visible modes in hertz.
@@ -180,11 +187,11 @@ def loss_slope_sentence(
         Estimate that contains the order.
     status : str
         "compatible", "fractional" or "open".
-    reason : str or None
+    doubt_reason : str or None
         Reason why the order is not established. None if it is established.
     """
-    std = (interval[1] - interval[0]) / (2 * NORMAL_95)
-    value_text, low_text, high_text = to_uncertainty((value, *interval), std)
+    std = (order_interval[1] - order_interval[0]) / (2 * NORMAL_95)
+    value_text, low_text, high_text = to_uncertainty((order_value, *order_interval), std)
     condition_text = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
         condition_text = (
@@ -194,8 +201,8 @@ def loss_slope_sentence(
         f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSS_NAMES[order]} grows as "
         f"f^{value_text} ({order}; 95 %: {low_text} to {high_text}), {condition_text}"
     )
-    if reason is not None:
-        return f"{slope_sentence}; not established, because {reason}."
+    if doubt_reason is not None:
+        return f"{slope_sentence}; not established, because {doubt_reason}."
     conclusion_text = {
         "compatible": "consistent with order 1",
         "fractional": "damping ratios and residue phases alone exclude order 1",
@@ -219,36 +226,36 @@ def _exact_order_sentences(headline: Headline) -> list[str]:
     return [f"{EXACTLY_UNIFORM_CONDITION.capitalize()}: {', '.join(number_texts)}."]
 
 
-def order_sentence(verdict: OrderVerdict) -> str:
+def order_sentence(order_verdict: OrderVerdict) -> str:
     """Return the sentence on one order, estimated on an exactly uniform beam."""
-    profile = verdict.profile
-    lower_end, upper_end = profile.interval
-    order_name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
+    order_profile = order_verdict.profile
+    lower_end, upper_end = order_profile.interval
+    order_name, damping_name = order_verdict.order, _DAMPING_OF_ORDER[order_verdict.order]
     std = (upper_end - lower_end) / (2 * NORMAL_95)
     estimate_text, first_text, last_text = to_uncertainty(
-        (profile.estimate, lower_end, upper_end), std
+        (order_profile.estimate, lower_end, upper_end), std
     )
     order_text = f"{estimate_text} (95 %: {first_text} to {last_text})"
-    if verdict.status == "absent":
+    if order_verdict.status == "absent":
         return f"No {damping_name} was found, so its order {order_name} has no meaning."
-    if verdict.status == "not identifiable":
+    if order_verdict.status == "not identifiable":
         return (
             f"The order {order_name} of the {damping_name} is not identifiable: "
-            f"{_unidentifiable_reason(verdict)}."
+            f"{_unidentifiable_reason(order_verdict)}."
         )
-    if verdict.reason is not None:
+    if order_verdict.reason is not None:
         return (
             f"The order {order_name} of the {damping_name} is not established: {order_text} fits, "
-            f"but {verdict.reason}. "
+            f"but {order_verdict.reason}. "
             "Do not interpret it."
         )
-    if verdict.status == "compatible":
+    if order_verdict.status == "compatible":
         return f"The order {order_name} of the {damping_name} is {order_text}, consistent with 1."
-    if verdict.status == "fractional":
+    if order_verdict.status == "fractional":
         return f"The order {order_name} of the {damping_name} is {order_text}; 1 is excluded."
     return (
         f"The order {order_name} of the {damping_name} is {order_text}: 1 is doubtful, but not "
-        f"excluded (p = {math.erfc(math.sqrt(deviance_of_order_one(profile) / 2)):.1g})."
+        f"excluded (p = {math.erfc(math.sqrt(deviance_of_order_one(order_profile) / 2)):.1g})."
     )
 
 
@@ -293,15 +300,17 @@ def _value_and_interval_text(reported_value: ReportedValue) -> str:
     )
 
 
-def _unidentifiable_reason(verdict: OrderVerdict) -> str:
+def _unidentifiable_reason(order_verdict: OrderVerdict) -> str:
     """Return, as part of a sentence, why an order is not identifiable."""
-    profile = verdict.profile
-    lower_end, upper_end = profile.interval
-    if verdict.reason is not None and (profile.identifiable or not profile.is_computed):
-        return verdict.reason
-    if len(profile.local_minima) > 1:
+    order_profile = order_verdict.profile
+    lower_end, upper_end = order_profile.interval
+    if order_verdict.reason is not None and (
+        order_profile.identifiable or not order_profile.is_computed
+    ):
+        return order_verdict.reason
+    if len(order_profile.local_minima) > 1:
         minima_text = " and ".join(
-            f"{order_value:.3f}" for order_value in sorted(profile.local_minima)
+            f"{order_value:.3f}" for order_value in sorted(order_profile.local_minima)
         )
         return (
             f"{minima_text} fit the record equally well, each with a different damping (95 %: "
@@ -310,11 +319,11 @@ def _unidentifiable_reason(verdict: OrderVerdict) -> str:
         )
     return (
         "any value between 0 and 2 fits"
-        if profile.open_below and profile.open_above
+        if order_profile.open_below and order_profile.open_above
         else f"anything below {upper_end:.2f} fits"
-        if profile.open_below
+        if order_profile.open_below
         else f"anything above {lower_end:.2f} fits"
-        if profile.open_above
+        if order_profile.open_above
         else f"anything from {lower_end:.2f} to {upper_end:.2f} fits"
     )
 
@@ -333,7 +342,7 @@ _MODE_ORDINALS: Final = {1: "first", 2: "second"}
 
 def experiments(
     candidate_set: CandidateSet,
-    orders: tuple[OrderVerdict, ...],
+    order_verdicts: tuple[OrderVerdict, ...],
     visible_numbers: tuple[int, ...],
     findings: tuple[Finding, ...],
     close_rivals: tuple[Candidate, ...],
@@ -344,7 +353,7 @@ def experiments(
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     visible_numbers : tuple of int
         Numbers of the visible modes.
@@ -354,7 +363,7 @@ def experiments(
         Candidates that explain the record about as well as the selected one.
     """
     advice_sentences = []
-    unidentifiable_orders = [o for o in orders if o.status == "not identifiable"]
+    unidentifiable_orders = [o for o in order_verdicts if o.status == "not identifiable"]
     if unidentifiable_orders:
         order_names = " and ".join(o.order for o in unidentifiable_orders)
         if len(visible_numbers) < _MIN_MODES_FOR_AN_ORDER:
@@ -369,7 +378,9 @@ def experiments(
                 "that reaches one more mode."
             )
     has_unexplained_residual = any(finding.kind == "unexplained" for finding in findings)
-    if close_rivals or (not has_unexplained_residual and any(o.status == "open" for o in orders)):
+    if close_rivals or (
+        not has_unexplained_residual and any(o.status == "open" for o in order_verdicts)
+    ):
         advice_sentences.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )

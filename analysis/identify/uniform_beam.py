@@ -255,7 +255,7 @@ class UniformBeamProblem:
         )
 
     def constants(
-        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
         """Predict the modal constants of m uniform beams with n modes each, shape (m, 4 n).
 
@@ -265,36 +265,38 @@ class UniformBeamProblem:
         ----------
         x : ndarray of float, shape (m, 7)
             One vector of unknowns for each beam.
-        terms : ModeTerms, optional
+        mode_terms : ModeTerms, optional
             Modal integrals of another beam than the one the file states.
         """
-        terms = self.terms if terms is None else terms
+        mode_terms = self.terms if mode_terms is None else mode_terms
         zeta, alpha, gamma, lambda_, density_over_stiffness, ln_stiffness, delay_s = (
             self.parameters(x).T[..., None]
         )
         zeta, gamma = np.exp(zeta), np.exp(gamma)
         density_ratio = 1.0
-        if terms.density_kg_per_m is not None:
-            density_ratio = terms.density_kg_per_m * np.exp(-density_over_stiffness - ln_stiffness)
+        if mode_terms.density_kg_per_m is not None:
+            density_ratio = mode_terms.density_kg_per_m * np.exp(
+                -density_over_stiffness - ln_stiffness
+            )
         density_over_stiffness = np.exp(density_over_stiffness)
         modal_mass, lever_arm = (
-            terms.mass + density_ratio * terms.lump,
-            terms.mass_arm + density_ratio * terms.lump_arm,
+            mode_terms.mass + density_ratio * mode_terms.lump,
+            mode_terms.mass_arm + density_ratio * mode_terms.lump_arm,
         )
         static_modal_stiffness = (
-            terms.stiffness + terms.clamp + density_over_stiffness * terms.tension
+            mode_terms.stiffness + mode_terms.clamp + density_over_stiffness * mode_terms.tension
         )
-        relaxation_strength, relaxation_time_s = terms.alteration.relaxation
+        relaxation_strength, relaxation_time_s = mode_terms.alteration.relaxation
         s = np.broadcast_to(self._poles, (len(x), self._poles.size))
         for _ in range(_MAX_NEWTON_ITERATIONS):
             log_s = np.log(s)
-            internal_damping = zeta * np.exp(alpha * log_s) * terms.stiffness
+            internal_damping = zeta * np.exp(alpha * log_s) * mode_terms.stiffness
             external_damping = gamma * np.exp(lambda_ * log_s)
             inertia_term = density_over_stiffness * s * s
             impedance_slope = (
                 alpha * internal_damping + lambda_ * external_damping
             ) / s + 2 * density_over_stiffness * s * modal_mass
-            impedance = (
+            modal_impedance = (
                 static_modal_stiffness
                 + internal_damping
                 + inertia_term * modal_mass
@@ -305,11 +307,11 @@ class UniformBeamProblem:
                     relaxation_strength
                     * relaxation_time_s
                     / (1 + relaxation_time_s * s)
-                    * terms.stiffness
+                    * mode_terms.stiffness
                 )
-                impedance = impedance + relaxed_stiffness * s
+                modal_impedance = modal_impedance + relaxed_stiffness * s
                 impedance_slope = impedance_slope + relaxed_stiffness / (1 + relaxation_time_s * s)
-            pole_step = impedance / impedance_slope
+            pole_step = modal_impedance / impedance_slope
             s = s - pole_step
             if np.abs(pole_step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
@@ -317,14 +319,16 @@ class UniformBeamProblem:
         channel_response = torque_channel_response(replace(self.nominal, delay_s=0.0), s) * np.exp(
             -delay_s * s
         )
-        channel_response = channel_response * terms.alteration.channel(s)
-        rotation_arm = external_damping * terms.turn_by_medium
-        rotation_arm = rotation_arm + internal_damping / terms.stiffness * terms.turn_by_internal
+        channel_response = channel_response * mode_terms.alteration.channel(s)
+        rotation_arm = external_damping * mode_terms.turn_by_medium
+        rotation_arm = (
+            rotation_arm + internal_damping / mode_terms.stiffness * mode_terms.turn_by_internal
+        )
         modal_force = inertia_term * (lever_arm + rotation_arm)
         modal_force = (
             modal_force
-            + external_damping * terms.medium_arm
-            + density_over_stiffness * terms.tension_arm
+            + external_damping * mode_terms.medium_arm
+            + density_over_stiffness * mode_terms.tension_arm
         )
         length_cubed = self.nominal.beam.length_m**3
         log_residues = (
@@ -340,7 +344,7 @@ class UniformBeamProblem:
         return np.stack(constant_rows, axis=-1).reshape(len(x), -1)
 
     def differences(
-        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
         """Return predicted minus measured modal constants, shape (m, 4 n).
 
@@ -350,11 +354,11 @@ class UniformBeamProblem:
         ----------
         x : ndarray of float, shape (m, 7)
             One vector of unknowns for each beam.
-        terms : ModeTerms, optional
+        mode_terms : ModeTerms, optional
             Modal integrals of another beam than the one the file states.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
-            constant_deviations = self.constants(x, terms) - self.measured
+            constant_deviations = self.constants(x, mode_terms) - self.measured
         phase_deviations = constant_deviations[
             :, MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
         ]
@@ -488,15 +492,17 @@ class UniformBeamProblem:
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
             """Return chi-square and its derivatives by the transformed unknowns."""
-            found = self.equations(from_transformed @ y)
+            original_equations = self.equations(from_transformed @ y)
             return NormalEquations(
-                found.cost,
-                from_transformed.T @ found.gradient,
-                from_transformed.T @ found.hessian @ from_transformed,
+                original_equations.cost,
+                from_transformed.T @ original_equations.gradient,
+                from_transformed.T @ original_equations.hessian @ from_transformed,
             )
 
-        found = _minimize_within_bounds(equations, to_transformed @ x, lower_bounds, upper_bounds)
-        return replace(found, x=from_transformed @ found.x)
+        constrained_minimum = _minimize_within_bounds(
+            equations, to_transformed @ x, lower_bounds, upper_bounds
+        )
+        return replace(constrained_minimum, x=from_transformed @ constrained_minimum.x)
 
 
 def _minimize_within_bounds(
@@ -558,13 +564,13 @@ class UniformBeamTest:
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[index // len(MODE_CONSTANT_NAMES)],
-                    "name": MODE_CONSTANT_NAMES[index % len(MODE_CONSTANT_NAMES)],
-                    "measured": measured,
+                    "mode": self.modes[constant_index // len(MODE_CONSTANT_NAMES)],
+                    "name": MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)],
+                    "measured": measured_value,
                     "std": std,
-                    "predicted": predicted,
+                    "predicted": predicted_value,
                 }
-                for index, (measured, std, predicted) in enumerate(
+                for constant_index, (measured_value, std, predicted_value) in enumerate(
                     zip(
                         self.measured.tolist(),
                         self.std.tolist(),
@@ -728,13 +734,13 @@ def tolerant_estimate(
             break
     else:
         estimate_basis = "none"
-    estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value)
+    beam_estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value)
     orders_excluding_one = [
         order_name for order_name in ("alpha", "lambda")
-        if not estimate.interval[order_name][0] <= 1 <= estimate.interval[order_name][1]
+        if not beam_estimate.interval[order_name][0] <= 1 <= beam_estimate.interval[order_name][1]
     ]  # fmt: skip
     if not orders_excluding_one:
-        return estimate
+        return beam_estimate
     if estimate_basis == "geometry":
         problem = UniformBeamProblem(fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
@@ -747,7 +753,8 @@ def tolerant_estimate(
         for order_name in orders_excluding_one
     }
     return replace(
-        estimate, deviance_of_order_one=estimate.deviance_of_order_one | order_one_deviances
+        beam_estimate,
+        deviance_of_order_one=beam_estimate.deviance_of_order_one | order_one_deviances,
     )
 
 
@@ -764,7 +771,7 @@ def _count_idle_unknowns(problem: UniformBeamProblem, minimum: Minimum) -> int:
 def _estimate_at_minimum(
     problem: UniformBeamProblem,
     minima: Sequence[Minimum],
-    basis: EstimateBasis,
+    estimate_basis: EstimateBasis,
     p_value: float | None,
 ) -> TolerantEstimate:
     """Return the beam parameters at the lowest minimum, with their uncertainties.
@@ -819,7 +826,7 @@ def _estimate_at_minimum(
             lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
         intervals[parameter_name], std[parameter_name] = (lower_end, upper_end), parameter_std
     return TolerantEstimate(
-        basis=basis,
+        basis=estimate_basis,
         uniformity=problem.uniformity,
         p_value=p_value,
         plant=plant,

@@ -170,7 +170,7 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     in_channel = replace(
         plant, delay_s=0.0, filter_time_constant_s=0.0, second_order_filter_time_constant_s=0.0
     )
-    filters = (
+    torque_filters = (
         (plant.filter_time_constant_s, 1),
         (plant.second_order_filter_time_constant_s, 2),
     )
@@ -183,7 +183,7 @@ def beam_dynamics(plant: Plant) -> Dynamics:
         real_poles=real_poles,
         tool_inertia_kg_m2=plant.tool_inertia_kg_m2,
         motor_inertia_kg_m2=plant.beam.inertia_kg_m2,
-        filters=tuple(filter_entry for filter_entry in filters if filter_entry[0]),
+        filters=tuple(filter_entry for filter_entry in torque_filters if filter_entry[0]),
         delay_s=plant.delay_s,
     )
 

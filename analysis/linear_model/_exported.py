@@ -175,7 +175,7 @@ class LinearModel:
 
         Their values are strings, numbers, lists of strings or arrays.
         """
-        state_space, accuracy, posterior_samples = self.system, self.accuracy, self.posterior
+        state_space, model_accuracy, posterior_samples = self.system, self.accuracy, self.posterior
         modal_model = self.identified.modal
         modal_names_and_covariance = self.identified.modal_covariance()
         modal_names, modal_covariance = modal_names_and_covariance or ((), np.zeros((0, 0)))
@@ -216,15 +216,15 @@ class LinearModel:
             "output_units": list(state_space.outputs.units),
             "states": list(state_space.states.names),
             "state_units": list(state_space.states.units),
-            "band_hz": np.array(accuracy.band_hz),
-            "frequency_hz": accuracy.frequency_hz,
-            "response_nm_per_rad": accuracy.response,
-            "error": accuracy.error,
-            "error_max": accuracy.error_max,
-            "error_median": accuracy.error_median,
-            "uncertainty": accuracy.std,
-            "uncertainty_max": accuracy.std_max,
-            "uncertainty_median": accuracy.std_median,
+            "band_hz": np.array(model_accuracy.band_hz),
+            "frequency_hz": model_accuracy.frequency_hz,
+            "response_nm_per_rad": model_accuracy.response,
+            "error": model_accuracy.error,
+            "error_max": model_accuracy.error_max,
+            "error_median": model_accuracy.error_median,
+            "uncertainty": model_accuracy.std,
+            "uncertainty_max": model_accuracy.std_max,
+            "uncertainty_median": model_accuracy.std_median,
             "parameter_names": list(self.uncertain.names),
             "parameter_values": self.uncertain.values,
             "parameter_covariance": self.uncertain.covariance,

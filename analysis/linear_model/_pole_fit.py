@@ -145,22 +145,22 @@ class PoleFit:
         """Return the exact response at `check_points_s`, without delay, in N·m/rad."""
         return self.dynamics.filtered(self.check_points_s)
 
-    def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
+    def real_poles(self, pole_structure: PoleStructure) -> tuple[float, ...]:
         """Return all real poles of a state space with a given structure, in rad/s.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
         """
-        return (*self.dynamics.real_poles, *structure.added_real_poles_rad_s)
+        return (*self.dynamics.real_poles, *pole_structure.added_real_poles_rad_s)
 
-    def solve(self, structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
+    def solve(self, pole_structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
         """Fit the coefficients of a pole structure to the response.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
 
         Returns
@@ -170,11 +170,11 @@ class PoleFit:
         error : float
             Largest relative error in the band, at the points of the fit.
         """
-        real_poles = self.real_poles(structure)
-        direct_term_count = 1 + structure.integrators
+        real_poles = self.real_poles(pole_structure)
+        direct_term_count = 1 + pole_structure.integrators
         basis_functions = np.concatenate(
             [
-                *self._pair_basis[: structure.pairs],
+                *self._pair_basis[: pole_structure.pairs],
                 [1 / (self._s - real_pole) for real_pole in real_poles]
                 or np.empty((0, self._s.size)),
                 [self._s**-power_of_s for power_of_s in range(direct_term_count)],
@@ -187,50 +187,53 @@ class PoleFit:
         return fit_coefficients, float(np.abs(weighted_residual[self._in_band]).max())
 
     def system(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
+        self,
+        pole_structure: PoleStructure,
+        fit_coefficients: NDArray[np.float64],
+        input_kind: InputKind,
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
-        coefficients : ndarray
+        fit_coefficients : ndarray
             Coefficients that `solve` returned.
         input_kind : str
             Input: "acceleration", or "angle" for angle, velocity and acceleration.
         """
-        state_space = self._system_without_filters(structure, coefficients, input_kind)
+        state_space = self._system_without_filters(pole_structure, fit_coefficients, input_kind)
         for time_constant_s, filter_order in self.dynamics.filters:
             state_space = with_filter(state_space, time_constant_s, filter_order)
         return replace(state_space, delay_s=self.dynamics.delay_s)
 
-    def error(self, system: StateSpace) -> NDArray[np.float64]:
+    def error(self, state_space: StateSpace) -> NDArray[np.float64]:
         """Return the relative error of a state space at each point of `check_points_s`.
 
         Parameters
         ----------
-        system : StateSpace
+        state_space : StateSpace
             Realisation of the response in continuous time.
         """
-        return np.abs(angle_response(system, self.check_points_s) / self.exact - 1)
+        return np.abs(angle_response(state_space, self.check_points_s) / self.exact - 1)
 
     def is_stable_on_motor(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64]
+        self, pole_structure: PoleStructure, fit_coefficients: NDArray[np.float64]
     ) -> bool:
         """Return whether a frictionless motor with the beam's inertia is stable with the model.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
-        coefficients : ndarray
+        fit_coefficients : ndarray
             Coefficients that `solve` returned.
         """
         motor_inertia_kg_m2 = self.dynamics.motor_inertia_kg_m2
         if motor_inertia_kg_m2 is None:
             return True
-        state_space = self._system_without_filters(structure, coefficients, "acceleration")
+        state_space = self._system_without_filters(pole_structure, fit_coefficients, "acceleration")
         coupled_state_matrix = state_space.a - state_space.b @ state_space.c / (
             motor_inertia_kg_m2 + state_space.d.item()
         )
@@ -239,10 +242,16 @@ class PoleFit:
         )
 
     def _system_without_filters(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
+        self,
+        pole_structure: PoleStructure,
+        fit_coefficients: NDArray[np.float64],
+        input_kind: InputKind,
     ) -> StateSpace:
         """Return the state space of a fit with tool inertia, without filters and delay."""
-        upper_poles, real_poles = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
+        upper_poles, real_poles = (
+            self.dynamics.pairs[: pole_structure.pairs],
+            self.real_poles(pole_structure),
+        )
         pole_count = 2 * upper_poles.size + len(real_poles)
         a = np.zeros((pole_count, pole_count))
         pair_rows = np.arange(0, 2 * upper_poles.size, 2)
@@ -253,9 +262,9 @@ class PoleFit:
         a[real_rows, real_rows] = real_poles
         b = np.ones((pole_count, 1))
         b[pair_rows + 1] = 0.0
-        c = coefficients[None, :pole_count]
+        c = fit_coefficients[None, :pole_count]
         inertia_coefficient, viscosity_coefficient, stiffness_coefficient = np.append(
-            coefficients[pole_count:], np.zeros(2)
+            fit_coefficients[pole_count:], np.zeros(2)
         )[:3].tolist()
         inertia_coefficient += self.dynamics.tool_inertia_kg_m2
         state_names = [
@@ -280,7 +289,7 @@ class PoleFit:
                 SignalNames(tuple(state_names), ("rad.s",) * pole_count),
             )
         # Velocity v and angle q are integrals of the input u: v' = u, q' = v.
-        k = structure.integrators
+        k = pole_structure.integrators
         a = np.pad(a, (0, k))
         if k == 2:
             a[pole_count + 1, pole_count] = 1.0
@@ -311,7 +320,9 @@ class PoleFit:
         """Return the complex poles and zeros of the response to be fitted, in rad/s."""
         return np.concatenate([self.dynamics.pairs, self.zeros])
 
-    def _dense_frequencies(self, band_hz: tuple[float, float], points: tuple[int, int]) -> Real:
+    def _dense_frequencies(
+        self, band_hz: tuple[float, float], point_counts: tuple[int, int]
+    ) -> Real:
         """Return frequencies of a band in hertz.
 
         They are dense within three half widths of poles and zeros.
@@ -320,11 +331,11 @@ class PoleFit:
         half_width_rad_s = np.maximum(
             np.abs(poles_and_zeros_rad_s.real), 1e-4 * np.abs(poles_and_zeros_rad_s)
         )
-        relative_offsets = np.linspace(-3, 3, points[1])
+        relative_offsets = np.linspace(-3, 3, point_counts[1])
         near_hz = (
             poles_and_zeros_rad_s.imag[:, None] + half_width_rad_s[:, None] * relative_offsets
         ).ravel() / (2 * np.pi)
-        frequencies_hz = np.concatenate([np.geomspace(*band_hz, points[0]), near_hz])
+        frequencies_hz = np.concatenate([np.geomspace(*band_hz, point_counts[0]), near_hz])
         return np.sort(
             frequencies_hz[(frequencies_hz >= band_hz[0]) & (frequencies_hz <= band_hz[1])]
         )
@@ -389,20 +400,20 @@ def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
     return np.asarray(2j * np.pi * frequency_hz, dtype=np.complex128)
 
 
-def angle_response(system: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def angle_response(state_space: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return the response of a state space to the motor angle, without its delay, in N·m/rad.
 
     Parameters
     ----------
-    system : StateSpace
+    state_space : StateSpace
         System in continuous time, whose inputs are the acceleration, or angle, velocity and
         acceleration.
     s : ndarray of complex
         Points in rad/s.
     """
-    motion_per_angle = np.array([np.ones_like(s), s, s * s])[-system.d.shape[1] :]
+    motion_per_angle = np.array([np.ones_like(s), s, s * s])[-state_space.d.shape[1] :]
     torque_response: NDArray[np.complex128] = np.einsum(
-        "km,mk->k", system.response(s)[:, 0], motion_per_angle
+        "km,mk->k", state_space.response(s)[:, 0], motion_per_angle
     )
     return torque_response
 

@@ -95,39 +95,44 @@ class StateSpace:
         return replace(self, a=a, b=b, c=c, d=d, period_s=float(period_s))
 
 
-def with_filter(system: StateSpace, time_constant_s: float, order: int) -> StateSpace:
+def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> StateSpace:
     """Return the system with a low-pass filter (order 1, or Butterworth of order 2) at its output.
 
     Parameters
     ----------
-    system : StateSpace
+    state_space : StateSpace
         System in continuous time with one output.
     time_constant_s : float
         Reciprocal of the corner frequency, in s/rad.
     order : int
         Order of the filter: 1 or 2.
     """
-    n, m = system.b.shape
+    n, m = state_space.b.shape
     cutoff_rad_s = 1.0 / time_constant_s
     a = np.zeros((n + order, n + order))
     b = np.zeros((n + order, m))
-    a[:n, :n], b[:n] = system.a, system.b
+    a[:n, :n], b[:n] = state_space.a, state_space.b
     first_state, last_state = n, n + order - 1
     # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-    a[last_state, :n], b[last_state] = cutoff_rad_s * system.c[0], cutoff_rad_s * system.d[0]
+    a[last_state, :n], b[last_state] = (
+        cutoff_rad_s * state_space.c[0],
+        cutoff_rad_s * state_space.d[0],
+    )
     a[last_state, first_state] = -cutoff_rad_s
     if order == 2:
         a[first_state, last_state] = cutoff_rad_s
         a[last_state, last_state] = -np.sqrt(2) * cutoff_rad_s
-    output_unit = system.outputs.units[0]
+    output_unit = state_space.outputs.units[0]
     state_names = ("filter_output", "filter_slope")[:order]
     return replace(
-        system,
+        state_space,
         a=a,
         b=b,
         c=np.eye(1, n + order, n),
-        d=np.zeros_like(system.d),
-        states=concatenate_names((system.states, SignalNames(state_names, (output_unit,) * order))),
+        d=np.zeros_like(state_space.d),
+        states=concatenate_names(
+            (state_space.states, SignalNames(state_names, (output_unit,) * order))
+        ),
     )
 
 
