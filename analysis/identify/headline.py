@@ -644,7 +644,7 @@ def symmetric_value(
 
     Parameters
     ----------
-    value, std : float
+    estimated_value, std : float
         Estimate and its standard deviation.
     invalid_reason : str or None
         Flag of the reported value. None if it is valid.

@@ -91,7 +91,7 @@ def with_scale_uncertainty(
     """
     return {
         parameter_name: _with_scale_uncertainty(
-            reported_value, relative_std, logarithmic=parameter_name in LOGARITHMIC_PARAMETERS
+            reported_value, relative_std, is_logarithmic=parameter_name in LOGARITHMIC_PARAMETERS
         )
         for parameter_name, reported_value in reported_parameters.items()
         if reported_value.interval_95 is not None

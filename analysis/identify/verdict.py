@@ -110,7 +110,7 @@ def order_verdict(
         Reason against the structure. None if it is valid.
     """
     order_status, reason_against = _order_status(
-        candidate_set, order_profile, visible_numbers, doubt=doubt_reason
+        candidate_set, order_profile, visible_numbers, doubt_reason=doubt_reason
     )
     is_reported = order_status not in ("not identifiable", "absent")
     return OrderVerdict(
