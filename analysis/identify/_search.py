@@ -129,7 +129,7 @@ class CoarseResponse:
         self._costs: dict[Plant, float] = {}
 
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
-        """Return this coarse response with weights for another noise spectrum.
+        """Return the measured response with the weights for another noise spectrum.
 
         Parameters
         ----------
@@ -331,7 +331,7 @@ class Descent:
         return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
-        """Remove the hum near modes and descend again. Return `self` if there is no hum."""
+        """Remove the hum near modes from the data, and fit again. Return `self` without hum."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
             hum = descent.hum()
@@ -368,7 +368,7 @@ class Descent:
 
 @dataclass(frozen=True, slots=True)
 class StructureSearch:
-    """Search for the minima of one structure on one record.
+    """Search for the best fits of one structure to one record: minima of the sum of squares.
 
     Attributes
     ----------

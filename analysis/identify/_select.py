@@ -487,7 +487,7 @@ def _fit_modal_model(
 
 
 def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio of each mode as start of its search.
+    """Return number, frequency in hertz and damping ratio at which the search for a mode starts.
 
     A beam that fits badly may have an overdamped mode below one that oscillates. The search for the
     overdamped mode starts at the frequency ratio of a uniform beam.

@@ -89,7 +89,7 @@ _SIZE_TOLERANCE: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class TemporalChange:
-    """Change of one property along the record, or backlash, with its estimated size.
+    """Change of a property of the rig during the record, or backlash, with its estimated size.
 
     Attributes
     ----------
@@ -185,7 +185,10 @@ def _has_possible_size(temporal_change: TemporalChange) -> bool:
 
 
 def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
-    """Yield the candidates that are tested with a change along the record, the best one first."""
+    """Yield the fitted structures that are tested with a change along the record.
+
+    The best one is first.
+    """
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
         if candidate.structure in _STRUCTURES_TO_TEST:
@@ -306,8 +309,8 @@ def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> N
     """Return the torque change in N·m by clocks whose rates differ by `_CLOCK_UNIT`, (samples,).
 
     The torque with time stamp t is that at t plus the rate difference times the time since the
-    middle of the record. It is computed by its Taylor series. `change_size` is in
-    units of `_CLOCK_UNIT`.
+    middle of the record. It is computed by its Taylor series. `change_size` is in units of
+    `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())

@@ -63,7 +63,9 @@ def count_decay_spectra(poles: Sequence[Pole]) -> int:
 def mode_poles(
     plant: Plant, mode_count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
 ) -> tuple[Pole, ...]:
-    """Return the poles of the first `mode_count` modes with derivatives. A mode may have none.
+    """Return the poles of the first `mode_count` modes of a beam, with their derivatives.
+
+    A mode for which no pole is found is left out.
 
     Parameters
     ----------
@@ -124,7 +126,7 @@ def _loaded_poles(
 
 
 class DecaySpectra:
-    """Discrete Fourier transforms of free decays over a number of samples, at some bins.
+    """Computation of the spectra of free decays of the beam, at given frequencies.
 
     Parameters
     ----------
@@ -183,7 +185,10 @@ class DecaySpectra:
         return spectrum_slopes
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the spectra of the decays times the time since the first sample, shape (m, K)."""
+        """Return the spectra of ``t exp(p t)`` of each pole p, shape (m, K).
+
+        The time t begins at the first sample.
+        """
         return self._real_spectra(poles, self._transform_of_growing_decay)
 
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:

@@ -581,7 +581,7 @@ def _reported_parameter(
 def reported_loss_factor(
     damping: Damping, damping_size: DampingSize, invalid_reason: str | None
 ) -> ReportedLossFactor:
-    """Return the reported loss factor of a damping, with its 95 % interval.
+    """Return the loss factor of a damping as reported, with 95 % interval and flag.
 
     Parameters
     ----------

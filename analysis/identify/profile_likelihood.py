@@ -94,7 +94,7 @@ class LikelihoodProfile:
 
     @property
     def is_computed(self) -> bool:
-        """Return whether the profile has more than one value of the order."""
+        """Return whether deviances were computed for more than one value of the order."""
         return len(self.values) > 1
 
     @property
@@ -383,7 +383,7 @@ class OrderProfiler:
             self._extend(direction)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from equally good candidates whose order is outside of the interval.
+        """Extend the profile from candidates that fit as well, outside of the 95 % interval.
 
         Most of them fix the order at 1. A barrier may separate them from the minimum.
         """
@@ -448,7 +448,7 @@ class OrderProfiler:
                 self.extend_both_ways()
 
     def _store_lower(self, order_value: float, refit: Refit) -> None:
-        """Store a refit at one value of the order, unless a stored one has a lower cost."""
+        """Store the fit with the order fixed at a value, unless a stored one has a lower cost."""
         if refit.cost < self.costs.get(order_value, math.inf):
             self.costs[order_value], self._refits[order_value] = refit.cost, refit
 
@@ -518,7 +518,10 @@ class OrderProfiler:
         )
 
     def _refit_at(self, order_value: float, nearest_refit: Refit) -> float:
-        """Fit all other parameters at a fixed order. Return the square root of the deviance."""
+        """Fit all other parameters with the order fixed at a value, and store the fit.
+
+        Return the square root of its deviance.
+        """
         fixed_names, highest_cost = (
             (self.order,),
             self.costs[self._minimum_order]

@@ -446,7 +446,7 @@ class UniformBeamProblem:
         return minima
 
     def _minimize_from(self, start_vectors: Sequence[NDArray[np.float64]]) -> list[Minimum]:
-        """Minimize chi-square from each given start. Return the minima, the lowest first."""
+        """Minimize chi-square from each start vector. Return the minima, the lowest first."""
         return sorted((self.minimize(x) for x in start_vectors), key=lambda minimum: minimum.cost)
 
     def minimize_without_damping(self, coefficient_index: int, x: NDArray[np.float64]) -> Minimum:

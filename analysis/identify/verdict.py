@@ -202,7 +202,7 @@ def _order_status(
 
 @dataclass(frozen=True, slots=True)
 class CandidateRow:
-    """Row of the table of candidate structures.
+    """Row of the table that compares the fitted structures by cost, BIC and AIC.
 
     Attributes
     ----------

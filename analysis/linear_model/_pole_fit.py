@@ -308,7 +308,10 @@ class PoleFit:
         )
 
     def _pair_basis_functions(self, upper_pole: complex) -> NDArray[np.complex128]:
-        """Return both basis functions of a conjugate pair at the fit points, shape (2, points)."""
+        """Return the responses of the two states of a conjugate pole pair, shape (2, points).
+
+        They are the basis functions of the fit.
+        """
         shifted_s = self._s - upper_pole.real
         return np.array([shifted_s, np.full_like(shifted_s, -upper_pole.imag)]) / (
             shifted_s * shifted_s + upper_pole.imag**2
