@@ -48,7 +48,7 @@ _COST_TOLERANCE: Final = 1e-8
 
 @dataclass(frozen=True, slots=True)
 class Refit:
-    """Minimum of the sum of squares of a structure under one noise spectrum.
+    """Fit of one structure to a record: the minimum of the sum of squares for one noise spectrum.
 
     Attributes
     ----------
@@ -74,7 +74,7 @@ class Refit:
         unknowns: Unknowns,
         start: NDArray[np.float64],
         noise: NoiseSpectrum,
-        columns: NDArray[np.complex128] | None = None,
+        torque_spectra: NDArray[np.complex128] | None = None,
         *,
         max_evaluations: int = 60,
         relative_tolerance: float = _COST_TOLERANCE,
@@ -83,20 +83,20 @@ class Refit:
     ) -> Refit:
         """Descend from a start vector, after unknown torques are filled with the prediction there.
 
-        `columns`, shape (c, K), are torque spectra of unknown size that are projected out in
+        `torque_spectra`, shape (c, K), are torque spectra of unknown size that are projected out in
         addition to the free decay. `hold` names unknowns that keep their start values.
         `relative_tolerance` and `hopeless` are those of `analysis.optimizer.descend`. With
         `max_evaluations` of 1 the start is only evaluated.
         """
-        region = Steps.of(unknowns, VANISHING_LOSS)
-        x = np.clip(start, region.lower, region.upper)
-        for name in hold:
-            index = unknowns.names.index(name)
-            region.lower[index] = region.upper[index] = x[index]
-        objective, minimum = Objective(comparison, unknowns, columns).minimum(
+        descent_steps = Steps.of(unknowns, VANISHING_LOSS)
+        x = np.clip(start, descent_steps.lower, descent_steps.upper)
+        for fixed_name in hold:
+            fixed_index = unknowns.names.index(fixed_name)
+            descent_steps.lower[fixed_index] = descent_steps.upper[fixed_index] = x[fixed_index]
+        objective, minimum = Objective(comparison, unknowns, torque_spectra).minimum(
             x,
             noise.weight,
-            region,
+            descent_steps,
             relative_tolerance=relative_tolerance,
             max_evaluations=max_evaluations,
             hopeless=hopeless,
@@ -141,17 +141,18 @@ class Refit:
     @property
     def predicted_step(self) -> NDArray[np.float64]:
         """Return the Gauss-Newton step of the unknowns to the true minimum, shape (k,)."""
-        equations = self.equations
-        at_bound = equations.held(self.x, *self.objective.unknowns.bounds)
-        is_free = ~at_bound & (np.diag(equations.hessian) > 0)
-        scaled_hessian, scale = equations.scaled_hessian()
-        slope = equations.gradient[is_free] / scale[is_free]
-        step = np.zeros(self.x.size)
-        solved = np.linalg.solve(
-            scaled_hessian[np.ix_(is_free, is_free)] + 1e-12 * np.eye(slope.size), slope
+        normal_equations = self.equations
+        is_at_bound = normal_equations.held(self.x, *self.objective.unknowns.bounds)
+        is_free = ~is_at_bound & (np.diag(normal_equations.hessian) > 0)
+        scaled_hessian, hessian_scale = normal_equations.scaled_hessian()
+        scaled_gradient = normal_equations.gradient[is_free] / hessian_scale[is_free]
+        newton_step = np.zeros(self.x.size)
+        scaled_step = np.linalg.solve(
+            scaled_hessian[np.ix_(is_free, is_free)] + 1e-12 * np.eye(scaled_gradient.size),
+            scaled_gradient,
         )
-        step[is_free] = -solved / scale[is_free]
-        return step
+        newton_step[is_free] = -scaled_step / hessian_scale[is_free]
+        return newton_step
 
     @property
     def plant(self) -> Plant:
@@ -163,30 +164,34 @@ class Refit:
 
         The standard deviations include the uncertainty of all other fitted parameters.
         """
-        values, covariance = self.amplitude_covariance()
-        return values, np.sqrt(np.diag(covariance))
+        torque_amplitudes, covariance = self.amplitude_covariance()
+        return torque_amplitudes, np.sqrt(np.diag(covariance))
 
     def amplitude_covariance(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the sizes of the added torque spectra, (c,), and their covariance, (c, c)."""
+        """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
         linearisation = self.objective.linearise(self.x)
-        projected = self.objective.project(linearisation, self.noise.weight)
-        white = linearisation.columns * self.noise.weight
+        projected_objective = self.objective.project(linearisation, self.noise.weight)
+        whitened_spectra = linearisation.columns * self.noise.weight
         # The Jacobian before the projection is needed: after it the columns are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
-        derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, white])
-        scale = np.sqrt(np.sum(np.abs(derivatives) ** 2, axis=1))
-        scale[scale == 0] = 1.0
-        derivatives = derivatives / scale[:, None]
-        gram = (derivatives.conj() @ derivatives.T).real + 1e-12 * np.eye(scale.size)
-        first_column = scale.size - len(self.columns)
-        column_scale = scale[first_column:]
-        covariance = np.linalg.inv(gram)[first_column:, first_column:] / np.outer(
+        derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, whitened_spectra])
+        derivative_norms = np.sqrt(np.sum(np.abs(derivatives) ** 2, axis=1))
+        derivative_norms[derivative_norms == 0] = 1.0
+        derivatives = derivatives / derivative_norms[:, None]
+        gram_matrix = (derivatives.conj() @ derivatives.T).real + 1e-12 * np.eye(
+            derivative_norms.size
+        )
+        first_column = derivative_norms.size - len(self.columns)
+        column_scale = derivative_norms[first_column:]
+        covariance = np.linalg.inv(gram_matrix)[first_column:, first_column:] / np.outer(
             column_scale, column_scale
         )
-        return projected.amplitudes[projected.amplitudes.size - len(self.columns) :], covariance
+        return projected_objective.amplitudes[
+            projected_objective.amplitudes.size - len(self.columns) :
+        ], covariance
 
     def unexplained_columns(
-        self, columns: NDArray[np.complex128], *, beam_free: bool = True
+        self, torque_spectra: NDArray[np.complex128], *, beam_free: bool = True
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
         """Whiten torque spectra and remove the part that other free terms explain, shape (c, K).
 
@@ -194,26 +199,34 @@ class Refit:
         `beam_free` the unknowns may explain a part of the spectra, too. Otherwise only the terms
         that are projected out may.
         """
-        weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
-        projected = self.objective.project(linearisation, weight)
-        explaining_spectra = linearisation.columns * weight
+        noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
+        projected_objective = self.objective.project(linearisation, noise_weight)
+        explaining_spectra = linearisation.columns * noise_weight
         if beam_free:
-            explaining_spectra = np.concatenate([projected.jacobian, explaining_spectra])
-        return unexplained_part(columns * weight, explaining_spectra), projected.residual
+            explaining_spectra = np.concatenate([projected_objective.jacobian, explaining_spectra])
+        return unexplained_part(
+            torque_spectra * noise_weight, explaining_spectra
+        ), projected_objective.residual
 
-    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the first-order cost reduction by each added torque spectrum alone, shape (c,).
+    def cost_reduction_by_spectrum(
+        self, torque_spectra: NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
+        """Return the first-order reduction of the sum of squares by each torque spectrum alone.
+
+        Its shape is (c,).
 
         Parameters
         ----------
-        columns : ndarray of complex, shape (c, K)
+        torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra of unknown size.
         """
-        unexplained, residual = self.unexplained_columns(columns)
-        correlation = (unexplained.conj() @ residual).real
-        squares = np.maximum(np.sum(np.abs(unexplained) ** 2, axis=1), np.finfo(float).tiny)
-        reduction: NDArray[np.float64] = correlation**2 / squares
-        return reduction
+        unexplained_spectra, residual = self.unexplained_columns(torque_spectra)
+        correlation = (unexplained_spectra.conj() @ residual).real
+        unexplained_squares = np.maximum(
+            np.sum(np.abs(unexplained_spectra) ** 2, axis=1), np.finfo(float).tiny
+        )
+        cost_reductions: NDArray[np.float64] = correlation**2 / unexplained_squares
+        return cost_reductions
 
     def fit(self) -> RecordFit:
         """Return the fit at this minimum with parameters, modes and uncertainties."""
@@ -221,22 +234,26 @@ class Refit:
         if not len(self.columns):
             return fit
         # `summary` does not know that the amplitudes of other columns are free as well.
-        projected = self.objective.project(self.objective.linearise(self.x), self.noise.weight)
-        decays = fit.ringing.degrees_of_freedom
-        scale = np.sqrt(np.diag(projected.amplitude_gram))
-        scale[scale == 0] = 1.0
-        gram = projected.amplitude_gram / np.outer(scale, scale) + 1e-12 * np.eye(scale.size)
+        projected_objective = self.objective.project(
+            self.objective.linearise(self.x), self.noise.weight
+        )
+        decay_count = fit.ringing.degrees_of_freedom
+        gram_scale = np.sqrt(np.diag(projected_objective.amplitude_gram))
+        gram_scale[gram_scale == 0] = 1.0
+        gram_matrix = projected_objective.amplitude_gram / np.outer(
+            gram_scale, gram_scale
+        ) + 1e-12 * np.eye(gram_scale.size)
         decay_gram, cross_gram, column_gram = (
-            gram[:decays, :decays],
-            gram[:decays, decays:],
-            gram[decays:, decays:],
+            gram_matrix[:decay_count, :decay_count],
+            gram_matrix[:decay_count, decay_count:],
+            gram_matrix[decay_count:, decay_count:],
         )
         # Inverse covariance of the decays alone, the other columns free (Schur complement).
         decay_precision = decay_gram - cross_gram @ np.linalg.solve(column_gram, cross_gram.T)
-        a = (projected.amplitudes * scale)[:decays]
+        a = (projected_objective.amplitudes * gram_scale)[:decay_count]
         chi_square = float(a @ decay_precision @ a) * fit.degrees_of_freedom / fit.cost
         return replace(
-            fit, ringing=replace(fit.ringing, chi_square=chi_square, degrees_of_freedom=decays)
+            fit, ringing=replace(fit.ringing, chi_square=chi_square, degrees_of_freedom=decay_count)
         )
 
     def candidate(self) -> Candidate:
@@ -246,22 +263,30 @@ class Refit:
 
     def residual_noise(self) -> NoiseSpectrum:
         """Return the noise of the residual at this minimum. Lines stay excluded."""
-        residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
+        unwhitened_residual = self.objective.project(self.objective.linearise(self.x), 1.0).residual
         known_fraction = self.objective.comparison.measurement.known_torque_fraction
-        return replace(self.noise, power=smooth_power(residual) / known_fraction)
+        return replace(self.noise, power=smooth_power(unwhitened_residual) / known_fraction)
 
 
 def unexplained_part(
-    columns: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
+    whitened_spectra: NDArray[np.complex128], explaining_spectra: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
     """Return the part of whitened spectra that other free terms do not explain, shape (c, K).
 
     `explaining_spectra`, shape (k, K), are the whitened derivatives by all free parameters and
     amplitudes.
     """
-    scale = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
-    basis = explaining_spectra[scale > 0] / scale[scale > 0, None]
-    gram = (basis.conj() @ basis.T).real + 1e-12 * np.eye(len(basis))
-    coefficients = np.linalg.solve(gram, (basis.conj() @ columns.T).real)
-    remainder: NDArray[np.complex128] = columns - coefficients.T @ basis
-    return remainder
+    spectrum_norms = np.sqrt(np.sum(np.abs(explaining_spectra) ** 2, axis=1))
+    normalized_spectra = (
+        explaining_spectra[spectrum_norms > 0] / spectrum_norms[spectrum_norms > 0, None]
+    )
+    gram_matrix = (normalized_spectra.conj() @ normalized_spectra.T).real + 1e-12 * np.eye(
+        len(normalized_spectra)
+    )
+    coefficients = np.linalg.solve(
+        gram_matrix, (normalized_spectra.conj() @ whitened_spectra.T).real
+    )
+    unexplained_spectra: NDArray[np.complex128] = (
+        whitened_spectra - coefficients.T @ normalized_spectra
+    )
+    return unexplained_spectra

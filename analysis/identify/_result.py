@@ -81,8 +81,11 @@ class Ringing:
     @property
     def significant(self) -> bool:
         """Return whether chance gives such amplitudes in less than one of 10 000 records."""
-        freedom = self.degrees_of_freedom
-        return bool(freedom and chi_square_p_value(self.chi_square, freedom) < _RINGING_P_VALUE)
+        degrees_of_freedom = self.degrees_of_freedom
+        return bool(
+            degrees_of_freedom
+            and chi_square_p_value(self.chi_square, degrees_of_freedom) < _RINGING_P_VALUE
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,8 +216,8 @@ class RecordAnalysis:
     @property
     def noise(self) -> NoiseSpectrum:
         """Return the noise spectrum of the torque under which the fits were made."""
-        scale = self.comparison.samples * self.comparison.decimation.rate_hz / 2
-        return NoiseSpectrum(self.noise_nm2_per_hz * scale, self.compared, self.lines)
+        density_factor = self.comparison.samples * self.comparison.decimation.rate_hz / 2
+        return NoiseSpectrum(self.noise_nm2_per_hz * density_factor, self.compared, self.lines)
 
     def fit_percent(self, fit: RecordFit | ModalFit) -> float:
         """Return how well a model fits the measured torque in the band, in per cent (NRMSE).
@@ -231,6 +234,6 @@ class RecordAnalysis:
         torque_nm = (
             comparison.torque_nm[comparison.retained] + comparison.removed_nm - comparison.hum_nm
         )
-        measured = comparison.spectrum(torque_nm)[noise.counts]
-        residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
-        return nrmse_percent(residual, measured)
+        measured_spectrum = comparison.spectrum(torque_nm)[noise.counts]
+        unwhitened_residual = (fit.residual * np.sqrt(noise.power / 2))[noise.counts]
+        return nrmse_percent(unwhitened_residual, measured_spectrum)

@@ -45,28 +45,32 @@ _SCAN_DAMPING: Final = {"zeta": -4.5, "alpha": 1.0, "gamma": -3.0, "lambda": 1.0
 """Damping for the scan of these shifts, as `Unknowns.start` accepts it."""
 
 
-def resonance_shift(cost: Callable[[Plant], float], unknowns: Unknowns) -> NDArray[np.float64]:
+def resonance_shift(
+    coarse_cost: Callable[[Plant], float], unknowns: Unknowns
+) -> NDArray[np.float64]:
     """Return the shift of the unknowns that aligns the resonances with the record, (k,).
 
     If a resonance is off by more than its width, no descent finds it.
 
     Parameters
     ----------
-    cost : callable
+    coarse_cost : callable
         Function from a plant to its cost, on few points of a frequency response.
     unknowns : Unknowns
         Unknowns of the structure.
     """
-    moderate = unknowns.start(np.array([_SCAN_DAMPING[name] for name in unknowns.structure.free]))
-    shift = np.zeros(moderate.size)
+    moderate_damping_start = unknowns.start(
+        np.array([_SCAN_DAMPING[parameter_name] for parameter_name in unknowns.structure.free])
+    )
+    aligning_shift = np.zeros(moderate_damping_start.size)
     if "density_over_stiffness" in unknowns.names:
-        index = unknowns.names.index("density_over_stiffness")
-        costs = []
-        for step in _LN_RATIO_SHIFTS:
-            shift[index] = step
-            costs.append(cost(unknowns.plant(moderate + shift)))
-        shift[index] = _LN_RATIO_SHIFTS[int(np.argmin(costs))]
-    return shift
+        ratio_index = unknowns.names.index("density_over_stiffness")
+        shift_costs = []
+        for ratio_shift in _LN_RATIO_SHIFTS:
+            aligning_shift[ratio_index] = ratio_shift
+            shift_costs.append(coarse_cost(unknowns.plant(moderate_damping_start + aligning_shift)))
+        aligning_shift[ratio_index] = _LN_RATIO_SHIFTS[int(np.argmin(shift_costs))]
+    return aligning_shift
 
 
 # Coarse response
@@ -94,30 +98,38 @@ _START_ORDERS: Final = (0.5, 1.5)
 
 
 class CoarseResponse:
-    """Some points of the whole record's frequency response, with their weights."""
+    """Measured frequency response of a record at a few hundred points, with their weights.
+
+    A cost on it is cheap to compute.
+    """
 
     __slots__ = ("_costs", "_frequency_hz", "_measured", "_response", "_weights")
 
     def __init__(self, comparison: Comparison) -> None:
-        length = comparison.angle_rad.size
-        hz = np.fft.rfftfreq(length, 1 / comparison.decimation.rate_hz)
+        sample_count = comparison.angle_rad.size
+        hz = np.fft.rfftfreq(sample_count, 1 / comparison.decimation.rate_hz)
         first_hz, last_hz = comparison.frequency_hz[[0, -1]]
-        band = np.flatnonzero((hz >= first_hz) & (hz <= last_hz))
-        angle = np.fft.rfft(comparison.angle_rad)[band]
-        torque = np.fft.rfft(comparison.torque_nm)[band]
+        band_bins = np.flatnonzero((hz >= first_hz) & (hz <= last_hz))
+        angle_spectrum = np.fft.rfft(comparison.angle_rad)[band_bins]
+        torque_spectrum = np.fft.rfft(comparison.torque_nm)[band_bins]
         # Without excitation the motor moved with the noise: such bins show no response.
-        coherent_angle = np.fft.rfft(comparison.coherent_rad())[band]
-        power = coherent_angle.real**2 + coherent_angle.imag**2
-        excited = power > 1e-12 * power.max()
-        response, weights = torque[excited] / angle[excited], power[excited]
-        selected, self._weights = thinned(response, weights / weights.sum(), _COARSE_POINTS)
-        self._measured = response[selected]
-        self._frequency_hz = hz[band][excited][selected]
+        coherent_angle = np.fft.rfft(comparison.coherent_rad())[band_bins]
+        angle_power = coherent_angle.real**2 + coherent_angle.imag**2
+        is_excited = angle_power > 1e-12 * angle_power.max()
+        measured_response, response_weights = (
+            torque_spectrum[is_excited] / angle_spectrum[is_excited],
+            angle_power[is_excited],
+        )
+        selected_bins, self._weights = thinned(
+            measured_response, response_weights / response_weights.sum(), _COARSE_POINTS
+        )
+        self._measured = measured_response[selected_bins]
+        self._frequency_hz = hz[band_bins][is_excited][selected_bins]
         self._response = ResponseGrid(2j * np.pi * self._frequency_hz)
         self._costs: dict[Plant, float] = {}
 
     def whitened(self, noise: NoiseSpectrum, frequency_hz: NDArray[np.float64]) -> CoarseResponse:
-        """Return this coarse response with weights for another noise spectrum.
+        """Return the measured response with the weights for another noise spectrum.
 
         Parameters
         ----------
@@ -126,18 +138,18 @@ class CoarseResponse:
         frequency_hz : ndarray, shape (K,)
             Frequencies of the bins of the noise spectrum.
         """
-        weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
-        response = copy(self)
-        response._weights = self._weights * weight / (self._weights @ weight)
-        response._costs = {}
-        return response
+        noise_weight = np.interp(self._frequency_hz, frequency_hz, noise.weight**2)
+        whitened_response = copy(self)
+        whitened_response._weights = self._weights * noise_weight / (self._weights @ noise_weight)
+        whitened_response._costs = {}
+        return whitened_response
 
     def cost(self, plant: Plant) -> float:
         """Return the weighted mean square of predicted minus measured response, in (N·m/rad)²."""
         # Cached: structures that differ only in the free parameters are scanned at the same plants.
         if plant not in self._costs:
-            deviation = self._response.evaluate(plant)[0] - self._measured
-            self._costs[plant] = self._mean_square(deviation)
+            response_deviation = self._response.evaluate(plant)[0] - self._measured
+            self._costs[plant] = self._mean_square(response_deviation)
         return self._costs[plant]
 
     def distance(self, first_plant: Plant, second_plant: Plant) -> float:
@@ -147,71 +159,89 @@ class CoarseResponse:
         )
 
     def alike(self, first_plant: Plant, second_plant: Plant) -> bool:
-        """Return whether two plants are so similar that they belong to the same minimum."""
+        """Return whether the responses of two plants are so similar that they are one minimum."""
         return self.distance(first_plant, second_plant) <= _SAME_MINIMUM_FRACTION * min(
             self.cost(first_plant), self.cost(second_plant)
         )
 
     def normal_equations(self, unknowns: Unknowns, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the coarse cost with its gradient and Gauss-Newton matrix by the unknowns."""
-        plant, chain = unknowns.plant_and_gradient(x)
-        response, *gradient = self._response.evaluate(plant, unknowns.gradient_names)
-        deviation = response - self._measured
-        jacobian = chain.T @ np.array(gradient)
-        weighted = jacobian.conj() * self._weights
+        """Return `cost` with its gradient and Gauss-Newton matrix by the unknowns."""
+        plant, unknown_slopes = unknowns.plant_and_gradient(x)
+        predicted_response, *response_gradient = self._response.evaluate(
+            plant, unknowns.gradient_names
+        )
+        response_deviation = predicted_response - self._measured
+        jacobian = unknown_slopes.T @ np.array(response_gradient)
+        weighted_jacobian = jacobian.conj() * self._weights
         return NormalEquations(
-            cost=self._mean_square(deviation),
-            gradient=(weighted @ deviation).real,
-            hessian=(weighted @ jacobian.T).real,
+            cost=self._mean_square(response_deviation),
+            gradient=(weighted_jacobian @ response_deviation).real,
+            hessian=(weighted_jacobian @ jacobian.T).real,
         )
 
-    def _mean_square(self, deviation: NDArray[np.complex128]) -> float:
+    def _mean_square(self, response_deviation: NDArray[np.complex128]) -> float:
         """Return the weighted mean square of differences of the response, in (N·m/rad)²."""
-        return float(self._weights @ (deviation.real**2 + deviation.imag**2))
+        return float(self._weights @ (response_deviation.real**2 + response_deviation.imag**2))
 
 
-def initial_guesses(coarse: CoarseResponse, unknowns: Unknowns) -> list[NDArray[np.float64]]:
+def initial_guesses(
+    coarse_response: CoarseResponse, unknowns: Unknowns
+) -> list[NDArray[np.float64]]:
     """Return start vectors from which descents reach all relevant minima, each of shape (k,).
 
     The first is the best fit with all orders 1, which is close to most materials and to air. The
     others have the same losses with different orders.
     """
-    shift = resonance_shift(coarse.cost, unknowns)
-    sizes = [_START_LN_SIZES.get(name, (1.0,)) for name in unknowns.structure.free]
-    starts = [unknowns.start(np.array(guess)) + shift for guess in itertools.product(*sizes)]
-    best_start = min(starts, key=lambda x: coarse.cost(unknowns.plant(x)))
-    guesses = [best_start]
-    orders = [i for i, name in enumerate(unknowns.names) if name in ("alpha", "lambda")]
-    for values in itertools.product(_START_ORDERS, repeat=len(orders)) if orders else ():
-        guess = best_start.copy()
-        guess[orders] = values
-        guesses.append(guess)
-    return guesses
+    aligning_shift = resonance_shift(coarse_response.cost, unknowns)
+    damping_sizes = [
+        _START_LN_SIZES.get(parameter_name, (1.0,)) for parameter_name in unknowns.structure.free
+    ]
+    shifted_starts = [
+        unknowns.start(np.array(start_vector)) + aligning_shift
+        for start_vector in itertools.product(*damping_sizes)
+    ]
+    best_start = min(shifted_starts, key=lambda x: coarse_response.cost(unknowns.plant(x)))
+    start_vectors = [best_start]
+    order_indices = [
+        i
+        for i, parameter_name in enumerate(unknowns.names)
+        if parameter_name in ("alpha", "lambda")
+    ]
+    for order_values in (
+        itertools.product(_START_ORDERS, repeat=len(order_indices)) if order_indices else ()
+    ):
+        start_vector = best_start.copy()
+        start_vector[order_indices] = order_values
+        start_vectors.append(start_vector)
+    return start_vectors
 
 
 def coarse_minima(
-    coarse: CoarseResponse, unknowns: Unknowns, points: Iterable[NDArray[np.float64]]
+    coarse_response: CoarseResponse,
+    unknowns: Unknowns,
+    start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
-    steps = Steps.of(unknowns)
+    descent_steps = Steps.of(unknowns)
     minima = [
         descend(
-            lambda x: coarse.normal_equations(unknowns, x),
-            point,
-            steps,
+            lambda x: coarse_response.normal_equations(unknowns, x),
+            start_vector,
+            descent_steps,
             relative_tolerance=_COARSE_TOLERANCE,
             max_evaluations=_MAX_COARSE_EVALUATIONS,
         )
-        for point in points
+        for start_vector in start_vectors
     ]
-    distinct: list[Minimum] = []
+    distinct_minima: list[Minimum] = []
     for minimum in sorted(minima, key=lambda m: m.cost):
         plant = unknowns.plant(minimum.x)
         if not any(
-            coarse.alike(plant, unknowns.plant(known_minimum.x)) for known_minimum in distinct
+            coarse_response.alike(plant, unknowns.plant(known_minimum.x))
+            for known_minimum in distinct_minima
         ):
-            distinct.append(minimum)
-    return distinct
+            distinct_minima.append(minimum)
+    return distinct_minima
 
 
 # Descents on the whole record
@@ -242,7 +272,7 @@ of the hum to the beam."""
 
 @dataclass(frozen=True, slots=True)
 class Descent:
-    """Current point of the descent of one structure on a record: its objective and unknowns."""
+    """Current point of a least-squares fit of one structure: objective and vector of unknowns."""
 
     objective: Objective
     x: NDArray[np.float64]
@@ -266,9 +296,9 @@ class Descent:
         hopeless : tuple of int and float, optional
             Number of evaluations and cost above which `descend` gives up.
         """
-        region = Steps.of(self.objective.unknowns)
+        descent_steps = Steps.of(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
-            self.x, noise.weight, region, relative_tolerance=tolerance, hopeless=hopeless
+            self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
         )
         return Descent(objective, minimum.x)
 
@@ -277,7 +307,7 @@ class Descent:
         return self.objective.normal_equations(self.x, noise.weight).cost
 
     def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
-        """Re-estimate the angle that follows the reference, and descend again, until it converges.
+        """Re-estimate the motor angle from the reference angle, and descend until it converges.
 
         Return `self` if it has converged already.
         """
@@ -292,25 +322,25 @@ class Descent:
         return descent
 
     def hum(self) -> tuple[Hum, ...]:
-        """Return the narrow-band disturbances found near the modes of the current beam."""
+        """Search for hum, a narrow-band disturbance, near the modes of the current beam."""
         comparison = self.objective.comparison
         at, noise = self.objective.linearise(self.x), self.noise()
-        amplitudes = self.objective.project(at, noise.weight).amplitudes
-        decays = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
-        decaying_nm = comparison.in_time(amplitudes[:decays] @ at.columns[:decays])
+        torque_amplitudes = self.objective.project(at, noise.weight).amplitudes
+        decay_count = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
+        decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ at.columns[:decay_count])
         return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:
-        """Remove the hum near modes and descend again. Return `self` if there is no hum."""
+        """Remove the hum near modes from the data, and fit again. Return `self` without hum."""
         descent = self
         for _ in range(_MAX_HUM_SEARCHES):
             hum = descent.hum()
             if not hum:
                 return self
-            objective = Objective(
+            hum_free_objective = Objective(
                 descent.objective.comparison.remove_hum(hum), descent.objective.unknowns
             )
-            descent = Descent(objective, descent.x)
+            descent = Descent(hum_free_objective, descent.x)
             descent = descent.descend_to_minimum(descent.noise(), tolerance)
         return descent
 
@@ -318,25 +348,27 @@ class Descent:
         """Return the noise spectrum of the current residual, without the free decay."""
         objective, comparison = self.objective, self.objective.comparison
         at = objective.linearise(self.x)
-        near_mode = None
+        is_near_mode = None
         if with_lines:
             hz = comparison.frequency_hz
-            near_mode = np.zeros(hz.size, dtype=bool)
-            for pole in at.poles:
-                width = resonance_half_width_hz(pole, float(hz[1] - hz[0]))
-                near_mode |= np.abs(hz - abs(pole.at_rad_s.imag) / (2 * np.pi)) < width
+            is_near_mode = np.zeros(hz.size, dtype=bool)
+            for mode_pole in at.poles:
+                mode_width_hz = resonance_half_width_hz(mode_pole, float(hz[1] - hz[0]))
+                is_near_mode |= (
+                    np.abs(hz - abs(mode_pole.at_rad_s.imag) / (2 * np.pi)) < mode_width_hz
+                )
         return estimate_noise(
             objective.project(at, 1.0).residual,
             comparison.frequency_hz,
             comparison.samples,
             comparison.measurement.known_torque_fraction,
-            near_mode,
+            is_near_mode,
         )
 
 
 @dataclass(frozen=True, slots=True)
 class StructureSearch:
-    """Search for the minima of one structure on one record.
+    """Search for the best fits of one structure to one record: minima of the sum of squares.
 
     Attributes
     ----------
@@ -356,10 +388,15 @@ class StructureSearch:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse: CoarseResponse) -> StructureSearch:
+    def of(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
         """Search the whole range of the unknowns for minima of the coarse response."""
-        starts = initial_guesses(coarse, objective.unknowns)
-        return cls(objective, coarse, starts[0], coarse_minima(coarse, objective.unknowns, starts))
+        start_vectors = initial_guesses(coarse_response, objective.unknowns)
+        return cls(
+            objective,
+            coarse_response,
+            start_vectors[0],
+            coarse_minima(coarse_response, objective.unknowns, start_vectors),
+        )
 
     @property
     def unknowns(self) -> Unknowns:
@@ -367,14 +404,16 @@ class StructureSearch:
         return self.objective.unknowns
 
     def with_comparison(self, comparison: Comparison) -> StructureSearch:
-        """Return the same search, with the same starts, on other data of the record."""
+        """Return the search with the same starts and minima for other data of the same record."""
         return replace(self, objective=Objective(comparison, self.unknowns))
 
     def lowest_coarse_minimum(self) -> Descent:
         """Return a descent that starts at the lowest minimum of the coarse response."""
         return Descent(self.objective, self.minima[0].x)
 
-    def descend_to_lowest(self, noise: NoiseSpectrum, near: Descent | None = None) -> Descent:
+    def descend_to_lowest(
+        self, noise: NoiseSpectrum, known_descent: Descent | None = None
+    ) -> Descent:
         """Descend to the lowest minimum of the whole record under a noise spectrum.
 
         Under another noise spectrum another minimum may be the lowest. So all minima are compared
@@ -385,27 +424,32 @@ class StructureSearch:
         ----------
         noise : NoiseSpectrum
             Noise that weights the residual.
-        near : Descent, optional
+        known_descent : Descent, optional
             Descent at a known minimum.
         """
-        coarse = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
-        points = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
-        minima_under_noise = coarse_minima(coarse, self.unknowns, [*points, self.first])
-        rivals = [
+        whitened_response = self.coarse.whitened(noise, self.objective.comparison.frequency_hz)
+        start_vectors = [minimum.x for minimum in self.minima[:_MAX_STORED_MINIMA]]
+        minima_under_noise = coarse_minima(
+            whitened_response, self.unknowns, [*start_vectors, self.first]
+        )
+        rival_descents = [
             Descent(self.objective, minimum.x)
             for minimum in minima_under_noise[:_MAX_RIVALS]
             if minimum.cost < _RIVAL_COST_RATIO * minima_under_noise[0].cost
         ]
-        if near is not None:
-            plant = self.unknowns.plant(near.x)
-            rivals = [near] + [
-                rival
-                for rival in rivals
-                if not coarse.alike(plant, self.unknowns.plant(rival.x))
-                and coarse.cost(self.unknowns.plant(rival.x))
-                < _BETTER_COST_RATIO * coarse.cost(plant)
+        if known_descent is not None:
+            known_plant = self.unknowns.plant(known_descent.x)
+            rival_descents = [known_descent] + [
+                rival_descent
+                for rival_descent in rival_descents
+                if not whitened_response.alike(known_plant, self.unknowns.plant(rival_descent.x))
+                and whitened_response.cost(self.unknowns.plant(rival_descent.x))
+                < _BETTER_COST_RATIO * whitened_response.cost(known_plant)
             ]
-        if len(rivals) == 1:
-            return rivals[0]
-        final_descents = [rival.descend_to_minimum(noise, _RIVAL_TOLERANCE) for rival in rivals]
+        if len(rival_descents) == 1:
+            return rival_descents[0]
+        final_descents = [
+            rival_descent.descend_to_minimum(noise, _RIVAL_TOLERANCE)
+            for rival_descent in rival_descents
+        ]
         return min(final_descents, key=lambda end: end.cost(noise))

@@ -120,7 +120,7 @@ _CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
 
 @dataclass(frozen=True, slots=True)
 class Selection:
-    """Verdict on a record, with the fits that support it.
+    """Verdict on one record of angle and torque, with the fits from which it is drawn.
 
     Attributes
     ----------
@@ -141,14 +141,18 @@ class Selection:
 
     @property
     def fit(self) -> RecordFit:
-        """Return the fit whose numbers are reported."""
+        """Return the fit of a beam to the record whose parameter values are reported."""
         return self.headline.fit
 
     @property
     def determined(self) -> frozenset[Order]:
-        """Return the orders, "alpha" or "lambda", that the record determines."""
-        orders = (self.verdict.alpha, self.verdict.lambda_)
-        return frozenset(each.order for each in orders if each.profile.identifiable)
+        """Return the damping orders, "alpha" or "lambda", that the record determines precisely."""
+        order_verdicts = (self.verdict.alpha, self.verdict.lambda_)
+        return frozenset(
+            verdict_of_order.order
+            for verdict_of_order in order_verdicts
+            if verdict_of_order.profile.identifiable
+        )
 
 
 def select(
@@ -158,10 +162,10 @@ def select(
     band_hz: tuple[float, float] = BAND_HZ,
     earlier: Selection | None = None,
 ) -> Selection:
-    """Select the model that a record supports, and report its parameters.
+    """Select the model of beam and damping that a record supports, and report its parameters.
 
     The modal model is fitted to the record without hum, impacts and gaps. Its modes are reported.
-    If its residual is noise, the antenna is linear and constant. Otherwise drag, nonlinear forces,
+    If its residual is noise, the beam is linear and constant. Otherwise drag, nonlinear forces,
     changes along the record and impacts are tested. A uniform beam is tested against the modal
     constants. Orders, coefficients and stiffness are estimated from these constants, with the
     tolerance of the geometry that the measurement states. All structures are also fitted to the
@@ -204,7 +208,9 @@ _ResultT = TypeVar("_ResultT")
 
 @dataclass(frozen=True, slots=True)
 class _Assessment(Generic[_ResultT]):
-    """Result on a record, with the candidates that support it.
+    """Result of the model selection on one record, with the fitted candidates it is based on.
+
+    A candidate is one structure of beam and damping, fitted to the record.
 
     Attributes
     ----------
@@ -225,10 +231,14 @@ class _Assessment(Generic[_ResultT]):
 
 
 def _assess_with_impacts(
-    measurement: Measurement, assess: Callable[[Measurement], _Assessment[_ResultT]]
+    measurement: Measurement, assess_measurement: Callable[[Measurement], _Assessment[_ResultT]]
 ) -> _Assessment[_ResultT]:
-    """Assess a record, and assess it again with each impact that explains its residual."""
-    assessment = assess(measurement)
+    """Select the model of a record, and again with each impact that may explain its residual.
+
+    `assess_measurement` is the selection for a measurement whose known impacts are fitted. Return
+    the last result that was improved by an impact.
+    """
+    assessment = assess_measurement(measurement)
     for _ in range(MAX_IMPACTS):
         if assessment.explained or not _KINDS_AGAINST_IMPACT_SEARCH.isdisjoint(assessment.kinds):
             break
@@ -237,12 +247,12 @@ def _assess_with_impacts(
         for impact in find_impacts(
             assessment.candidate_set, obvious="harmonics" in assessment.kinds
         ):
-            with_impact = assess(
+            impact_assessment = assess_measurement(
                 add_known_impact(assessment.candidate_set.comparison.measurement, impact)
             )
-            if with_impact.explained or impact.evident:
-                better_assessment = with_impact
-            if with_impact.explained:
+            if impact_assessment.explained or impact.evident:
+                better_assessment = impact_assessment
+            if impact_assessment.explained:
                 break
         if better_assessment is None:
             break
@@ -256,135 +266,180 @@ def _select_with_known_impacts(
     band_hz: tuple[float, float],
     earlier: Selection | None,
 ) -> _Assessment[Selection]:
-    """Select the structure of a record whose known impacts are part of the measurement."""
+    """Select the structure of a record. The impacts that the measurement states are fitted, too."""
     earlier_candidates = earlier.candidates if earlier else ()
-    refitted = (
+    refitted_candidates = (
         CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed, band_hz)
         if earlier_candidates
         else None
     )
-    linear = refitted or CandidateSet.of(measurement, fixed, band_hz)
-    modal = _fit_modal_model(linear)
-    candidate_set, small_linear_effect = linear, None
-    forces: tuple[NonlinearForce, ...] = ()
-    changes: tuple[TemporalChange, ...] = ()
-    is_linear = modal is not None and _is_linear_and_constant(linear, modal, band_hz)
-    if modal is not None:
+    linear_candidates = refitted_candidates or CandidateSet.of(measurement, fixed, band_hz)
+    modal_fit = _fit_modal_model(linear_candidates)
+    candidate_set, small_linear_effect = linear_candidates, None
+    nonlinear_forces: tuple[NonlinearForce, ...] = ()
+    temporal_changes: tuple[TemporalChange, ...] = ()
+    is_linear_and_constant = modal_fit is not None and _is_linear_and_constant(
+        linear_candidates, modal_fit, band_hz
+    )
+    if modal_fit is not None:
         small_linear_effect = small_effect(
-            linear.comparison, modal, modal.plant_with_modal_frequencies(linear.likeliest.plant)
+            linear_candidates.comparison,
+            modal_fit,
+            modal_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant),
         )
-    modal_with_effect, effect_suffices = modal, is_linear
+    modal_fit_with_effect, small_effect_suffices = modal_fit, is_linear_and_constant
     if small_linear_effect is not None:
-        modal_with_effect = _fit_modal_model(linear, small_linear_effect.column[None])
-        effect_suffices = modal_with_effect is not None and _is_linear_and_constant(
-            linear, modal_with_effect, band_hz
+        modal_fit_with_effect = _fit_modal_model(
+            linear_candidates, small_linear_effect.column[None]
         )
-    if not (is_linear or effect_suffices or measurement.knocks):
-        for impact in find_impacts(linear, obvious=True):
-            with_impact = _select_with_known_impacts(
+        small_effect_suffices = modal_fit_with_effect is not None and _is_linear_and_constant(
+            linear_candidates, modal_fit_with_effect, band_hz
+        )
+    if not (is_linear_and_constant or small_effect_suffices or measurement.knocks):
+        for impact in find_impacts(linear_candidates, obvious=True):
+            impact_assessment = _select_with_known_impacts(
                 add_known_impact(measurement, impact), fixed, band_hz, None
             )
-            if with_impact.explained:
-                return with_impact
+            if impact_assessment.explained:
+                return impact_assessment
     stiffness_step = None
-    if modal is not None and measurement.is_single_sweep:
-        if not (is_linear or effect_suffices) or (
+    if modal_fit is not None and measurement.is_single_sweep:
+        if not (is_linear_and_constant or small_effect_suffices) or (
             small_linear_effect is not None and small_linear_effect.large
         ):
-            stiffness_step = _likely_stiffness_step(linear, modal, small_linear_effect)
+            stiffness_step = _likely_stiffness_step(
+                linear_candidates, modal_fit, small_linear_effect
+            )
         if stiffness_step is not None:
-            small_linear_effect, modal_with_effect, effect_suffices = None, modal, is_linear
-    if not (is_linear or effect_suffices) or (
+            small_linear_effect, modal_fit_with_effect, small_effect_suffices = (
+                None,
+                modal_fit,
+                is_linear_and_constant,
+            )
+    if not (is_linear_and_constant or small_effect_suffices) or (
         small_linear_effect is not None and small_linear_effect.large
     ):
-        candidate_set, forces, changes = _fit_further_effects(
-            linear, test_amplitude_effects=stiffness_step is None
+        candidate_set, nonlinear_forces, temporal_changes = _fit_further_effects(
+            linear_candidates, test_amplitude_effects=stiffness_step is None
         )
-        modal = _fit_modal_model(candidate_set)
-        if effect_suffices and not (
-            modal is not None and _is_linear_and_constant(candidate_set, modal, band_hz)
+        modal_fit = _fit_modal_model(candidate_set)
+        if small_effect_suffices and not (
+            modal_fit is not None and _is_linear_and_constant(candidate_set, modal_fit, band_hz)
         ):
-            candidate_set, forces, changes, modal = linear, (), (), modal_with_effect
+            candidate_set, nonlinear_forces, temporal_changes, modal_fit = (
+                linear_candidates,
+                (),
+                (),
+                modal_fit_with_effect,
+            )
         else:
             small_linear_effect = None
     elif small_linear_effect is not None and small_linear_effect.saved > LARGE_DEVIANCE_REDUCTION:
-        candidate_set = linear.refit_with_additional_effect(small_linear_effect.column[None])
-        modal = _fit_modal_model(candidate_set)
+        candidate_set = linear_candidates.refit_with_additional_effect(
+            small_linear_effect.column[None]
+        )
+        modal_fit = _fit_modal_model(candidate_set)
     else:
-        modal = modal_with_effect
+        modal_fit = modal_fit_with_effect
     candidate_set = candidate_set.fit_with_free_orders()
-    visible_numbers = _visible_mode_numbers(candidate_set, modal)
-    beam_test = _uniform_beam_test(measurement, modal)
+    visible_numbers = _visible_mode_numbers(candidate_set, modal_fit)
+    beam_test = _uniform_beam_test(measurement, modal_fit)
     uniform_beam_refused = beam_test is not None and beam_test.status == "refused"
     # A local minimum that a part of the record excludes is excluded by the whole record.
-    determined = earlier.determined if earlier and refitted else ()
-    compute_profiles = (
+    determined_orders = earlier.determined if earlier and refitted_candidates else ()
+    should_compute_profiles = (
         not_reported_reason(candidate_set, visible_numbers) is None and not uniform_beam_refused
     )
-    candidate_set, *profiles = profile_both_orders(
-        candidate_set, determined, compute=compute_profiles
+    candidate_set, *order_profiles = profile_both_orders(
+        candidate_set, determined_orders, compute=should_compute_profiles
     )
-    leading = candidate_set.with_leading_candidate(candidate_set.freest)
-    whiteness_test, input_test, harmonic_tests = _test_residual(leading, modal, band_hz)
-    explained = whiteness_test.white and not input_test.related
-    all_findings = findings(leading, forces, harmonic_tests)
-    kinds = {finding.kind for finding in all_findings}
-    model_reason = _wrong_model_reason(kinds, explained=explained)
-    clipped_reason = _CLIPPED_TORQUE_REASON if "clipping" in kinds else None
-    doubt = (
+    leading_candidates = candidate_set.with_leading_candidate(candidate_set.freest)
+    whiteness_test, input_test, harmonic_tests = _test_residual(
+        leading_candidates, modal_fit, band_hz
+    )
+    residual_explained = whiteness_test.white and not input_test.related
+    all_findings = findings(leading_candidates, nonlinear_forces, harmonic_tests)
+    finding_kinds = {finding.kind for finding in all_findings}
+    model_reason = _wrong_model_reason(finding_kinds, residual_explained=residual_explained)
+    clipped_reason = _CLIPPED_TORQUE_REASON if "clipping" in finding_kinds else None
+    doubt_reason = (
         model_reason
         or clipped_reason
-        or _doubt_reason(changes, is_single_sweep=measurement.is_single_sweep)
+        or _doubt_reason(temporal_changes, is_single_sweep=measurement.is_single_sweep)
     )
-    alpha, lambda_ = (
-        order_verdict(candidate_set, each, visible_numbers, doubt=doubt) for each in profiles
+    alpha_verdict, lambda_verdict = (
+        order_verdict(candidate_set, each, visible_numbers, doubt_reason=doubt_reason)
+        for each in order_profiles
     )
-    orders, close_rivals = (alpha, lambda_), rivals(candidate_set, BIC_TIE)
-    reported = headline(candidate_set, orders, visible_numbers, unexplained=model_reason)
-    if doubt is not None:
-        reported = reported.doubted(doubt)
+    order_verdicts, close_rivals = (alpha_verdict, lambda_verdict), rivals(candidate_set, BIC_TIE)
+    reported_headline = headline(
+        candidate_set, order_verdicts, visible_numbers, unexplained=model_reason
+    )
+    if doubt_reason is not None:
+        reported_headline = reported_headline.doubted(doubt_reason)
     # With a fitted change the modes are those at the middle of the record.
-    mode_doubt = doubt if changes and changes[0].certain else model_reason or clipped_reason
-    reported = _add_modal_model(reported, measurement, modal, beam_test, doubt, mode_doubt)
-    if reported.tolerant is not None:
-        alpha, lambda_ = (
+    mode_doubt_reason = (
+        doubt_reason
+        if temporal_changes and temporal_changes[0].certain
+        else model_reason or clipped_reason
+    )
+    reported_headline = _add_modal_model(
+        reported_headline, measurement, modal_fit, beam_test, doubt_reason, mode_doubt_reason
+    )
+    if reported_headline.tolerant is not None:
+        alpha_verdict, lambda_verdict = (
             order_verdict_with_geometry_tolerance(
-                each.order, reported.tolerant, each, doubt, refused=uniform_beam_refused
+                each.order,
+                reported_headline.tolerant,
+                each,
+                doubt_reason,
+                refused=uniform_beam_refused,
             )
-            for each in profiles
+            for each in order_profiles
         )
-        orders = alpha, lambda_
-    if "nonlinear stiffness" in kinds:
-        reported = reported.with_stiffness_law_flag()
-    sentences, advice = [], []
+        order_verdicts = alpha_verdict, lambda_verdict
+    if "nonlinear stiffness" in finding_kinds:
+        reported_headline = reported_headline.with_stiffness_law_flag()
+    verdict_sentences, experiment_texts = [], []
     if model_reason == CONTRADICTED_FILE_REASON:
         all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
     else:
         change_findings = tuple(
-            temporal_change_findings(changes, is_single_sweep=measurement.is_single_sweep)
+            temporal_change_findings(temporal_changes, is_single_sweep=measurement.is_single_sweep)
         )
-        all_findings += _setting_findings(leading, reported, kinds)
+        all_findings += _setting_findings(leading_candidates, reported_headline, finding_kinds)
         all_findings += () if small_linear_effect is None else (small_linear_effect.finding(),)
         if (
-            modal is not None
+            modal_fit is not None
             and beam_test is not None
             and uniform_beam_refused
             and model_reason is None
         ):
-            all_findings += _explain_deviations(measurement, leading, modal, beam_test)
+            all_findings += _explain_deviations(
+                measurement, leading_candidates, modal_fit, beam_test
+            )
         all_findings = _mark_doubtful_findings(
-            all_findings, change_findings, model_reason, doubt, reported.flags, explained=explained
+            all_findings,
+            change_findings,
+            model_reason,
+            doubt_reason,
+            reported_headline.flags,
+            only_harmonics_remain=residual_explained,
         )
         all_findings = _add_impacts_and_unexplained(
-            leading, all_findings, whiteness_test, input_test, stiffness_step
+            leading_candidates, all_findings, whiteness_test, input_test, stiffness_step
         )
-        sentences = headline_sentences(reported, orders, without_rival=doubt is None)
-        advice = experiments(candidate_set, orders, visible_numbers, all_findings, close_rivals)
-    advice += [each.remedy for each in all_findings if each.remedy]
+        verdict_sentences = headline_sentences(
+            reported_headline, order_verdicts, without_rival=doubt_reason is None
+        )
+        experiment_texts = experiments(
+            candidate_set, order_verdicts, visible_numbers, all_findings, close_rivals
+        )
+    experiment_texts += [each.remedy for each in all_findings if each.remedy]
     best_candidate = candidate_set.best
     selection = Selection(
         candidates=candidate_set.candidates,
-        headline=reported,
+        headline=reported_headline,
         analysis=RecordAnalysis.of(
             (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
@@ -392,22 +447,24 @@ def _select_with_known_impacts(
             name=measurement.name,
             structure=best_candidate.structure.name,
             rivals=tuple(c.name for c in close_rivals),
-            parameters={k: q.value for k, q in reported.parameters.items() if q.flag is None},
+            parameters={
+                k: q.value for k, q in reported_headline.parameters.items() if q.flag is None
+            },
             adequate=model_reason is None,
-            alpha=alpha,
-            lambda_=lambda_,
+            alpha=alpha_verdict,
+            lambda_=lambda_verdict,
             visible_modes=visible_numbers,
             findings=all_findings,
             table=_candidate_table(candidate_set),
             whiteness=whiteness_test,
             input_relation=input_test,
             harmonics=harmonic_tests,
-            sentences=(*sentences, *(each.sentence for each in all_findings)),
-            experiments=tuple(dict.fromkeys(advice)),
-            damping_with_amplitude=damping_with_amplitude(leading),
+            sentences=(*verdict_sentences, *(each.sentence for each in all_findings)),
+            experiments=tuple(dict.fromkeys(experiment_texts)),
+            damping_with_amplitude=damping_with_amplitude(leading_candidates),
         ),
     )
-    return _Assessment(selection, leading, explained, kinds)
+    return _Assessment(selection, leading_candidates, residual_explained, finding_kinds)
 
 
 def _fit_modal_model(
@@ -420,17 +477,17 @@ def _fit_modal_model(
     """
     if candidate_set.misread:
         return None
-    starts = _mode_starts(candidate_set.likeliest.modes)
-    columns, drag = candidate_set.columns, candidate_set.comparison.drag
+    mode_starts = _mode_starts(candidate_set.likeliest.modes)
+    torque_spectra, drag_expansion = candidate_set.columns, candidate_set.comparison.drag
     if added_spectra is not None:
-        columns = np.concatenate([columns, added_spectra])
-    if drag is not None:  # the size of the drag is not known exactly
-        columns = np.concatenate([columns, drag.by_law])
-    return fit_modes(candidate_set.comparison, candidate_set.noise, starts, columns)
+        torque_spectra = np.concatenate([torque_spectra, added_spectra])
+    if drag_expansion is not None:  # the size of the drag is not known exactly
+        torque_spectra = np.concatenate([torque_spectra, drag_expansion.by_law])
+    return fit_modes(candidate_set.comparison, candidate_set.noise, mode_starts, torque_spectra)
 
 
 def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]]:
-    """Return number, frequency in hertz and damping ratio of each mode as start of its search.
+    """Return number, frequency in hertz and damping ratio at which the search for a mode starts.
 
     A beam that fits badly may have an overdamped mode below one that oscillates. The search for the
     overdamped mode starts at the frequency ratio of a uniform beam.
@@ -438,138 +495,185 @@ def _mode_starts(modes: Iterable[ModeEstimate]) -> list[tuple[int, float, float]
     oscillating_modes = {mode.number: mode for mode in modes if mode.frequency_hz > 0}
     if not oscillating_modes:
         return []
-    numbers = range(1, max(oscillating_modes) + 1)
-    eigenvalues = clamped_free_eigenvalues(len(numbers)).tolist()
-    starts = []
-    for number in numbers:
-        mode = oscillating_modes.get(number)
+    mode_numbers = range(1, max(oscillating_modes) + 1)
+    beam_eigenvalues = clamped_free_eigenvalues(len(mode_numbers)).tolist()
+    mode_starts = []
+    for mode_number in mode_numbers:
+        mode = oscillating_modes.get(mode_number)
         if mode is not None:
-            starts.append((number, mode.frequency_hz, mode.damping_ratio))
+            mode_starts.append((mode_number, mode.frequency_hz, mode.damping_ratio))
             continue
-        nearest = min(oscillating_modes.values(), key=lambda each: abs(each.number - number))
-        frequency_ratio = (eigenvalues[number - 1] / eigenvalues[nearest.number - 1]) ** 2
-        starts.append((number, nearest.frequency_hz * frequency_ratio, _ROUGH_DAMPING_RATIO))
-    return starts
+        nearest_mode = min(
+            oscillating_modes.values(), key=lambda each: abs(each.number - mode_number)
+        )
+        frequency_ratio = (
+            beam_eigenvalues[mode_number - 1] / beam_eigenvalues[nearest_mode.number - 1]
+        ) ** 2
+        mode_starts.append(
+            (mode_number, nearest_mode.frequency_hz * frequency_ratio, _ROUGH_DAMPING_RATIO)
+        )
+    return mode_starts
 
 
-def _visible_mode_numbers(candidate_set: CandidateSet, modal: ModalFit | None) -> tuple[int, ...]:
-    """Return the numbers of the modes that a record shows."""
-    if modal is None:
+def _visible_mode_numbers(
+    candidate_set: CandidateSet, modal_fit: ModalFit | None
+) -> tuple[int, ...]:
+    """Return the numbers of the beam modes that are visible in a record, from 1."""
+    if modal_fit is None:
         return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
-    return modal.visible
+    return modal_fit.visible
 
 
 def _add_modal_model(
     exact_headline: Headline,
     measurement: Measurement,
-    modal: ModalFit | None,
-    test: UniformBeamTest | None,
-    doubt: str | None,
-    mode_doubt: str | None,
+    modal_fit: ModalFit | None,
+    uniform_beam_result: UniformBeamTest | None,
+    doubt_reason: str | None,
+    mode_doubt_reason: str | None,
 ) -> Headline:
     """Add the modal model and the estimates with tolerance to the headline of a uniform beam.
 
-    Return `exact_headline` if there is no modal model. `doubt` is the reason against every number,
-    and `mode_doubt` the reason against every mode. They are None if there is no such reason.
+    Return `exact_headline` if there is no modal model. `doubt_reason` is the reason against every
+    number, and `mode_doubt_reason` the reason against every mode. They are None if there is no such
+    reason.
     """
-    if modal is None or test is None:
+    if modal_fit is None or uniform_beam_result is None:
         return exact_headline
-    tolerant = None
+    estimate_with_tolerance = None
     if measurement.axis_tilt_deg:
         exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
-    if measurement.uniformity or test.status == "refused" or measurement.axis_tilt_deg:
-        tolerant = tolerant_estimate(
-            modal, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
+    if (
+        measurement.uniformity
+        or uniform_beam_result.status == "refused"
+        or measurement.axis_tilt_deg
+    ):
+        estimate_with_tolerance = tolerant_estimate(
+            modal_fit, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
         )
-    return replace_by_modal_model(exact_headline, modal, test, tolerant, doubt, mode_doubt)
+    return replace_by_modal_model(
+        exact_headline,
+        modal_fit,
+        uniform_beam_result,
+        estimate_with_tolerance,
+        doubt_reason,
+        mode_doubt_reason,
+    )
 
 
-def _uniform_beam_test(measurement: Measurement, modal: ModalFit | None) -> UniformBeamTest | None:
-    """Test whether a uniform beam predicts the modes. Return None without a modal model."""
-    if modal is None:
+def _uniform_beam_test(
+    measurement: Measurement, modal_fit: ModalFit | None
+) -> UniformBeamTest | None:
+    """Test whether a uniform beam predicts the measured modes. Return None without modal model."""
+    if modal_fit is None:
         return None
-    return uniform_beam_test(modal, measurement.nominal, measurement.axis_tilt_deg)
+    return uniform_beam_test(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
 
 
 def _explain_deviations(
-    measurement: Measurement, candidate_set: CandidateSet, modal: ModalFit, test: UniformBeamTest
+    measurement: Measurement,
+    candidate_set: CandidateSet,
+    modal_fit: ModalFit,
+    beam_test: UniformBeamTest,
 ) -> tuple[Finding, ...]:
     """Return a finding that names simple causes of the deviations from a uniform beam.
 
     Return no finding with only two modes, which leave no degree of freedom for this test.
     """
-    if len(modal.visible) <= _MODES_WITHOUT_REDUNDANCY:
+    if len(modal_fit.visible) <= _MODES_WITHOUT_REDUNDANCY:
         return ()
-    causes = explanations(modal, measurement.nominal, measurement.axis_tilt_deg)
+    deviation_causes = explanations(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
     stiffness_step = (
-        best_stiffness_step(candidate_set.comparison, modal)
+        best_stiffness_step(candidate_set.comparison, modal_fit)
         if measurement.is_single_sweep
         else None
     )
-    return (explanation_finding(test, causes, stiffness_step),)
+    return (explanation_finding(beam_test, deviation_causes, stiffness_step),)
 
 
 def _setting_findings(
-    candidate_set: CandidateSet, result: Headline, kinds: Collection[str]
+    candidate_set: CandidateSet, reported_headline: Headline, finding_kinds: Collection[str]
 ) -> tuple[Finding, ...]:
-    """Return findings on settings that differ from the file, if the record can show them."""
-    if "implausible" in kinds or len(result.visible_modes) < _MODES_WITHOUT_REDUNDANCY:
+    """Return findings on fitted settings, such as the delay, that differ from those in the file.
+
+    Return none if the record cannot show such a difference.
+    """
+    if (
+        "implausible" in finding_kinds
+        or len(reported_headline.visible_modes) < _MODES_WITHOUT_REDUNDANCY
+    ):
         return ()
-    return tuple(setting_findings(candidate_set, result))
+    return tuple(setting_findings(candidate_set, reported_headline))
 
 
 def _is_linear_and_constant(
-    candidate_set: CandidateSet, modal: ModalFit, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal_fit: ModalFit, band_hz: tuple[float, float]
 ) -> bool:
-    """Return whether noise and no harmonic remains, so that no other effect need be tested."""
-    _, _, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
-    return modal.explained and not any(each.present for each in harmonic_tests)
+    """Return whether the residual of the modal model is noise without harmonics of the sweep.
+
+    Then no nonlinear or time-varying effect need be tested.
+    """
+    _, _, harmonic_tests = _test_residual(candidate_set, modal_fit, band_hz)
+    return modal_fit.explained and not any(
+        harmonic_test.present for harmonic_test in harmonic_tests
+    )
 
 
 def _fit_further_effects(
-    linear: CandidateSet, *, test_amplitude_effects: bool
+    linear_candidates: CandidateSet, *, test_amplitude_effects: bool
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...], tuple[TemporalChange, ...]]:
-    """Test a record for nonlinear and time-varying effects, or for the latter alone.
+    """Test a record for nonlinear and time-varying effects.
 
-    Return the candidate set with the best explanation, its nonlinear forces, and its changes along
-    the record.
+    Nonlinear effects are only tested with `test_amplitude_effects`. Return the candidate set with
+    the best explanation, its nonlinear forces, and its changes along the record.
     """
     if not test_amplitude_effects:
-        candidate_set, changes = find_temporal_changes(linear.fit_with_free_orders())
-        return candidate_set, (), changes
-    candidate_set = linear if linear.misread else refit_with_air_drag(linear)
-    visible_numbers = visible_modes(linear.comparison, linear.noise, linear.best.fit)
-    candidate_set, forces = (
+        candidate_set, temporal_changes = find_temporal_changes(
+            linear_candidates.fit_with_free_orders()
+        )
+        return candidate_set, (), temporal_changes
+    candidate_set = (
+        linear_candidates if linear_candidates.misread else refit_with_air_drag(linear_candidates)
+    )
+    visible_numbers = visible_modes(
+        linear_candidates.comparison, linear_candidates.noise, linear_candidates.best.fit
+    )
+    candidate_set, nonlinear_forces = (
         (candidate_set, ())
         if candidate_set.misread
         else add_nonlinear_forces(candidate_set, visible_numbers)
     )
-    if forces and candidate_set.drag is not None:
+    if nonlinear_forces and candidate_set.drag is not None:
         # A stiffness that depends on the deflection may have been mistaken for weak drag.
-        without_drag, forces_without_drag = add_nonlinear_forces(linear, visible_numbers)
-        if forces_without_drag and without_drag.bic < candidate_set.bic:
-            candidate_set, forces = without_drag, forces_without_drag
-    candidate_set, changes = find_temporal_changes(candidate_set.fit_with_free_orders())
-    is_single_sweep = linear.comparison.measurement.is_single_sweep
-    if not is_single_sweep and (forces or candidate_set.drag is not None):
-        # A change along the record may have been mistaken for a dependence on the amplitude.
-        with_changes, other_changes = find_temporal_changes(
-            linear.fit_with_free_orders(), rival_bic=candidate_set.bic
+        drag_free_candidates, drag_free_forces = add_nonlinear_forces(
+            linear_candidates, visible_numbers
         )
-        if other_changes and with_changes.bic < candidate_set.bic:
-            return with_changes, (), other_changes
-    return candidate_set, forces, changes
+        if drag_free_forces and drag_free_candidates.bic < candidate_set.bic:
+            candidate_set, nonlinear_forces = drag_free_candidates, drag_free_forces
+    candidate_set, temporal_changes = find_temporal_changes(candidate_set.fit_with_free_orders())
+    is_single_sweep = linear_candidates.comparison.measurement.is_single_sweep
+    if not is_single_sweep and (nonlinear_forces or candidate_set.drag is not None):
+        # A change along the record may have been mistaken for a dependence on the amplitude.
+        candidates_with_changes, other_changes = find_temporal_changes(
+            linear_candidates.fit_with_free_orders(), rival_bic=candidate_set.bic
+        )
+        if other_changes and candidates_with_changes.bic < candidate_set.bic:
+            return candidates_with_changes, (), other_changes
+    return candidate_set, nonlinear_forces, temporal_changes
 
 
 def _likely_stiffness_step(
-    linear: CandidateSet, modal: ModalFit, small_linear_effect: SmallEffect | None
+    linear_candidates: CandidateSet, modal_fit: ModalFit, small_linear_effect: SmallEffect | None
 ) -> StiffnessStep | None:
-    """Return the step of the stiffness if it explains more than any effect of the amplitude."""
-    stiffness_step = best_stiffness_step(linear.comparison, modal)
-    rival_reduction = 0.0 if small_linear_effect is None else small_linear_effect.saved
+    """Return the step of the stiffness in time that best explains the residual.
+
+    Return None if the small nonlinear effect explains more.
+    """
+    stiffness_step = best_stiffness_step(linear_candidates.comparison, modal_fit)
+    rival_deviance_reduction = 0.0 if small_linear_effect is None else small_linear_effect.saved
     return (
         stiffness_step
-        if stiffness_step.score > max(rival_reduction, LARGE_DEVIANCE_REDUCTION)
+        if stiffness_step.score > max(rival_deviance_reduction, LARGE_DEVIANCE_REDUCTION)
         else None
     )
 
@@ -613,126 +717,165 @@ def fit_freest_alone(
 def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
-    """Fit only the freest structure to a record whose known impacts are part of the measurement."""
-    misread = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
-    additional = () if misread else (ORDER_ONE_STRUCTURE,)
+    """Fit the structure with most free parameters, with the impacts that the measurement states."""
+    misread_findings = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
+    additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
-        CandidateSet.fit_freest_structure(measurement, (), band_hz, additional), misread=misread
+        CandidateSet.fit_freest_structure(measurement, (), band_hz, additional_structures),
+        misread=misread_findings,
     )
-    if not misread:
+    if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()
-    modal = _fit_modal_model(candidate_set)
-    visible_numbers = _visible_mode_numbers(candidate_set, modal)
-    whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal, band_hz)
+    modal_fit = _fit_modal_model(candidate_set)
+    visible_numbers = _visible_mode_numbers(candidate_set, modal_fit)
+    whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal_fit, band_hz)
     all_findings = findings(candidate_set, (), harmonic_tests)
-    kinds = {finding.kind for finding in all_findings}
-    explained = whiteness_test.white and not input_test.related
-    model_reason = _wrong_model_reason(kinds, explained=explained)
-    result = headline_of_fit(
+    finding_kinds = {finding.kind for finding in all_findings}
+    residual_explained = whiteness_test.white and not input_test.related
+    model_reason = _wrong_model_reason(finding_kinds, residual_explained=residual_explained)
+    reported_headline = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
         visible_numbers,
-        {} if misread else _unidentifiable_orders(candidate_set, visible_numbers),
+        {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
         unexplained=model_reason,
-        both=None if misread else candidate_set.fit_with_both_dampings(candidate_set.best),
+        both=None if misread_findings else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
-    doubt = model_reason or (_CLIPPED_TORQUE_REASON if "clipping" in kinds else None)
-    beam_test = _uniform_beam_test(measurement, modal)
-    result = _add_modal_model(result, measurement, modal, beam_test, doubt, doubt)
+    doubt_reason = model_reason or (_CLIPPED_TORQUE_REASON if "clipping" in finding_kinds else None)
+    beam_test = _uniform_beam_test(measurement, modal_fit)
+    reported_headline = _add_modal_model(
+        reported_headline, measurement, modal_fit, beam_test, doubt_reason, doubt_reason
+    )
     if model_reason == CONTRADICTED_FILE_REASON:
-        all_findings = tuple(each for each in all_findings if each.kind in _CHANNEL_KINDS)
+        all_findings = tuple(
+            candidate for candidate in all_findings if candidate.kind in _CHANNEL_KINDS
+        )
     else:
-        all_findings += _setting_findings(candidate_set, result, kinds)
+        all_findings += _setting_findings(candidate_set, reported_headline, finding_kinds)
         all_findings = _mark_doubtful_findings(
-            all_findings, (), model_reason, doubt, result.flags, explained=explained
+            all_findings,
+            (),
+            model_reason,
+            doubt_reason,
+            reported_headline.flags,
+            only_harmonics_remain=residual_explained,
         )
         all_findings = _add_impacts_and_unexplained(
             candidate_set, all_findings, whiteness_test, input_test
         )
-    result = result.doubted(_CLIPPED_TORQUE_REASON) if "clipping" in kinds else result
+    reported_headline = (
+        reported_headline.doubted(_CLIPPED_TORQUE_REASON)
+        if "clipping" in finding_kinds
+        else reported_headline
+    )
     other_fits = (
-        each.fit for each in candidate_set.candidates if each.structure is ORDER_ONE_STRUCTURE
+        candidate.fit
+        for candidate in candidate_set.candidates
+        if candidate.structure is ORDER_ONE_STRUCTURE
     )
-    analysis = RecordAnalysis.of(
-        (result.fit, *other_fits), candidate_set.noise, candidate_set.comparison
+    record_analysis = RecordAnalysis.of(
+        (reported_headline.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
-    return _Assessment((result, all_findings, analysis), candidate_set, explained, kinds)
+    return _Assessment(
+        (reported_headline, all_findings, record_analysis),
+        candidate_set,
+        residual_explained,
+        finding_kinds,
+    )
 
 
 def _unidentifiable_orders(
     candidate_set: CandidateSet, visible_numbers: tuple[int, ...]
 ) -> dict[str, str]:
-    """Return the orders that the fit of the freest structure does not determine, with reasons."""
-    freest, *other_candidates = candidate_set.candidates
-    reason = not_reported_reason(candidate_set, visible_numbers)
-    reasons = {}
-    for name in COEFFICIENT_OF.keys() & set(freest.structure.free):
-        low, high = freest.fit.interval[name] or (-math.inf, math.inf)
-        interval_too_wide = high - low > MAX_IDENTIFIABLE_FRACTION * (
+    """Return why an order is not determined, for each order that the record does not determine.
+
+    The fit is that of the structure with most free parameters.
+    """
+    freest_candidate, *other_candidates = candidate_set.candidates
+    common_reason = not_reported_reason(candidate_set, visible_numbers)
+    order_reasons = {}
+    for order_name in COEFFICIENT_OF.keys() & set(freest_candidate.structure.free):
+        low, upper_end = freest_candidate.fit.interval[order_name] or (-math.inf, math.inf)
+        is_interval_too_wide = upper_end - low > MAX_IDENTIFIABLE_FRACTION * (
             ORDER_RANGE[1] - ORDER_RANGE[0]
         )
         # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
-        at_local_minimum = not low <= 1 <= high and any(
-            each.structure.fixed.get(name) == 1.0  # type: ignore[call-overload]
-            and each.deviance - freest.deviance < NORMAL_95**2
-            for each in other_candidates
+        has_other_minimum = not low <= 1 <= upper_end and any(
+            other_candidate.structure.fixed.get(order_name) == 1.0  # type: ignore[call-overload]
+            and other_candidate.deviance - freest_candidate.deviance < NORMAL_95**2
+            for other_candidate in other_candidates
         )
         if (
-            reason
-            or interval_too_wide
-            or at_local_minimum
-            or freest.fit.interval[COEFFICIENT_OF[name]] is None
+            common_reason
+            or is_interval_too_wide
+            or has_other_minimum
+            or freest_candidate.fit.interval[COEFFICIENT_OF[order_name]] is None
         ):
-            reasons[name] = reason or ORDER_NOT_DETERMINED_REASON
-    return reasons
+            order_reasons[order_name] = common_reason or ORDER_NOT_DETERMINED_REASON
+    return order_reasons
 
 
-def _wrong_model_reason(kinds: Collection[str], *, explained: bool) -> str | None:
-    """Return the reason why findings or residual refute the model, or None if they do not."""
-    if not _CONTRADICTING_KINDS.isdisjoint(kinds):
+def _wrong_model_reason(finding_kinds: Collection[str], *, residual_explained: bool) -> str | None:
+    """Return why the findings or the residual refute the fitted model, or None if they do not."""
+    if not _CONTRADICTING_KINDS.isdisjoint(finding_kinds):
         return CONTRADICTED_FILE_REASON
-    return UNEXPLAINED_REASON if "harmonics" in kinds or not explained else None
+    return UNEXPLAINED_REASON if "harmonics" in finding_kinds or not residual_explained else None
 
 
-def _doubt_reason(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> str | None:
+def _doubt_reason(
+    temporal_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+) -> str | None:
     """Return why changes along the record make every parameter doubtful, or None if they do not.
 
     With a change along the record, the mode parameters are those at the time when the sweep passed
     each mode.
     """
-    if established(changes, is_single_sweep=is_single_sweep):
+    if established(temporal_changes, is_single_sweep=is_single_sweep):
         return None
-    return next((f"{change.name} would explain the record as well" for change in changes), None)
+    return next(
+        (
+            f"{first_change.name} would explain the record as well"
+            for first_change in temporal_changes
+        ),
+        None,
+    )
 
 
 def _mark_doubtful_findings(
     fitted_findings: tuple[Finding, ...],
     change_findings: tuple[Finding, ...],
     model_reason: str | None,
-    doubt: str | None,
-    flags: Mapping[str, str],
+    doubt_reason: str | None,
+    parameter_flags: Mapping[str, str],
     *,
-    explained: bool,
+    only_harmonics_remain: bool,
 ) -> tuple[Finding, ...]:
     """Return all findings, with the doubtful ones marked as not established.
 
     `fitted_findings` are effects that were fitted with the beam. `change_findings` are changes
     along the record, which already state their certainty. `model_reason` is the reason against the
-    model, `doubt` the reason against all numbers, and `flags` are the reasons against single
-    parameters. `explained` states that harmonics are all that remains.
+    model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the reasons
+    against single parameters. With `only_harmonics_remain` the finding on harmonics is established.
     """
 
-    def qualified(each: Finding) -> Finding:
+    def qualified(finding: Finding) -> Finding:
         """Mark a finding as not established if a reason against it exists."""
-        flag = next((flags[name] for name in each.parameters if name in flags), None)
-        reason = doubt or flag
-        if reason is None or (each.kind == "harmonics" and explained):
-            return each
-        return doubted(each, reason)
+        parameter_flag = next(
+            (
+                parameter_flags[parameter_name]
+                for parameter_name in finding.parameters
+                if parameter_name in parameter_flags
+            ),
+            None,
+        )
+        finding_reason = doubt_reason or parameter_flag
+        if finding_reason is None or (finding.kind == "harmonics" and only_harmonics_remain):
+            return finding
+        return doubted(finding, finding_reason)
 
     fitted_findings = tuple(map(qualified, fitted_findings))
     if model_reason is not None:
-        change_findings = tuple(doubted(each, model_reason) for each in change_findings)
+        change_findings = tuple(doubted(finding, model_reason) for finding in change_findings)
     return (*fitted_findings, *change_findings)
 
 
@@ -743,14 +886,14 @@ def _add_impacts_and_unexplained(
     input_test: InputRelation,
     stiffness_step: StiffnessStep | None = None,
 ) -> tuple[Finding, ...]:
-    """Add impacts before the other findings, and the unexplained residual after them."""
-    explained = whiteness_test.white and not input_test.related
+    """Return the findings on impacts, those of the model, and that on an unexplained residual."""
+    residual_explained = whiteness_test.white and not input_test.related
     findings_of_impacts = impact_findings(
-        candidate_set.comparison.measurement.knocks, explained=explained
+        candidate_set.comparison.measurement.knocks, explained=residual_explained
     )
     unexplained_findings = (
         ()
-        if explained
+        if residual_explained
         else (
             unexplained(whiteness_test, input_test, candidate_set.best.fit.modes, stiffness_step),
         )
@@ -759,34 +902,37 @@ def _add_impacts_and_unexplained(
 
 
 def _test_residual(
-    candidate_set: CandidateSet, modal: ModalFit | None, band_hz: tuple[float, float]
+    candidate_set: CandidateSet, modal_fit: ModalFit | None, band_hz: tuple[float, float]
 ) -> tuple[Whiteness, InputRelation, tuple[Harmonic, ...]]:
-    """Test the residual of the modal model, or of the first candidate if there is none."""
+    """Test whether the residual is white, follows the angle, or has harmonics of the sweep.
+
+    This is the residual of the modal model, or that of the first candidate without such a model.
+    """
     comparison, compared_bins = candidate_set.comparison, candidate_set.noise.counts
-    residual = candidate_set.best.fit.residual if modal is None else modal.residual
+    modal_residual = candidate_set.best.fit.residual if modal_fit is None else modal_fit.residual
     angle_rad = comparison.angle_rad[comparison.retained]
-    unit_variance_residual = comparison.in_time(residual) * math.sqrt(comparison.samples / 2)
+    unit_variance_residual = comparison.in_time(modal_residual) * math.sqrt(comparison.samples / 2)
     harmonic_tests = harmonics(
         angle_rad, unit_variance_residual, comparison.decimation.rate_hz, band_hz
     )
-    if modal is not None:
-        return modal.whiteness, modal.input_relation, harmonic_tests
+    if modal_fit is not None:
+        return modal_fit.whiteness, modal_fit.input_relation, harmonic_tests
     return (
-        whiteness(residual[compared_bins], comparison.frequency_hz[compared_bins]),
-        input_relation(residual, comparison.spectrum(angle_rad), comparison.frequency_hz),
+        whiteness(modal_residual[compared_bins], comparison.frequency_hz[compared_bins]),
+        input_relation(modal_residual, comparison.spectrum(angle_rad), comparison.frequency_hz),
         harmonic_tests,
     )
 
 
 def _candidate_table(candidate_set: CandidateSet) -> tuple[CandidateRow, ...]:
-    """Return one table row for each candidate, the one with the lowest BIC first."""
-    best, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
+    """Return the table of candidates: cost, BIC and AIC of each, the lowest BIC first."""
+    best_candidate, least_aic = candidate_set.best, min(c.aic for c in candidate_set.candidates)
     return tuple(
         CandidateRow(
             structure=c.structure.name,
             parameters=c.parameters,
             cost=c.fit.cost,
-            delta_bic=c.bic - best.bic,
+            delta_bic=c.bic - best_candidate.bic,
             delta_aic=c.aic - least_aic,
         )
         for c in candidate_set.candidates

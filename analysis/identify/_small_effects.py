@@ -68,16 +68,16 @@ class SmallEffect:
 
     @property
     def linear(self) -> bool:
-        """Return whether the torque by this effect is exact to first order in its size."""
+        """Return whether the torque by this effect is proportional to the size of the effect."""
         return self.kind in _EXACT_KINDS
 
     @property
     def large(self) -> bool:
-        """Return whether the effect is so large that it needs a model of its own."""
+        """Return whether the nonlinear effect is so large that it needs a model of its own."""
         return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
 
     def finding(self) -> Finding:
-        """Return the finding that names the effect as not established."""
+        """Return the finding that this effect is possible, but not established."""
         return Finding(
             kind=self.kind,
             sentence=(
@@ -94,52 +94,60 @@ def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> Small
 
     The effects are computed for the motion of `plant`, a beam close to the modal model.
     """
-    effects = list(_possible_effects(comparison, modal, plant))
-    reductions = modal.cost_reduction_by_spectrum(np.array([column for _, _, column in effects]))
-    best_index = int(np.argmax(reductions))
-    if reductions[best_index] < MIN_DEVIANCE_REDUCTION:
+    possible_effects = list(_possible_effects(comparison, modal, plant))
+    cost_reductions = modal.cost_reduction_by_spectrum(
+        np.array([torque_spectrum for _, _, torque_spectrum in possible_effects])
+    )
+    best_index = int(np.argmax(cost_reductions))
+    if cost_reductions[best_index] < MIN_DEVIANCE_REDUCTION:
         return None
-    kind, words, column = effects[best_index]
-    return SmallEffect(kind, words, column, float(reductions[best_index]))
+    finding_kind, effect_words, torque_spectrum = possible_effects[best_index]
+    return SmallEffect(
+        finding_kind, effect_words, torque_spectrum, float(cost_reductions[best_index])
+    )
 
 
 def _possible_effects(
     comparison: Comparison, modal: ModalFit, plant: Plant
 ) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
     """Yield kind, description and torque spectrum, shape (K,), of each possible small effect."""
-    forces = NonlinearForceSpectra(comparison, plant)
-    for mode in modal.visible:
+    force_spectra = NonlinearForceSpectra(comparison, plant)
+    for mode_number in modal.visible:
         yield (
             "nonlinear stiffness",
-            f"A stiffness of mode {mode} that depends on the deflection",
-            forces.column(NonlinearTerm("cubic stiffness", mode)),
+            f"A stiffness of mode {mode_number} that depends on the deflection",
+            force_spectra.column(NonlinearTerm("cubic stiffness", mode_number)),
         )
         yield (
             "nonlinear stiffness",
-            f"A stiffness of mode {mode} that differs from side to side",
-            forces.column(NonlinearTerm("quadratic stiffness", mode)),
+            f"A stiffness of mode {mode_number} that differs from side to side",
+            force_spectra.column(NonlinearTerm("quadratic stiffness", mode_number)),
         )
-    (drag,) = small_drag_spectrum(comparison, plant)
-    yield "air drag", "Air drag", drag
+    (drag_spectrum,) = small_drag_spectrum(comparison, plant)
+    yield "air drag", "Air drag", drag_spectrum
     yield (
         "play",
         "Backlash between encoder and beam",
         play_spectrum(comparison, plant) / UNIT_PLAY_RAD,
     )
     yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
-    torque = comparison.prediction.torque(modal.model)[0]
-    largest = float(np.abs(torque).max())
-    if largest > 0 and math.isfinite(largest):
-        for power, description in ((3, "A gain of the torque that depends on its size"),
+    model_torque_nm = comparison.prediction.torque(modal.model)[0]
+    largest_torque_nm = float(np.abs(model_torque_nm).max())
+    if largest_torque_nm > 0 and math.isfinite(largest_torque_nm):
+        for force_power, effect_words in ((3, "A gain of the torque that depends on its size"),
                              (2, "A gain of the torque that depends on its sign")):  # fmt: skip
-            column = comparison.spectrum(torque * (torque / largest) ** (power - 1))
-            yield "nonlinear gain", description, column
+            torque_spectrum = comparison.spectrum(
+                model_torque_nm * (model_torque_nm / largest_torque_nm) ** (force_power - 1)
+            )
+            yield "nonlinear gain", effect_words, torque_spectrum
 
 
 def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:
     """Return the torque spectrum of a dry friction of 1 N·m against the motion, (K,)."""
     measurement = comparison.measurement
-    angle = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
-    speed = np.gradient(angle) * measurement.rate_hz
-    torque = comparison.decimation.apply(speed / np.hypot(speed, _FRICTION_SPEED_RAD_S))
-    return comparison.spectrum(torque[comparison.retained])
+    angle_rad = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
+    speed_rad_s = np.gradient(angle_rad) * measurement.rate_hz
+    friction_torque = comparison.decimation.apply(
+        speed_rad_s / np.hypot(speed_rad_s, _FRICTION_SPEED_RAD_S)
+    )
+    return comparison.spectrum(friction_torque[comparison.retained])

@@ -61,20 +61,20 @@ class StiffnessStep:
 
     @property
     def named(self) -> bool:
-        """Return whether the step explains more of the residual than chance would."""
+        """Return whether the step is significant: its score is above `MIN_REPORTED_SCORE`."""
         return self.score > MIN_REPORTED_SCORE
 
     @property
     def words(self) -> str:
-        """Return the step in words, as part of a sentence."""
-        change = float(f"{100 * self.relative_change:.1g}")
+        """Return size and time of the stiffness step in words, as part of a sentence."""
+        percent = float(f"{100 * self.relative_change:.1g}")
         return (
-            f"a step of the stiffness by about {change:+g} % near {self.instant_s:.0f} s (each "
+            f"a step of the stiffness by about {percent:+g} % near {self.instant_s:.0f} s (each "
             "mode is then what it was when it was passed)"
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return the step as a JSON-ready dict."""
+        """Return the stiffness step as a dict for JSON."""
         return {
             "name": "step in time",
             "score": self.score,
@@ -85,70 +85,83 @@ class StiffnessStep:
 
 def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
     """Return the stiffness step that best explains the residual of the modal model."""
-    residual = fit.residual.view(np.float64)
+    real_residual = fit.residual.view(np.float64)
     step_torque = _StiffnessStepTorque(comparison, fit)
-    best_step, instants = (
+    best_step, sample_indices = (
         StiffnessStep(0.0, 0.0, 0.0),
         np.linspace(0, comparison.samples, _COARSE_INSTANTS + 2)[1:-1],
     )
-    spacing = float(instants[1] - instants[0])
+    instant_spacing = float(sample_indices[1] - sample_indices[0])
     for _ in range(2):
-        spectra = np.array([step_torque.spectrum(int(instant)) for instant in instants])
-        whitened_spectra = np.ascontiguousarray(spectra * fit.noise.weight).view(np.float64)
-        whitened_spectra = whitened_spectra - (whitened_spectra @ fit.span.T) @ fit.span
-        squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
-        squares[squares == 0] = np.inf
-        correlation = -(whitened_spectra @ residual)  # the residual is model less measurement
-        scores = correlation**2 / squares
-        best_index = int(np.argmax(scores))
-        if scores[best_index] > best_step.score:
-            best_step = StiffnessStep(
-                score=float(scores[best_index]),
-                instant_s=comparison.first_s
-                + float(instants[best_index]) / comparison.decimation.rate_hz,
-                relative_change=float(correlation[best_index] / squares[best_index]),
-            )
-        instants = (
-            instants[best_index]
-            + spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
+        step_spectra = np.array(
+            [step_torque.spectrum(int(sample_index)) for sample_index in sample_indices]
         )
-        instants = instants[(instants > 0) & (instants < comparison.samples)]
+        whitened_spectra = np.ascontiguousarray(step_spectra * fit.noise.weight).view(np.float64)
+        whitened_spectra = whitened_spectra - (whitened_spectra @ fit.span.T) @ fit.span
+        spectrum_squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
+        spectrum_squares[spectrum_squares == 0] = np.inf
+        correlation = -(whitened_spectra @ real_residual)  # the residual is model less measurement
+        deviance_reductions = correlation**2 / spectrum_squares
+        best_index = int(np.argmax(deviance_reductions))
+        if deviance_reductions[best_index] > best_step.score:
+            best_step = StiffnessStep(
+                score=float(deviance_reductions[best_index]),
+                instant_s=comparison.first_s
+                + float(sample_indices[best_index]) / comparison.decimation.rate_hz,
+                relative_change=float(correlation[best_index] / spectrum_squares[best_index]),
+            )
+        sample_indices = (
+            sample_indices[best_index]
+            + instant_spacing * np.linspace(-1, 1, 2 * _FINE_INSTANTS_PER_SIDE + 3)[1:-1]
+        )
+        sample_indices = sample_indices[
+            (sample_indices > 0) & (sample_indices < comparison.samples)
+        ]
     return best_step
 
 
 class _StiffnessStepTorque:
-    """Torque change of the modal model by a stiffness that is higher from an instant on."""
+    """Computation of the torque change if the stiffness of the modal model rises at an instant."""
 
     def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
         self._comparison = comparison
-        count, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-        self._length = fast_length(math.ceil(_PADDING_RATIO * count))
-        sigma = _DECAY_EXPONENT * rate_hz / self._length
-        s = sigma + 2j * np.pi * rate_hz / self._length * np.arange(self._length // 2 + 1)
-        self._decay = np.exp(-sigma * np.arange(count) / rate_hz)
-        angle = np.fft.rfft(comparison.angle_rad * self._decay, self._length)
-        vibrations, torque_per_force = [], []
-        for number, pole, residue in zip(
+        sample_count, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
+        self._length = fast_length(math.ceil(_PADDING_RATIO * sample_count))
+        decay_rate = _DECAY_EXPONENT * rate_hz / self._length
+        s = decay_rate + 2j * np.pi * rate_hz / self._length * np.arange(self._length // 2 + 1)
+        self._decay = np.exp(-decay_rate * np.arange(sample_count) / rate_hz)
+        angle_transform = np.fft.rfft(comparison.angle_rad * self._decay, self._length)
+        mode_vibrations, torque_per_force = [], []
+        for mode_index, pole, residue in zip(
             fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
         ):
-            if number:
+            if mode_index:
                 # The mode adds inertia s⁴ / (s² + 2 xi omega s + omega²) to G, without constants.
-                omega_squared, inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
+                omega_squared, modal_inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
                 mode_response = s * s / (s * s - 2 * pole.real * s + omega_squared)
-                vibrations.append(np.fft.irfft(angle * mode_response, self._length)[:count])
+                mode_vibrations.append(
+                    np.fft.irfft(angle_transform * mode_response, self._length)[:sample_count]
+                )
                 phase_factor = residue / (1j * abs(residue))
-                torque_per_force.append(phase_factor * inertia * omega_squared * mode_response)
-        self._vibrations, self._torque_per_force = np.array(vibrations), np.array(torque_per_force)
+                torque_per_force.append(
+                    phase_factor * modal_inertia * omega_squared * mode_response
+                )
+        self._vibrations, self._torque_per_force = (
+            np.array(mode_vibrations),
+            np.array(torque_per_force),
+        )
 
-    def spectrum(self, instant: int) -> NDArray[np.complex128]:
+    def spectrum(self, sample_index: int) -> NDArray[np.complex128]:
         """Return the torque spectrum of a step per unit relative change, shape (K,).
 
-        `instant` is the index of the sample at which the stiffness steps.
+        `sample_index` is the index of the sample at which the stiffness steps.
         """
-        retained = self._comparison.retained
+        retained_samples = self._comparison.retained
         later_vibrations = self._vibrations.copy()
-        later_vibrations[:, : retained.start + instant] = 0.0
-        forces = np.fft.rfft(later_vibrations, self._length)
-        torque = np.fft.irfft(np.sum(forces * self._torque_per_force, axis=0), self._length)
-        torque = torque[: self._decay.size] / self._decay
-        return self._comparison.spectrum(torque[retained])
+        later_vibrations[:, : retained_samples.start + sample_index] = 0.0
+        force_transforms = np.fft.rfft(later_vibrations, self._length)
+        growing_torque = np.fft.irfft(
+            np.sum(force_transforms * self._torque_per_force, axis=0), self._length
+        )
+        growing_torque = growing_torque[: self._decay.size] / self._decay
+        return self._comparison.spectrum(growing_torque[retained_samples])

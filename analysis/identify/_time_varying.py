@@ -89,7 +89,7 @@ _SIZE_TOLERANCE: Final = 0.01
 
 @dataclass(frozen=True, slots=True)
 class TemporalChange:
-    """Change of one property along the record, or backlash, with its estimated size.
+    """Change of a property of the rig during the record, or backlash, with its estimated size.
 
     Attributes
     ----------
@@ -109,12 +109,12 @@ class TemporalChange:
 
     @property
     def name(self) -> str:
-        """Return the effect in words, as the beginning of a sentence."""
+        """Return the change in words, as the beginning of a sentence."""
         return _EFFECT_NAMES[self.what]
 
     @property
     def certain(self) -> bool:
-        """Return whether no model without this effect explains the record as well."""
+        """Return whether no model without this change explains the record as well."""
         return self.bic_difference < -BIC_DECISIVE
 
 
@@ -135,49 +135,60 @@ def find_temporal_changes(
     )
     fitted_changes: dict[Effect, tuple[float, Refit]] = {}
     for candidate in _candidates_to_test(candidate_set):
-        for effect, predicted_bic in _promising_changes(
+        for changing_property, predicted_bic in _promising_changes(
             candidate_set, candidate, play_angle, highest_bic
         ):
-            if predicted_bic < fitted_changes.get(effect, (math.inf,))[0]:
-                refit, bic = _fit_with_change(candidate_set, candidate, effect, play_angle)
-                if bic < fitted_changes.get(effect, (math.inf,))[0]:
-                    fitted_changes[effect] = (bic, refit)
+            if predicted_bic < fitted_changes.get(changing_property, (math.inf,))[0]:
+                best_refit, bic = _fit_with_change(
+                    candidate_set, candidate, changing_property, play_angle
+                )
+                if bic < fitted_changes.get(changing_property, (math.inf,))[0]:
+                    fitted_changes[changing_property] = (bic, best_refit)
     possible_changes = []
-    for effect, (bic, refit) in fitted_changes.items():
-        amplitudes, std = refit.amplitudes()
-        unit = _SIZE_UNITS.get(effect, 1.0)
-        change = TemporalChange(
-            effect,
-            unit * float(amplitudes[-1]),
-            unit * float(std[-1]),
+    for changing_property, (bic, best_refit) in fitted_changes.items():
+        size_factors, std = best_refit.amplitudes()
+        size_unit = _SIZE_UNITS.get(changing_property, 1.0)
+        temporal_change = TemporalChange(
+            changing_property,
+            size_unit * float(size_factors[-1]),
+            size_unit * float(std[-1]),
             bic - candidate_set.best.bic,
         )
-        if change.bic_difference < BIC_DECISIVE and _has_possible_size(change):
-            possible_changes.append((change, refit))
+        if temporal_change.bic_difference < BIC_DECISIVE and _has_possible_size(temporal_change):
+            possible_changes.append((temporal_change, best_refit))
     possible_changes.sort(key=lambda pair: pair[0].bic_difference)
     if not possible_changes:
         return candidate_set, ()
-    best_change, refit = possible_changes[0]
-    changes = tuple(
+    best_change, best_refit = possible_changes[0]
+    equivalent_changes = tuple(
         c
         for c, _ in possible_changes
         if c.bic_difference < best_change.bic_difference + BIC_DECISIVE
     )
-    if not best_change.certain or len(changes) > 1:
-        return candidate_set, changes
-    return candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise()), changes
+    if not best_change.certain or len(equivalent_changes) > 1:
+        return candidate_set, equivalent_changes
+    return candidate_set.refit_with_effect_spectra(
+        best_refit.columns, best_refit.residual_noise()
+    ), equivalent_changes
 
 
-def _has_possible_size(change: TemporalChange) -> bool:
+def _has_possible_size(temporal_change: TemporalChange) -> bool:
     """Return whether the size of a change is possible.
 
     Backlash is positive, and other changes are below 100 %.
     """
-    return change.size > 0 if change.what == "play" else abs(change.size) < 1
+    return (
+        temporal_change.size > 0
+        if temporal_change.what == "play"
+        else abs(temporal_change.size) < 1
+    )
 
 
 def _candidates_to_test(candidate_set: CandidateSet) -> Iterator[Candidate]:
-    """Yield the candidates that are tested with a change along the record, the best one first."""
+    """Yield the fitted structures that are tested with a change along the record.
+
+    The best one is first.
+    """
     yield candidate_set.best
     for candidate in candidate_set.candidates[1:]:
         if candidate.structure in _STRUCTURES_TO_TEST:
@@ -194,60 +205,71 @@ def _promising_changes(
 
     A change must reduce the deviance significantly, and its BIC must be below `highest_bic`.
     """
-    refit = candidate_set.refit(candidate, 1)
-    columns = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
-    reductions = refit.cost_reduction_by_spectrum(np.array(list(columns.values())))
-    for effect, reduction in zip(columns, reductions.tolist(), strict=True):
-        remaining_cost = max(refit.cost - reduction, 1e-3 * refit.cost)
-        deviance_reduction = candidate.values * math.log(refit.cost / remaining_cost)
+    candidate_refit = candidate_set.refit(candidate, 1)
+    effect_spectra = _torque_spectra(candidate_set.comparison, candidate.fit.plant, play_angle)
+    cost_reductions = candidate_refit.cost_reduction_by_spectrum(
+        np.array(list(effect_spectra.values()))
+    )
+    for changing_property, cost_reduction in zip(
+        effect_spectra, cost_reductions.tolist(), strict=True
+    ):
+        remaining_cost = max(candidate_refit.cost - cost_reduction, 1e-3 * candidate_refit.cost)
+        deviance_reduction = candidate.values * math.log(candidate_refit.cost / remaining_cost)
         bic = candidate.bic - deviance_reduction + math.log(candidate.values)
         if deviance_reduction > _MIN_DEVIANCE_REDUCTION and bic < highest_bic:
-            yield effect, bic
+            yield changing_property, bic
 
 
 def _fit_with_change(
     candidate_set: CandidateSet,
     candidate: Candidate,
-    effect: Effect,
+    changing_property: Effect,
     play_angle: NDArray[np.float64],
 ) -> tuple[Refit, float]:
     """Fit a candidate with one change along the record. Return the fit and its BIC."""
-    refit = candidate_set.refit(candidate, 1)
-    unknowns = refit.objective.unknowns
-    size = 0.0
+    change_refit = candidate_set.refit(candidate, 1)
+    beam_unknowns = change_refit.objective.unknowns
+    change_size = 0.0
     for _ in range(_MAX_SIZE_FITS):
-        column = _torque_spectrum(candidate_set.comparison, refit.plant, play_angle, effect, size)
-        columns = np.concatenate([candidate_set.columns, column[None]])
-        cost_before = refit.cost
-        refit = Refit.descend(
+        change_spectrum = _torque_spectrum(
+            candidate_set.comparison, change_refit.plant, play_angle, changing_property, change_size
+        )
+        added_spectra = np.concatenate([candidate_set.columns, change_spectrum[None]])
+        cost_before = change_refit.cost
+        change_refit = Refit.descend(
             candidate_set.comparison,
-            unknowns,
-            refit.x,
+            beam_unknowns,
+            change_refit.x,
             candidate_set.noise,
-            columns,
+            added_spectra,
             max_evaluations=DESCENT_EVALUATIONS,
         )
-        previous_size, size = size, float(refit.amplitudes()[0][-1])
-        converged = abs(size - previous_size) < _SIZE_TOLERANCE * abs(size)
-        if converged and abs(candidate.values * math.log(cost_before / refit.cost)) < 1:
+        previous_size, change_size = change_size, float(change_refit.amplitudes()[0][-1])
+        is_converged = abs(change_size - previous_size) < _SIZE_TOLERANCE * abs(change_size)
+        if is_converged and abs(candidate.values * math.log(cost_before / change_refit.cost)) < 1:
             break
-    deviance = candidate.values * math.log(refit.cost / candidate.values)
-    return refit, deviance + (candidate.parameters + 1) * math.log(candidate.values)
+    refit_deviance = candidate.values * math.log(change_refit.cost / candidate.values)
+    return change_refit, refit_deviance + (candidate.parameters + 1) * math.log(candidate.values)
 
 
 def _torque_spectra(
     comparison: Comparison, plant: Plant, play_angle: NDArray[np.float64]
 ) -> dict[Effect, NDArray[np.complex128]]:
-    """Return the torque spectrum of each effect per unit size, each of shape (K,)."""
-    slopes = _torque_slopes(comparison, plant)
+    """Return the torque spectrum of each possible change per unit of its size, each (K,)."""
+    torque_slopes = _torque_slopes(comparison, plant)
     return {
-        effect: _torque_spectrum(comparison, plant, play_angle, effect, 0.0, slopes)
-        for effect in _EFFECT_NAMES
+        changing_property: _torque_spectrum(
+            comparison, plant, play_angle, changing_property, 0.0, torque_slopes
+        )
+        for changing_property in _EFFECT_NAMES
     }
 
 
 def _torque_slopes(comparison: Comparison, plant: Plant) -> dict[Effect, NDArray[np.float64]]:
-    """Return the torque per relative change of damping, stiffness and gain, each (samples,)."""
+    """Return the torque change in N·m per relative change of damping, stiffness and gain.
+
+    Each has the shape (samples,).
+    """
     _, (by_zeta, by_gamma, by_gain, by_density_over_stiffness) = comparison.prediction.torque(
         plant, _GRADIENT_PARAMETERS
     )
@@ -262,63 +284,68 @@ def _torque_spectrum(
     comparison: Comparison,
     plant: Plant,
     play_angle: NDArray[np.float64],
-    effect: Effect,
-    size: float,
-    slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
+    changing_property: Effect,
+    change_size: float,
+    torque_slopes: Mapping[Effect, NDArray[np.float64]] | None = None,
 ) -> NDArray[np.complex128]:
     """Return the torque spectrum of an effect at a given size, divided by that size, shape (K,).
 
-    `slopes` is the result of `_torque_slopes`, if it is known already.
+    `torque_slopes` is the result of `_torque_slopes`, if it is known already.
     """
-    if effect == "play":
+    if changing_property == "play":
         return comparison.spectrum(comparison.prediction.with_angle(play_angle).torque(plant)[0])
-    if effect == "clock":
-        return comparison.spectrum(_clock_torque(comparison, plant, size))
-    ramp = np.linspace(-0.5, 0.5, comparison.samples)
-    change = ramp * (slopes or _torque_slopes(comparison, plant))[effect]
-    if effect != "gain":
-        change += memory_torque(comparison, plant, ramp, effect, size)
-    return comparison.spectrum(change)
+    if changing_property == "clock":
+        return comparison.spectrum(_clock_torque(comparison, plant, change_size))
+    unit_ramp = np.linspace(-0.5, 0.5, comparison.samples)
+    torque_change = (
+        unit_ramp * (torque_slopes or _torque_slopes(comparison, plant))[changing_property]
+    )
+    if changing_property != "gain":
+        torque_change += memory_torque(comparison, plant, unit_ramp, changing_property, change_size)
+    return comparison.spectrum(torque_change)
 
 
-def _clock_torque(comparison: Comparison, plant: Plant, size: float) -> NDArray[np.float64]:
-    """Return the torque change by a faster clock, per unit rate difference, shape (samples,).
+def _clock_torque(comparison: Comparison, plant: Plant, change_size: float) -> NDArray[np.float64]:
+    """Return the torque change in N·m by clocks whose rates differ by `_CLOCK_UNIT`, (samples,).
 
     The torque with time stamp t is that at t plus the rate difference times the time since the
-    middle of the record. It is computed by its Taylor series. `size` is in units of `_CLOCK_UNIT`.
+    middle of the record. It is computed by its Taylor series. `change_size` is in units of
+    `_CLOCK_UNIT`.
     """
     prediction, time_s = comparison.prediction, comparison.times_s()
     offset_s = _CLOCK_UNIT * (time_s - time_s.mean())
-    grid = ResponseGrid(prediction.s)
-    derivative = grid.evaluate(plant)[0]
+    response_grid = ResponseGrid(prediction.s)
+    response_derivative = response_grid.evaluate(plant)[0]
     taylor_factor = offset_s
     torque_change = np.zeros(offset_s.size)
-    for number in range(1, _TAYLOR_TERMS + 1 if size else 2):
-        derivative = derivative * grid.s
-        torque_change += taylor_factor * prediction.in_time(derivative)
-        taylor_factor = taylor_factor * size * offset_s / (number + 1)
+    for term_number in range(1, _TAYLOR_TERMS + 1 if change_size else 2):
+        response_derivative = response_derivative * response_grid.s
+        torque_change += taylor_factor * prediction.in_time(response_derivative)
+        taylor_factor = taylor_factor * change_size * offset_s / (term_number + 1)
     return torque_change
 
 
 def play_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a backlash of `UNIT_PLAY_RAD`, shape (K,)."""
+    """Return the spectrum of the torque change in N·m by a backlash of `UNIT_PLAY_RAD`, (K,)."""
     return _torque_spectrum(comparison, plant, _play_angle(comparison), "play", 0.0)
 
 
 def _play_angle(comparison: Comparison) -> NDArray[np.float64]:
     """Return the hub angle minus the shaft angle under backlash, in rad, at the decimated rate."""
     highest_hz = float(comparison.frequency_hz[-1])
-    half_play, hub_angle, hub_angles = UNIT_PLAY_RAD / 2, 0.0, []
-    shaft = comparison.measurement.angle_from_rest(highest_hz)
-    for angle in shaft.tolist():
+    half_play_rad, hub_angle_rad, hub_angles_rad = UNIT_PLAY_RAD / 2, 0.0, []
+    shaft_angle_rad = comparison.measurement.angle_from_rest(highest_hz)
+    for sample_angle_rad in shaft_angle_rad.tolist():
         # A comparison each: min and max take three times as long, at every tick of the record.
-        if hub_angle < angle - half_play:
-            hub_angle = angle - half_play
-        elif hub_angle > angle + half_play:
-            hub_angle = angle + half_play
-        hub_angles.append(hub_angle)
-    lag: NDArray[np.float64] = comparison.decimation.apply(np.array(hub_angles) - shaft)
-    return lag
+        if hub_angle_rad < sample_angle_rad - half_play_rad:
+            hub_angle_rad = sample_angle_rad - half_play_rad
+        elif hub_angle_rad > sample_angle_rad + half_play_rad:
+            hub_angle_rad = sample_angle_rad + half_play_rad
+        hub_angles_rad.append(hub_angle_rad)
+    lag_rad: NDArray[np.float64] = comparison.decimation.apply(
+        np.array(hub_angles_rad) - shaft_angle_rad
+    )
+    return lag_rad
 
 
 # Effect of past values of damping and stiffness
@@ -340,66 +367,83 @@ _STRESS_TOLERANCE: Final = 1e-4
 def memory_torque(
     comparison: Comparison,
     plant: Plant,
-    change: NDArray[np.float64],
-    effect: Literal["damping", "stiffness"],
-    size: float = 0.0,
+    relative_change: NDArray[np.float64],
+    changing_property: Literal["damping", "stiffness"],
+    change_size: float = 0.0,
 ) -> NDArray[np.float64]:
     """Return the torque change by past values of a changing property, per unit size, (samples,).
 
-    This is the torque beyond the instantaneous derivative. `change`, shape (samples,), is w at the
-    retained samples, constant before and after. For `effect` of "stiffness" the mass is constant.
-    `size` is e.
+    This is the torque beyond the instantaneous derivative. `relative_change`, shape (samples,), is
+    w at the retained samples, constant before and after. For `changing_property` of "stiffness" the
+    mass is constant.
+    `change_size` is e.
     """
     n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-    length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
-    sigma = _DECAY_EXPONENT * rate_hz / length
-    s = sigma + 2j * np.pi * rate_hz / length * np.arange(length // 2 + 1)
-    growth = np.exp(sigma * np.arange(n) / rate_hz)
+    padded_length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
+    decay_rate = _DECAY_EXPONENT * rate_hz / padded_length
+    s = decay_rate + 2j * np.pi * rate_hz / padded_length * np.arange(padded_length // 2 + 1)
+    time_growth = np.exp(decay_rate * np.arange(n) / rate_hz)
     retained_samples = comparison.retained
-    w = np.interp(np.arange(n), np.arange(retained_samples.start, retained_samples.stop), change)
+    w = np.interp(
+        np.arange(n), np.arange(retained_samples.start, retained_samples.stop), relative_change
+    )
     damping, beam = plant.damping, plant.beam
-    internal = damping.zeta * s**damping.alpha
-    external = damping.gamma * s**damping.lambda_
-    inertial = beam.density_over_stiffness * s * s + external
-    changing_factor = internal + 1 if effect == "stiffness" else internal
-    angle = np.fft.rfft(comparison.angle_rad / growth, length) * torque_channel_response(plant, s)
+    internal_damping = damping.zeta * s**damping.alpha
+    external_damping = damping.gamma * s**damping.lambda_
+    inertial_term = beam.density_over_stiffness * s * s + external_damping
+    changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
+    angle_transform = np.fft.rfft(
+        comparison.angle_rad / time_growth, padded_length
+    ) * torque_channel_response(plant, s)
     total_torque = np.zeros(n)
 
-    def in_time(spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the values over time of a quantity with a given spectrum, shape (n,)."""
-        values: NDArray[np.float64] = np.fft.irfft(spectrum, length)[:n] * growth
-        return values
+    def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Convert a Laplace transform to values over time, shape (n,)."""
+        time_values: NDArray[np.float64] = (
+            np.fft.irfft(laplace_transform, padded_length)[:n] * time_growth
+        )
+        return time_values
 
-    def weighted(spectrum: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the spectrum of a quantity times w, from the spectrum of the quantity."""
-        transform: NDArray[np.complex128] = np.fft.rfft(w * in_time(spectrum) / growth, length)
-        return transform
+    def weighted(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the transform of w times a quantity, from the transform of the quantity."""
+        weighted_transform: NDArray[np.complex128] = np.fft.rfft(
+            w * in_time(laplace_transform) / time_growth, padded_length
+        )
+        return weighted_transform
 
     k4_of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
-    stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
-    for stiffness, k in zip(stiffnesses.tolist(), k4_of_modes.tolist(), strict=True):
-        compliance = 1 / ((1 + internal) * k + inertial)
-        rigid_response = inertial * compliance
-        stress_per_angle = changing_factor * k * -rigid_response + external * (1 - rigid_response)
-        constant_stress = stress = stress_per_angle * angle
-        vibration_change = np.zeros_like(stress)
-        for _ in range(_MAX_SIZE_ORDER if size else 1):
-            vibration_change = -compliance * weighted(stress)
-            previous_stress, stress = (
-                stress,
-                constant_stress + size * (changing_factor * k + external) * vibration_change,
+    modal_stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)
+    for modal_stiffness, k in zip(modal_stiffnesses.tolist(), k4_of_modes.tolist(), strict=True):
+        modal_compliance = 1 / ((1 + internal_damping) * k + inertial_term)
+        rigid_response = inertial_term * modal_compliance
+        stress_per_angle = changing_factor * k * -rigid_response + external_damping * (
+            1 - rigid_response
+        )
+        constant_stress = modal_stress = stress_per_angle * angle_transform
+        vibration_change = np.zeros_like(modal_stress)
+        for _ in range(_MAX_SIZE_ORDER if change_size else 1):
+            vibration_change = -modal_compliance * weighted(modal_stress)
+            previous_stress, modal_stress = (
+                modal_stress,
+                constant_stress
+                + change_size * (changing_factor * k + external_damping) * vibration_change,
             )
             if (
-                np.abs(stress - previous_stress).max()
+                np.abs(modal_stress - previous_stress).max()
                 < _STRESS_TOLERANCE * np.abs(constant_stress).max()
             ):
                 break
-        deflection = (1 - rigid_response) * angle + size * vibration_change
-        torque_part = in_time(inertial * vibration_change) + w * in_time(external * deflection)
-        total_torque += stiffness * (
+        modal_deflection = (1 - rigid_response) * angle_transform + change_size * vibration_change
+        torque_part = in_time(inertial_term * vibration_change) + w * in_time(
+            external_damping * modal_deflection
+        )
+        total_torque += modal_stiffness * (
             torque_part
             - w
-            * in_time(external * (1 - rigid_response) * angle - rigid_response * constant_stress)
+            * in_time(
+                external_damping * (1 - rigid_response) * angle_transform
+                - rigid_response * constant_stress
+            )
         )
     return total_torque[retained_samples]
 
@@ -425,60 +469,60 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 """Kind of the finding on each effect."""
 
 
-def established(changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
-    """Return whether one change, and no other model, explains the record.
+def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
+    """Return whether the record establishes exactly one change as its explanation.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
     Backlash may be established.
 
     Parameters
     ----------
-    changes : tuple of TemporalChange
+    equivalent_changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    if len(changes) != 1 or not changes[0].certain:
+    if len(equivalent_changes) != 1 or not equivalent_changes[0].certain:
         return False
-    return changes[0].what == "play" or not is_single_sweep
+    return equivalent_changes[0].what == "play" or not is_single_sweep
 
 
 def temporal_change_findings(
-    changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
 ) -> Iterator[Finding]:
     """Yield a finding on each change along the record.
 
     Parameters
     ----------
-    changes : tuple of TemporalChange
+    equivalent_changes : tuple of TemporalChange
         Changes that explain the record best or equally well.
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    for change in changes:
+    for change in equivalent_changes:
         finding = _established_finding(change)
-        if established(changes, is_single_sweep=is_single_sweep):
+        if established(equivalent_changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
-            others = "the others named" if len(changes) > 1 else "any other model"
+            rival_names = "the others named" if len(equivalent_changes) > 1 else "any other model"
             yield replace(
                 finding,
                 sentence=(
                     f"{_EFFECT_NAMES[change.what]} ({_size_text(change)}) would explain the record "
-                    f"as well as {others}: in one sweep, time and frequency vary together."
+                    f"as well as {rival_names}: in one sweep, time and frequency vary together."
                 ),
                 value=None,
                 interval=None,
             )
 
 
-def _size_text(change: TemporalChange) -> str:
+def _size_text(temporal_change: TemporalChange) -> str:
     """Return the size of a change as text with its unit."""
-    if change.what == "play":
-        return f"{1e3 * change.size:.2g} mrad"
-    if change.what == "clock":
-        return f"the torque's by {1e6 * change.size:+.3g} ppm"
-    return f"{100 * change.size:+.2g} % from beginning to end"
+    if temporal_change.what == "play":
+        return f"{1e3 * temporal_change.size:.2g} mrad"
+    if temporal_change.what == "clock":
+        return f"the torque's by {1e6 * temporal_change.size:+.3g} ppm"
+    return f"{100 * temporal_change.size:+.2g} % from beginning to end"
 
 
 _DISPLAY_FACTORS: Final[Mapping[Effect, float]] = {"play": 1e3, "clock": 1e6}
@@ -491,20 +535,20 @@ _TWO_WAY_SWEEP_ADVICE: Final = (
 """Advice to sweep in both directions, without its first letter."""
 
 
-def _established_finding(change: TemporalChange) -> Finding:
+def _established_finding(temporal_change: TemporalChange) -> Finding:
     """Return the finding that a change along the record is established."""
-    half_width = NORMAL_95 * change.std
-    is_backlash = change.what == "play"
-    remedy = f"S{_TWO_WAY_SWEEP_ADVICE}"
+    size_half_width = NORMAL_95 * temporal_change.std
+    is_backlash = temporal_change.what == "play"
+    remedy_text = f"S{_TWO_WAY_SWEEP_ADVICE}"
     if is_backlash:
-        remedy = "Remove the backlash in gear and clamp."
-    elif change.what == "clock":
-        remedy = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
+        remedy_text = "Remove the backlash in gear and clamp."
+    elif temporal_change.what == "clock":
+        remedy_text = f"Sample angle and torque by one clock, or s{_TWO_WAY_SWEEP_ADVICE}"
     return Finding(
-        kind=_FINDING_KINDS[change.what],
+        kind=_FINDING_KINDS[temporal_change.what],
         sentence=(
-            f"{_EFFECT_NAMES[change.what]}: {_size_text(change)} "
-            f"(± {_DISPLAY_FACTORS.get(change.what, 100.0) * half_width:.1g}; 95 %). "
+            f"{_EFFECT_NAMES[temporal_change.what]}: {_size_text(temporal_change)} "
+            f"(± {_DISPLAY_FACTORS.get(temporal_change.what, 100.0) * size_half_width:.1g}; 95 %). "
             "It was fitted too"
             + (
                 ", to first order in its size."
@@ -512,8 +556,8 @@ def _established_finding(change: TemporalChange) -> Finding:
                 else "; all parameters are those at the middle of the record."
             )
         ),
-        value=change.size,
-        interval=(change.size - half_width, change.size + half_width),
+        value=temporal_change.size,
+        interval=(temporal_change.size - size_half_width, temporal_change.size + size_half_width),
         unit="rad" if is_backlash else "1",
-        remedy=remedy,
+        remedy=remedy_text,
     )

@@ -42,7 +42,7 @@ _MAX_LN_PIVOT_FREQUENCY: Final = 50.0
 
 
 def covariance_of_unknowns(
-    jacobian: NDArray[np.complex128], scatter: float, at_bound: NDArray[np.bool_]
+    jacobian: NDArray[np.complex128], residual_variance: float, at_bound: NDArray[np.bool_]
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Return the covariance of those unknowns that the data determine.
 
@@ -50,7 +50,7 @@ def covariance_of_unknowns(
     ----------
     jacobian : ndarray of complex, shape (k, K)
         Derivatives of the whitened residual by the unknowns.
-    scatter : float
+    residual_variance : float
         Variance of real and imaginary parts of the whitened residual.
     at_bound : ndarray of bool, shape (k,)
         True for unknowns at a bound.
@@ -59,27 +59,29 @@ def covariance_of_unknowns(
     -------
     covariance : ndarray, shape (k, k)
         Covariance of the unknowns, 0 in rows and columns of those that are not determined.
-    determined : ndarray of bool, shape (k,)
+    is_determined : ndarray of bool, shape (k,)
         True for unknowns that the data determine.
     """
-    hessian = (jacobian.conj() @ jacobian.T).real
-    scale = np.sqrt(np.diag(hessian))
-    determined = ~at_bound & (scale > 0) & np.isfinite(scale)
-    covariance = np.zeros_like(hessian)
-    if not determined.any():
-        return covariance, determined
-    determined_block = np.ix_(determined, determined)
-    scale_products = np.outer(scale[determined], scale[determined])
-    scaled_hessian = hessian[determined_block] / scale_products
+    hessian_matrix = (jacobian.conj() @ jacobian.T).real
+    hessian_scale = np.sqrt(np.diag(hessian_matrix))
+    is_determined = ~at_bound & (hessian_scale > 0) & np.isfinite(hessian_scale)
+    covariance = np.zeros_like(hessian_matrix)
+    if not is_determined.any():
+        return covariance, is_determined
+    determined_block = np.ix_(is_determined, is_determined)
+    scale_products = np.outer(hessian_scale[is_determined], hessian_scale[is_determined])
+    scaled_hessian = hessian_matrix[determined_block] / scale_products
     if np.linalg.cond(scaled_hessian) > _MAX_CONDITION_NUMBER:
-        return covariance, np.zeros_like(determined)
-    covariance[determined_block] = scatter * np.linalg.inv(scaled_hessian) / scale_products
-    return covariance, determined
+        return covariance, np.zeros_like(is_determined)
+    covariance[determined_block] = (
+        residual_variance * np.linalg.inv(scaled_hessian) / scale_products
+    )
+    return covariance, is_determined
 
 
 @dataclass(frozen=True, slots=True)
 class ParameterUncertainty:
-    """Uncertainty of the parameters at a minimum, with the attributes of `RecordFit`."""
+    """Uncertainty of the fitted plant parameters. The attributes are those of `RecordFit`."""
 
     std: dict[str, float | None]
     interval: dict[str, tuple[float, float] | None]
@@ -97,7 +99,9 @@ def parameter_uncertainty(
     unknown_covariance: NDArray[np.float64],
     is_determined: NDArray[np.bool_],
 ) -> ParameterUncertainty:
-    """Propagate the covariance of the unknowns to the plant parameters.
+    """Return standard deviations and intervals of the plant parameters at a minimum.
+
+    They follow from the covariance of the unknowns.
 
     Parameters
     ----------
@@ -112,49 +116,81 @@ def parameter_uncertainty(
     is_determined : ndarray of bool, shape (k,)
         True for unknowns that the data determine.
     """
-    derivatives = unknowns.estimates_by_unknowns(x)
-    parameter_covariance = derivatives @ unknown_covariance @ derivatives.T
-    names, values = unknowns.names, unknowns.parameters(x)
-    logarithmic = np.array([name in LOGARITHMIC_PARAMETERS for name in names])
+    parameter_slopes = unknowns.estimates_by_unknowns(x)
+    parameter_covariance = parameter_slopes @ unknown_covariance @ parameter_slopes.T
+    parameter_names, parameter_values = unknowns.names, unknowns.parameters(x)
+    is_logarithmic = np.array(
+        [parameter_name in LOGARITHMIC_PARAMETERS for parameter_name in parameter_names]
+    )
     is_determined = is_determined & ~(
-        logarithmic & (np.diag(parameter_covariance) > _UNDETERMINED_LN_STD**2)
+        is_logarithmic & (np.diag(parameter_covariance) > _UNDETERMINED_LN_STD**2)
     )
-    covariance = parameter_covariance[np.ix_(is_determined, is_determined)]
-    determined = tuple(
-        name for name, is_known in zip(names, is_determined, strict=True) if is_known
+    determined_covariance = parameter_covariance[np.ix_(is_determined, is_determined)]
+    determined_names = tuple(
+        parameter_name
+        for parameter_name, is_known in zip(parameter_names, is_determined, strict=True)
+        if is_known
     )
-    std: dict[str, float | None] = dict.fromkeys(values, 0.0) | dict.fromkeys(names, None)
-    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(names, None)
-    for name, spread in zip(determined, np.sqrt(np.diag(covariance)).tolist(), strict=True):
-        std[name] = values[name] * spread if name in LOGARITHMIC_PARAMETERS else spread
-        intervals[name] = interval(name, values[name], spread)
-    first_omega_rad_s, _second = unknowns.omega_rad_s
+    std: dict[str, float | None] = dict.fromkeys(parameter_values, 0.0) | dict.fromkeys(
+        parameter_names, None
+    )
+    intervals: dict[str, tuple[float, float] | None] = dict.fromkeys(parameter_names, None)
+    for parameter_name, natural_std in zip(
+        determined_names, np.sqrt(np.diag(determined_covariance)).tolist(), strict=True
+    ):
+        std[parameter_name] = (
+            parameter_values[parameter_name] * natural_std
+            if parameter_name in LOGARITHMIC_PARAMETERS
+            else natural_std
+        )
+        intervals[parameter_name] = interval(
+            parameter_name, parameter_values[parameter_name], natural_std
+        )
+    first_omega_rad_s, _second_omega_rad_s = unknowns.omega_rad_s
     return ParameterUncertainty(
         std=std,
         interval=intervals,
-        determined=determined,
-        covariance=covariance,
-        at_bounds=tuple(name for name, is_held in zip(names, at_bound, strict=True) if is_held),
-        internal=damping_size("zeta", "alpha", values, determined, covariance, first_omega_rad_s),
-        external=damping_size("gamma", "lambda", values, determined, covariance, first_omega_rad_s),
+        determined=determined_names,
+        covariance=determined_covariance,
+        at_bounds=tuple(
+            parameter_name
+            for parameter_name, is_held in zip(parameter_names, at_bound, strict=True)
+            if is_held
+        ),
+        internal=damping_size(
+            "zeta",
+            "alpha",
+            parameter_values,
+            determined_names,
+            determined_covariance,
+            first_omega_rad_s,
+        ),
+        external=damping_size(
+            "gamma",
+            "lambda",
+            parameter_values,
+            determined_names,
+            determined_covariance,
+            first_omega_rad_s,
+        ),
     )
 
 
 # Intervals
 
 
-def interval(name: str, value: float, std: float) -> tuple[float, float]:
+def interval(parameter_name: str, parameter_value: float, std: float) -> tuple[float, float]:
     """Return the 95 % interval of a parameter.
 
     `std` is the standard deviation of the logarithm for parameters in `LOGARITHMIC_PARAMETERS`.
     """
     half_width = NORMAL_95 * std
-    if name in LOGARITHMIC_PARAMETERS:
-        return value * math.exp(-half_width), value * math.exp(half_width)
-    return value - half_width, value + half_width
+    if parameter_name in LOGARITHMIC_PARAMETERS:
+        return parameter_value * math.exp(-half_width), parameter_value * math.exp(half_width)
+    return parameter_value - half_width, parameter_value + half_width
 
 
-def interval_from_zero(value: float, std: float) -> tuple[float, float]:
+def interval_from_zero(estimated_value: float, std: float) -> tuple[float, float]:
     """Return the 95 % interval of a quantity that cannot be negative.
 
     It is the non-negative part of the symmetric interval. So it begins at 0 if the estimate is
@@ -163,23 +199,23 @@ def interval_from_zero(value: float, std: float) -> tuple[float, float]:
 
     Parameters
     ----------
-    value : float
+    estimated_value : float
         Estimate, not negative.
     std : float
         Standard deviation without the bound at 0.
     """
     half_width = NORMAL_95 * std
-    return max(value - half_width, 0.0), value + half_width
+    return max(estimated_value - half_width, 0.0), estimated_value + half_width
 
 
 # Loss factor at its pivot frequency
 
 
 def damping_size(
-    coefficient: str,
-    order: str,
-    values: dict[str, float],
-    names: Sequence[str],
+    coefficient_name: str,
+    order_name: str,
+    parameter_values: dict[str, float],
+    determined_names: Sequence[str],
     covariance: NDArray[np.float64],
     least_omega_rad_s: float,
 ) -> DampingSize | None:
@@ -191,42 +227,46 @@ def damping_size(
 
     Parameters
     ----------
-    coefficient, order : str
+    coefficient_name, order_name : str
         "zeta" and "alpha", or "gamma" and "lambda".
-    values : dict
+    parameter_values : dict
         Values of all parameters, by name.
-    names : sequence of str
+    determined_names : sequence of str
         Names of the determined parameters.
     covariance : ndarray, shape (k, k)
         Covariance of the determined parameters, with coefficients as logarithms.
     least_omega_rad_s : float
         Smallest pivot frequency: that of the first mode, below which no mode vibrates.
     """
-    if coefficient not in names:
+    if coefficient_name not in determined_names:
         return None
-    i = list(names).index(coefficient)
-    if order not in names:
-        return DampingSize(None, values[coefficient], values[coefficient] * covariance[i, i] ** 0.5)
-    j = list(names).index(order)
-    phase = math.pi / 2 * values[order]
-    gradient = np.zeros(len(names))
-    gradient[i] = 1.0
+    i = list(determined_names).index(coefficient_name)
+    if order_name not in determined_names:
+        return DampingSize(
+            None,
+            parameter_values[coefficient_name],
+            parameter_values[coefficient_name] * covariance[i, i] ** 0.5,
+        )
+    j = list(determined_names).index(order_name)
+    order_phase_rad = math.pi / 2 * parameter_values[order_name]
+    ln_loss_gradient = np.zeros(len(determined_names))
+    ln_loss_gradient[i] = 1.0
     # The loss of external damping is relative to the inertia rho/EI omega².
-    ratio, power = "density_over_stiffness", 2 if coefficient == "gamma" else 0
-    if power and ratio in names:
-        gradient[list(names).index(ratio)] = -1.0
+    ratio_name, inertia_power = "density_over_stiffness", 2 if coefficient_name == "gamma" else 0
+    if inertia_power and ratio_name in determined_names:
+        ln_loss_gradient[list(determined_names).index(ratio_name)] = -1.0
     # At this derivative of ln loss by the order, ln loss and order are uncorrelated:
-    pivot_slope = -float(gradient @ covariance[:, j]) / covariance[j, j]
-    phase_term = math.pi / 2 / math.tan(phase)
+    pivot_slope = -float(ln_loss_gradient @ covariance[:, j]) / covariance[j, j]
+    phase_term = math.pi / 2 / math.tan(order_phase_rad)
     ln_omega = max(pivot_slope - phase_term, math.log(least_omega_rad_s))
     if abs(ln_omega) > _MAX_LN_PIVOT_FREQUENCY:
         return None  # an almost undetermined order has no pivot frequency
-    gradient[j] = ln_omega + phase_term
-    scale = values[ratio] if power else 1.0
-    size = values[coefficient] / scale * math.sin(phase)
-    size *= math.exp((values[order] - power) * ln_omega)
-    variance = max(float(gradient @ covariance @ gradient), 0.0)
-    return DampingSize(math.exp(ln_omega), size, size * math.sqrt(variance))
+    ln_loss_gradient[j] = ln_omega + phase_term
+    inertia_scale = parameter_values[ratio_name] if inertia_power else 1.0
+    loss_factor = parameter_values[coefficient_name] / inertia_scale * math.sin(order_phase_rad)
+    loss_factor *= math.exp((parameter_values[order_name] - inertia_power) * ln_omega)
+    relative_variance = max(float(ln_loss_gradient @ covariance @ ln_loss_gradient), 0.0)
+    return DampingSize(math.exp(ln_omega), loss_factor, loss_factor * math.sqrt(relative_variance))
 
 
 # Modes
@@ -242,9 +282,9 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
     covariance : ndarray, shape (k, k)
         Covariance of the unknowns.
     """
-    table = []
-    for number in dict.fromkeys(pole.mode for pole in poles):
-        first_pole, *other_poles = (pole for pole in poles if pole.mode == number)
+    mode_estimates = []
+    for mode_number in dict.fromkeys(pole.mode for pole in poles):
+        first_pole, *other_poles = (pole for pole in poles if pole.mode == mode_number)
         p, dp = first_pole.at_rad_s, first_pole.derivative
         q, dq = (
             (other_poles[0].at_rad_s, other_poles[0].derivative)
@@ -253,26 +293,30 @@ def mode_table(poles: Sequence[Pole], covariance: NDArray[np.float64]) -> tuple[
         )
         natural_rad_s = math.sqrt((p * q).real)
         damping_ratio = -(p + q).real / (2 * natural_rad_s)
-        natural_slope = (q * dp + p * dq).real / (2 * natural_rad_s)
+        frequency_rad_s_slope = (q * dp + p * dq).real / (2 * natural_rad_s)
         ratio_slope = (
-            -(dp + dq).real / (2 * natural_rad_s) - damping_ratio * natural_slope / natural_rad_s
+            -(dp + dq).real / (2 * natural_rad_s)
+            - damping_ratio * frequency_rad_s_slope / natural_rad_s
         )
-        frequency_slope = np.zeros(dp.size) if other_poles else dp.imag / (2 * np.pi)
-        table.append(
+        frequency_hz_slope = np.zeros(dp.size) if other_poles else dp.imag / (2 * np.pi)
+        mode_estimates.append(
             ModeEstimate(
-                number=number,
+                number=mode_number,
                 frequency_hz=abs(p.imag) / (2 * np.pi),
-                frequency_std_hz=_propagated_std(frequency_slope, covariance),
+                frequency_std_hz=_propagated_std(frequency_hz_slope, covariance),
                 damping_ratio=damping_ratio,
                 damping_ratio_std=_propagated_std(ratio_slope, covariance),
             )
         )
-    return tuple(table)
+    return tuple(mode_estimates)
 
 
-def _propagated_std(slope: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
-    """Return the standard deviation of a quantity with given derivatives by the unknowns."""
-    return math.sqrt(max(float(slope @ covariance @ slope), 0.0))
+def _propagated_std(derivatives: NDArray[np.float64], covariance: NDArray[np.float64]) -> float:
+    """Return the standard deviation of a quantity from its derivatives and their covariance.
+
+    The derivatives, shape (k,), and the covariance, shape (k, k), are those by the unknowns.
+    """
+    return math.sqrt(max(float(derivatives @ covariance @ derivatives), 0.0))
 
 
 # Free decay at the start
@@ -281,48 +325,67 @@ def _propagated_std(slope: NDArray[np.float64], covariance: NDArray[np.float64])
 def ringing(
     poles: Sequence[Pole],
     projected: Projected,
-    scatter: float,
-    columns: NDArray[np.complex128],
-    hum: NDArray[np.complex128],
+    residual_variance: float,
+    projected_spectra: NDArray[np.complex128],
+    hum_spectra: NDArray[np.complex128],
 ) -> Ringing:
-    """Return the free decay's amplitude in each mode, with its significance.
+    """Return the amplitude of the free decay in each mode, with its chi-square.
 
     A hum is excluded bin by bin. But it starts and ends with the record and so leaks into all other
     bins, which the free decay would partly explain. So only the reduction of the sum of squares in
-    addition to the hum counts. `columns`, shape (m, K), are the whitened spectra of the free decays
-    and of the other projected terms. `hum`, shape (h, K), are the whitened spectra of the lines.
-    `scatter` is the variance of real and imaginary parts of the residual.
+    addition to the hum counts. `projected_spectra`, shape (m, K), are the whitened spectra of the
+    free decays and of the other projected terms. `hum_spectra`, shape (h, K), are the whitened
+    spectra of the lines. `residual_variance` is that of real and imaginary parts of the residual.
     """
-    count = count_decay_spectra(poles)
-    columns, decays = columns[:count], projected.amplitudes[:count]
-    explained = float(decays @ projected.amplitude_gram[:count, :count] @ decays)
-    if len(hum) and decays.size:
-        without_decays = projected.residual - decays @ columns
-        combination, remaining = _best_combination(without_decays, np.concatenate([columns, hum]))
-        explained = _best_combination(without_decays, hum)[1] - remaining
-        decays = combination[: decays.size]
-    amplitudes: dict[int, float] = {}
-    start = 0
-    for pole in poles:
-        column_count = 2 if pole.oscillates else 1
-        amplitude = float(np.linalg.norm(decays[start : start + column_count]))
-        amplitudes[pole.mode] = max(amplitudes.get(pole.mode, 0.0), amplitude)
-        start += column_count
+    decay_count = count_decay_spectra(poles)
+    projected_spectra, decay_amplitudes = (
+        projected_spectra[:decay_count],
+        projected.amplitudes[:decay_count],
+    )
+    explained_squares = float(
+        decay_amplitudes @ projected.amplitude_gram[:decay_count, :decay_count] @ decay_amplitudes
+    )
+    if len(hum_spectra) and decay_amplitudes.size:
+        decay_free_residual = projected.residual - decay_amplitudes @ projected_spectra
+        best_factors, remaining_squares = _best_combination(
+            decay_free_residual, np.concatenate([projected_spectra, hum_spectra])
+        )
+        explained_squares = (
+            _best_combination(decay_free_residual, hum_spectra)[1] - remaining_squares
+        )
+        decay_amplitudes = best_factors[: decay_amplitudes.size]
+    mode_amplitudes: dict[int, float] = {}
+    first_column = 0
+    for decay_pole in poles:
+        column_count = 2 if decay_pole.oscillates else 1
+        mode_amplitude = float(
+            np.linalg.norm(decay_amplitudes[first_column : first_column + column_count])
+        )
+        mode_amplitudes[decay_pole.mode] = max(
+            mode_amplitudes.get(decay_pole.mode, 0.0), mode_amplitude
+        )
+        first_column += column_count
     return Ringing(
-        amplitude_nm=tuple(amplitudes.values()),
-        chi_square=explained / scatter,
-        degrees_of_freedom=decays.size,
+        amplitude_nm=tuple(mode_amplitudes.values()),
+        chi_square=explained_squares / residual_variance,
+        degrees_of_freedom=decay_amplitudes.size,
     )
 
 
 def _best_combination(
-    values: NDArray[np.complex128], columns: NDArray[np.complex128]
+    target_spectrum: NDArray[np.complex128], basis_spectra: NDArray[np.complex128]
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the best real combination of spectra, (m,), and its remaining sum of squares."""
-    real_columns = np.ascontiguousarray(columns).view(np.float64)
-    norms = np.sqrt(np.einsum("ij,ij->i", real_columns, real_columns))
-    norms[norms == 0] = 1.0
-    scaled_columns, target = (real_columns / norms[:, None]).T, values.view(np.float64)
-    factors = np.linalg.lstsq(scaled_columns, target)[0]
-    remainder = target - scaled_columns @ factors
-    return factors / norms, float(remainder @ remainder)
+    """Fit a spectrum by a real linear combination of others.
+
+    Return its factors, shape (m,), and the sum of squares that remains.
+    """
+    real_spectra = np.ascontiguousarray(basis_spectra).view(np.float64)
+    spectrum_norms = np.sqrt(np.einsum("ij,ij->i", real_spectra, real_spectra))
+    spectrum_norms[spectrum_norms == 0] = 1.0
+    scaled_spectra, real_values = (
+        (real_spectra / spectrum_norms[:, None]).T,
+        target_spectrum.view(np.float64),
+    )
+    scaled_factors = np.linalg.lstsq(scaled_spectra, real_values)[0]
+    unexplained_values = real_values - scaled_spectra @ scaled_factors
+    return scaled_factors / spectrum_norms, float(unexplained_values @ unexplained_values)

@@ -52,40 +52,46 @@ def visible_modes(comparison: Comparison, noise: NoiseSpectrum, fit: RecordFit) 
     better than the smooth response is evidence, too, for weaker resonances in a long record. `fit`
     provides the frequencies and widths of the modes.
     """
-    torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
-    angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
-    visible = []
-    for mode in fit.modes:
-        offset = comparison.frequency_hz - mode.frequency_hz
-        reach_hz = _window_half_width_hz(comparison, mode.frequency_hz, mode.damping_ratio)
-        in_window = (np.abs(offset) < reach_hz) & noise.counts
+    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained])
+    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained])
+    visible_numbers = []
+    for mode_estimate in fit.modes:
+        offset_hz = comparison.frequency_hz - mode_estimate.frequency_hz
+        reach_hz = _window_half_width_hz(
+            comparison, mode_estimate.frequency_hz, mode_estimate.damping_ratio
+        )
+        in_window = (np.abs(offset_hz) < reach_hz) & noise.counts
         degrees_of_freedom = 2 * (int(np.count_nonzero(in_window)) - _SMOOTH_DEGREE - 1)
         if degrees_of_freedom < _MIN_BINS_PER_SIDE:
             continue
-        weight = noise.weight[in_window]
+        noise_weight = noise.weight[in_window]
         smooth_chi_square = _smooth_response_chi_square(
-            torque[in_window] * weight, angle[in_window] * weight, offset[in_window] / reach_hz
+            torque_spectrum[in_window] * noise_weight,
+            angle_spectrum[in_window] * noise_weight,
+            offset_hz[in_window] / reach_hz,
         )
         # Chance does neither: together they are nearly eight standard deviations, or more.
-        significant = (
+        has_evidence = (
             smooth_chi_square - degrees_of_freedom > _MIN_EVIDENCE
             and smooth_chi_square > _MIN_RESIDUAL_OVER_NOISE * degrees_of_freedom
         )
         # With many bins a resonance may be below the noise of each and still be significant.
         fit_chi_square = float(np.vdot(fit.residual[in_window], fit.residual[in_window]).real)
-        if significant or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
-            visible.append(mode.number)
-    return tuple(visible)
+        if has_evidence or smooth_chi_square - fit_chi_square > _MIN_EVIDENCE:
+            visible_numbers.append(mode_estimate.number)
+    return tuple(visible_numbers)
 
 
 def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: float) -> bool:
     """Return whether the excitation near a frequency is almost as large as near another one."""
     measurement = comparison.measurement
-    reference = measurement.reference_rad
+    reference_rad = measurement.reference_rad
     excitation_rad = (
-        measurement.angle_from_rest(1.0) if reference is None else reference - reference[0]
+        measurement.angle_from_rest(1.0)
+        if reference_rad is None
+        else reference_rad - reference_rad[0]
     )
-    power = np.abs(np.fft.rfft(excitation_rad)) ** 2
+    excitation_power = np.abs(np.fft.rfft(excitation_rad)) ** 2
     hz = np.fft.rfftfreq(excitation_rad.size, 1 / measurement.rate_hz)
 
     def amplitude(at_hz: float) -> float:
@@ -93,7 +99,7 @@ def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: floa
         in_window = np.abs(hz - at_hz) <= max(
             _MIN_RELATIVE_REACH * at_hz, _MIN_BINS_PER_SIDE * hz[1]
         )
-        return math.sqrt(float(np.mean(power[in_window]))) if in_window.any() else 0.0
+        return math.sqrt(float(np.mean(excitation_power[in_window]))) if in_window.any() else 0.0
 
     return amplitude(frequency_hz) > _MIN_EXCITATION_RATIO * amplitude(relative_to_hz) > 0
 
@@ -101,21 +107,29 @@ def is_excited(comparison: Comparison, frequency_hz: float, relative_to_hz: floa
 def _window_half_width_hz(
     comparison: Comparison, frequency_hz: float, damping_ratio: float
 ) -> float:
-    """Return the half width of the window around a mode, in hertz."""
+    """Return the half width in hertz of the frequency window in which a mode is tested."""
     spacing_hz = float(comparison.frequency_hz[1] - comparison.frequency_hz[0])
-    fraction = min(
+    relative_reach = min(
         max(_MIN_RELATIVE_REACH, _REACH_IN_HALF_WIDTHS * damping_ratio), _MAX_RELATIVE_REACH
     )
-    return max(fraction * frequency_hz, (_MIN_BINS_PER_SIDE + 0.5) * spacing_hz)
+    return max(relative_reach * frequency_hz, (_MIN_BINS_PER_SIDE + 0.5) * spacing_hz)
 
 
 def _smooth_response_chi_square(
-    torque: NDArray[np.complex128], angle: NDArray[np.complex128], position: NDArray[np.float64]
+    whitened_torque: NDArray[np.complex128],
+    whitened_angle: NDArray[np.complex128],
+    window_position: NDArray[np.float64],
 ) -> float:
-    """Return the sum of squares that the best smooth response leaves of whitened spectra, (K,).
+    """Return the sum of squares that remains after the best fit of a smooth response.
 
-    `position` is the position of each bin within the window, -1 to 1.
+    Torque and angle are whitened spectra, shape (K,).
+
+    `window_position` is the position of each bin within the window, -1 to 1.
     """
-    columns, _ = np.linalg.qr(np.array([position**k * angle for k in range(_SMOOTH_DEGREE + 1)]).T)
-    remainder = torque - columns @ (columns.conj().T @ torque)
-    return float(np.vdot(remainder, remainder).real)
+    orthonormal_spectra, _ = np.linalg.qr(
+        np.array([window_position**k * whitened_angle for k in range(_SMOOTH_DEGREE + 1)]).T
+    )
+    unexplained_torque = whitened_torque - orthonormal_spectra @ (
+        orthonormal_spectra.conj().T @ whitened_torque
+    )
+    return float(np.vdot(unexplained_torque, unexplained_torque).real)

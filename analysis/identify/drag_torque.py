@@ -130,7 +130,7 @@ class DragLaw:
     slowing: float = 0.0
 
     def at(self, speed_m_s: float) -> float:
-        """Return C_D d in m at a speed in m/s."""
+        """Return drag coefficient times diameter, C_D d, in m at a speed in m/s."""
         return float(self.constant_m + self.slowing * speed_m_s ** (_SLOWING_EXPONENT - 1))
 
 
@@ -170,14 +170,17 @@ class DragTorque:
 
     @property
     def by_ln_density(self) -> Real:
-        """Return the torque derivative by ln(mass per length), with constant poles and drag."""
-        numbers = np.array([self.law.constant_m, self.law.slowing])
-        own: Real = self.torque_nm - numbers @ self.by_law
-        return own
+        """Return the derivative of the drag torque by ln(mass per length), in N·m, shape (m,).
+
+        Poles and drag law are constant.
+        """
+        law_coefficients = np.array([self.law.constant_m, self.law.slowing])
+        torque_derivative: Real = self.torque_nm - law_coefficients @ self.by_law
+        return torque_derivative
 
 
 class DragResponse:
-    """Drag torque of one beam whose root follows a given angle.
+    """Computation of the torque by air drag on one beam whose root follows a given angle.
 
     Parameters
     ----------
@@ -198,11 +201,11 @@ class DragResponse:
         n = angle_rad.size
         self.plant, self._samples, self._rate_hz = plant, n, rate_hz
         self._length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
-        self._sigma = sigma = _DECAY_EXPONENT * rate_hz / self._length
-        bins = np.arange(self._length // 2 + 1)
-        self.s = s = sigma + 2j * np.pi * rate_hz / self._length * bins
+        self._sigma = decay_rate_per_s = _DECAY_EXPONENT * rate_hz / self._length
+        bin_indices = np.arange(self._length // 2 + 1)
+        self.s = s = decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
         fine_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
-        self._growth = np.exp(sigma * fine_time_s)
+        self._growth = np.exp(decay_rate_per_s * fine_time_s)
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
@@ -221,19 +224,22 @@ class DragResponse:
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
 
     def first_order(self) -> Real:
-        """Return the torque per C_D d in the limit of a small drag, in N, shape (m,)."""
+        """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
+
+        C_D d is drag coefficient times diameter.
+        """
         return self._torque_over_time(
             self._modal_forces(_drag_force(self._linear_speed(), DragLaw(1.0)))
         )
 
-    def torque(self, law: DragLaw, modes: Sequence[int] = ()) -> DragTorque:
-        """Return the torque by drag and its derivatives.
+    def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
+        """Return the torque by air drag in N·m, and its derivatives by poles, damping and law.
 
         Parameters
         ----------
         law : DragLaw
             Drag law of the air.
-        modes : sequence of int
+        mode_numbers : sequence of int
             Numbers of the modes whose poles the torque is differentiated by.
 
         Raises
@@ -241,149 +247,193 @@ class DragResponse:
         DragError
             If the simulated speeds diverge.
         """
-        speed = self._linear_speed()
-        highest_without_drag = float(np.abs(speed).max())
+        point_speed_m_s = self._linear_speed()
+        highest_without_drag = float(np.abs(point_speed_m_s).max())
         with np.errstate(over="ignore", invalid="ignore"):
-            self._add_drag_to_speeds(speed, law)
-            top = float(np.abs(speed).max())
-        if not top <= _DIVERGED_SPEED_RATIO * highest_without_drag:
+            self._add_drag_to_speeds(point_speed_m_s, law)
+            top_speed_m_s = float(np.abs(point_speed_m_s).max())
+        if not top_speed_m_s <= _DIVERGED_SPEED_RATIO * highest_without_drag:
             raise DragError(f"drag of {law.constant_m:g} m cannot be followed.")
-        forces = self._modal_forces(_drag_force(speed, law))
-        modes = [mode for mode in modes if self._pole_pairs[mode - 1][0].imag > 0]
-        spectra = self._transform_forces(forces)
-        modal_speeds = self._modal_speed_by_angle + self._speed_per_force * spectra[:-1]
-        sources: list[tuple[int, Real]] = []
-        direct_torques = []
-        modal_torques = self._leverage[:, None] * self._inertial_response * spectra[:-1]
-        for mode in modes:
-            pole = self._pole_pairs[mode - 1][0]
-            pole_term, conjugate_term = 1 / (self.s - pole), 1 / (self.s - pole.conjugate())
-            for pole_factor in (pole_term + conjugate_term, 1j * (pole_term - conjugate_term)):
-                sources.append(
-                    (mode - 1, self._oversampled_values(modal_speeds[mode - 1] * pole_factor))
-                )
-                direct_torques.append(self.in_time(modal_torques[mode - 1] * pole_factor))
-        for mode in _LOWEST_MODE_INDICES:
-            for pole_factor in (1 / self._inertia_term, self.s / self._inertia_term):
-                sources.append(
-                    (mode, self._oversampled_values(self._modal_speed_by_angle[mode] * pole_factor))
-                )
-                direct_torques.append(self.in_time(modal_torques[mode] * pole_factor))
-        force_changes = self._modal_force_changes(speed, law, sources)
-        by = [self._torque_over_time(pole_factor) for pole_factor in force_changes]
-        by[: len(direct_torques)] = [
-            sampled + direct for sampled, direct in zip(by, direct_torques, strict=False)
+        modal_forces = self._modal_forces(_drag_force(point_speed_m_s, law))
+        mode_numbers = [
+            mode_number
+            for mode_number in mode_numbers
+            if self._pole_pairs[mode_number - 1][0].imag > 0
         ]
-        of_external, of_law = by[2 * len(modes) : len(direct_torques)], by[len(direct_torques) :]
-        torque = self._torque_transform(spectra)
+        force_spectra = self._transform_forces(modal_forces)
+        modal_speeds = self._modal_speed_by_angle + self._speed_per_force * force_spectra[:-1]
+        speed_sources: list[tuple[int, Real]] = []
+        direct_torques = []
+        modal_torques = self._leverage[:, None] * self._inertial_response * force_spectra[:-1]
+        for mode_number in mode_numbers:
+            upper_pole = self._pole_pairs[mode_number - 1][0]
+            pole_term, conjugate_term = (
+                1 / (self.s - upper_pole),
+                1 / (self.s - upper_pole.conjugate()),
+            )
+            for pole_factor in (pole_term + conjugate_term, 1j * (pole_term - conjugate_term)):
+                speed_sources.append(
+                    (
+                        mode_number - 1,
+                        self._oversampled_values(modal_speeds[mode_number - 1] * pole_factor),
+                    )
+                )
+                direct_torques.append(self.in_time(modal_torques[mode_number - 1] * pole_factor))
+        for mode_number in _LOWEST_MODE_INDICES:
+            for pole_factor in (1 / self._inertia_term, self.s / self._inertia_term):
+                speed_sources.append(
+                    (
+                        mode_number,
+                        self._oversampled_values(
+                            self._modal_speed_by_angle[mode_number] * pole_factor
+                        ),
+                    )
+                )
+                direct_torques.append(self.in_time(modal_torques[mode_number] * pole_factor))
+        force_changes = self._modal_force_changes(point_speed_m_s, law, speed_sources)
+        torque_derivatives = [self._torque_over_time(pole_factor) for pole_factor in force_changes]
+        torque_derivatives[: len(direct_torques)] = [
+            force_torque + direct_torque
+            for force_torque, direct_torque in zip(torque_derivatives, direct_torques, strict=False)
+        ]
+        external_derivatives, law_derivatives = (
+            torque_derivatives[2 * len(mode_numbers) : len(direct_torques)],
+            torque_derivatives[len(direct_torques) :],
+        )
+        torque_transform = self._torque_transform(force_spectra)
         return DragTorque(
             law=law,
-            torque_nm=self.in_time(torque),
-            by_pole={mode: np.array(by[2 * i : 2 * i + 2]) for i, mode in enumerate(modes)},
-            by_external=np.reshape(of_external, (len(_LOWEST_MODE_INDICES), 2, self._samples)),
-            by_law=np.array(of_law),
-            by_delay=self.in_time(-self.s * torque),
-            speed_m_s=self._mean_speed(speed),
-            top_speed_m_s=top,
+            torque_nm=self.in_time(torque_transform),
+            by_pole={
+                mode_number: np.array(torque_derivatives[2 * i : 2 * i + 2])
+                for i, mode_number in enumerate(mode_numbers)
+            },
+            by_external=np.reshape(
+                external_derivatives, (len(_LOWEST_MODE_INDICES), 2, self._samples)
+            ),
+            by_law=np.array(law_derivatives),
+            by_delay=self.in_time(-self.s * torque_transform),
+            speed_m_s=self._mean_speed(point_speed_m_s),
+            top_speed_m_s=top_speed_m_s,
         )
 
     @property
     def poles(self) -> Complex:
-        """Return the upper pole of each mode in rad/s, shape (modes,)."""
-        upper: Complex = self._pole_pairs[:, 0]
-        return upper
+        """Return the pole with positive imaginary part of each mode, in rad/s, shape (modes,)."""
+        upper_poles: Complex = self._pole_pairs[:, 0]
+        return upper_poles
 
     @property
     def _leverage(self) -> Real:
-        """Return the leverage L b_i of each mode i in m, shape (modes,)."""
+        """Return ``L b_i`` in m², the first moment of the shape of each mode i about the root."""
         return self.plant.beam.length_m * self._grid.leverage_m
 
-    def _mean_speed(self, speed: Real) -> float:
-        """Return the mean speed in m/s over time and beam, weighted with the power of the drag."""
-        cubes = np.abs(speed) ** 3
-        total = float(cubes.sum(axis=0) @ self._grid.weight_m)
-        power = float(np.einsum("tg,tg->g", cubes, np.abs(speed)) @ self._grid.weight_m)
-        return power / total if total > 0 else 0.0
+    def _mean_speed(self, speed_m_s: Real) -> float:
+        """Return the mean speed of the beam in m/s, weighted with the power dissipated by drag."""
+        speed_cubed = np.abs(speed_m_s) ** 3
+        total_power = float(speed_cubed.sum(axis=0) @ self._grid.weight_m)
+        speed_times_power = float(
+            np.einsum("tg,tg->g", speed_cubed, np.abs(speed_m_s)) @ self._grid.weight_m
+        )
+        return speed_times_power / total_power if total_power > 0 else 0.0
 
     def _linear_speed(self) -> Real:
         """Return the speeds of the beam points without drag in m/s, shape (3 m, points)."""
-        speed = np.outer(self._oversampled_values(self._speed_transform), self._grid.x_m)
-        for shape, modal_speed in zip(self._grid.shapes, self._modal_speed_by_angle, strict=True):
-            speed += np.outer(self._oversampled_values(modal_speed), shape)
-        return speed
+        point_speed_m_s = np.outer(self._oversampled_values(self._speed_transform), self._grid.x_m)
+        for mode_shape, modal_speed in zip(
+            self._grid.shapes, self._modal_speed_by_angle, strict=True
+        ):
+            point_speed_m_s += np.outer(self._oversampled_values(modal_speed), mode_shape)
+        return point_speed_m_s
 
-    def _add_drag_to_speeds(self, speed: Real, law: DragLaw) -> None:
-        """Replace the speeds without drag by those with drag, in the same array."""
+    def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
+        """Replace the speeds of the beam points without drag, in m/s, by those with drag.
+
+        The array is changed itself.
+        """
         speed_by_state, by_state, by_force = self._time_step_matrices()
-        step = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
+        step_matrix = np.concatenate([self._grid.shapes.T @ speed_by_state, by_state])
         state_by_force = by_force @ self._grid.to_modes
-        state, force, magnitude = np.zeros(len(by_state)), *np.zeros((2, DRAG_POINTS))
-        output = np.zeros(len(step))
-        drag_speed, free_state = output[:DRAG_POINTS], output[DRAG_POINTS:]
+        modal_state, force_per_m, speed_magnitude = (
+            np.zeros(len(by_state)),
+            *np.zeros((2, DRAG_POINTS)),
+        )
+        step_output = np.zeros(len(step_matrix))
+        drag_speed_change, free_state = step_output[:DRAG_POINTS], step_output[DRAG_POINTS:]
         constant_factor, slowing_factor = (
             -HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m,
             -HALF_AIR_DENSITY_KG_PER_M3 * law.slowing,
         )
-        step_dot, force_dot = step.dot, state_by_force.dot
-        add, multiply, absolute, cbrt = np.add, np.multiply, np.absolute, np.cbrt
-        for point_speed in speed:
-            step_dot(state, output)
-            add(point_speed, drag_speed, point_speed)
-            absolute(point_speed, magnitude)
+        multiply_step, multiply_force = step_matrix.dot, state_by_force.dot
+        add, multiply, take_absolute, take_cube_root = np.add, np.multiply, np.absolute, np.cbrt
+        for point_speed in speed_m_s:
+            multiply_step(modal_state, step_output)
+            add(point_speed, drag_speed_change, point_speed)
+            take_absolute(point_speed, speed_magnitude)
             if slowing_factor:
-                cbrt(magnitude, force)
-                multiply(force, slowing_factor, force)
-                multiply(magnitude, constant_factor, magnitude)
-                add(force, magnitude, magnitude)
+                take_cube_root(speed_magnitude, force_per_m)
+                multiply(force_per_m, slowing_factor, force_per_m)
+                multiply(speed_magnitude, constant_factor, speed_magnitude)
+                add(force_per_m, speed_magnitude, speed_magnitude)
             else:
-                multiply(magnitude, constant_factor, magnitude)
-            multiply(magnitude, point_speed, force)
-            force_dot(force, state)
-            add(state, free_state, state)
+                multiply(speed_magnitude, constant_factor, speed_magnitude)
+            multiply(speed_magnitude, point_speed, force_per_m)
+            multiply_force(force_per_m, modal_state)
+            add(modal_state, free_state, modal_state)
 
     def _modal_force_changes(
-        self, speed: Real, law: DragLaw, sources: list[tuple[int, Real]]
+        self, speed_m_s: Real, law: DragLaw, speed_sources: list[tuple[int, Real]]
     ) -> list[Real]:
         """Return the first-order change of the modal forces by added speeds and by the drag law.
 
-        To first order the points are not needed: the effect of the speed of one mode on the force
-        on another is one number at each step. `speed`, shape (3 m, points), is with drag. Each
-        element of `sources` holds the index of a mode and the speed, shape (3 m,), that is added to
-        it.
+        To first order the force on a mode is a sum over the modal speeds, with one factor for each
+        pair of modes at each time step. `speed_m_s`, shape (3 m, points), includes the effect of
+        drag. Each element of `speed_sources` holds the index of a mode, and the speed, shape
+        (3 m,), that is added to this mode. The changes by the two coefficients of the drag law come
+        last.
         """
         speed_by_state, by_state, by_force = self._time_step_matrices()
-        step = np.concatenate([speed_by_state, by_state])
+        step_matrix = np.concatenate([speed_by_state, by_state])
         state_by_force = np.hstack(
             [by_force, np.zeros((len(by_force), 1))]
         )  # the moment is no input
-        run_count, force_weights = len(sources) + 2, self._point_to_modal_forces
-        coupling = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
-        force_changes = np.empty((len(speed), len(force_weights), run_count))
-        state, out = np.zeros((len(by_state), run_count)), np.zeros((len(step), run_count))
+        run_count, force_weights = len(speed_sources) + 2, self._point_to_modal_forces
+        speed_to_force = (force_weights[:, None] * self._grid.shapes).reshape(-1, DRAG_POINTS).T
+        force_changes = np.empty((len(speed_m_s), len(force_weights), run_count))
+        modal_state, out = (
+            np.zeros((len(by_state), run_count)),
+            np.zeros((len(step_matrix), run_count)),
+        )
         modal_speed, free_state = out[:DRAG_MODES], out[DRAG_MODES:]
-        force, dot, add = np.empty(force_changes.shape[1:]), np.dot, np.add
-        for first_step in range(0, len(speed), _STEPS_PER_CHUNK):
-            chunk = slice(first_step, first_step + _STEPS_PER_CHUNK)
-            now, magnitude = force_changes[chunk], np.abs(speed[chunk])
-            cube_root = np.cbrt(magnitude)
-            slope = -2 * HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m * magnitude
+        coupled_force, dot, add = np.empty(force_changes.shape[1:]), np.dot, np.add
+        for first_step in range(0, len(speed_m_s), _STEPS_PER_CHUNK):
+            step_range = slice(first_step, first_step + _STEPS_PER_CHUNK)
+            now, speed_magnitude = force_changes[step_range], np.abs(speed_m_s[step_range])
+            cube_root = np.cbrt(speed_magnitude)
+            force_slope = -2 * HALF_AIR_DENSITY_KG_PER_M3 * law.constant_m * speed_magnitude
             if law.slowing:
-                slope -= (
+                force_slope -= (
                     (1 + _SLOWING_EXPONENT) * HALF_AIR_DENSITY_KG_PER_M3 * law.slowing * cube_root
                 )
-            by_speed = (slope @ coupling).reshape(-1, len(force_weights), DRAG_MODES)
-            for run, (mode, added_speed) in enumerate(sources):
-                np.multiply(by_speed[:, :, mode], added_speed[chunk, None], out=now[:, :, run])
-            for run, power in (-2, magnitude), (-1, cube_root):
+            force_per_mode_speed = (force_slope @ speed_to_force).reshape(
+                -1, len(force_weights), DRAG_MODES
+            )
+            for run, (mode_index, added_speed) in enumerate(speed_sources):
+                np.multiply(
+                    force_per_mode_speed[:, :, mode_index],
+                    added_speed[step_range, None],
+                    out=now[:, :, run],
+                )
+            for run, law_power in (-2, speed_magnitude), (-1, cube_root):
                 now[:, :, run] = (
-                    -HALF_AIR_DENSITY_KG_PER_M3 * power * speed[chunk]
+                    -HALF_AIR_DENSITY_KG_PER_M3 * law_power * speed_m_s[step_range]
                 ) @ force_weights.T
-            for at, matrix in zip(now, by_speed, strict=True):
-                dot(step, state, out)
-                dot(matrix, modal_speed, force)
-                add(at, force, at)
-                dot(state_by_force, at, state)
-                add(state, free_state, state)
+            for at, coupling_matrix in zip(now, force_per_mode_speed, strict=True):
+                dot(step_matrix, modal_state, out)
+                dot(coupling_matrix, modal_speed, coupled_force)
+                add(at, coupled_force, at)
+                dot(state_by_force, at, modal_state)
+                add(modal_state, free_state, modal_state)
         return list(np.ascontiguousarray(force_changes.transpose(2, 1, 0)))
 
     def _time_step_matrices(self) -> tuple[Real, Real, Real]:
@@ -394,147 +444,180 @@ class DragResponse:
         mode, then the modal forces of the last three steps.
         """
         n, step_s = DRAG_MODES, 1 / (_OVERSAMPLING * self._rate_hz)
-        states = 2 * n + _PAST_FORCES * n
-        by_state, by_force = np.zeros((states, states)), np.zeros((states, n))
-        output = np.zeros((n, states))
-        z_prime = self._impedance_slopes()
-        for i, (pair, slope) in enumerate(zip(self._pole_pairs, z_prime, strict=True)):
-            rows = slice(2 * i, 2 * i + 2)
-            decay = np.exp(pair * step_s)
-            force_weights = _force_weights_of_step(pair, step_s)  # (2, 1 + _PAST), the newest first
-            gain = pair / slope / self.plant.beam.bending_stiffness_n_m2
-            if pair[0].imag > 0:
-                a, b = decay[0].real, decay[0].imag
-                by_state[rows, rows] = [[a, -b], [b, a]]
+        state_count = 2 * n + _PAST_FORCES * n
+        by_state, by_force = np.zeros((state_count, state_count)), np.zeros((state_count, n))
+        speed_output = np.zeros((n, state_count))
+        impedance_slopes = self._impedance_slopes()
+        for i, (pole_pair, impedance_slope_pair) in enumerate(
+            zip(self._pole_pairs, impedance_slopes, strict=True)
+        ):
+            state_rows = slice(2 * i, 2 * i + 2)
+            step_decay = np.exp(pole_pair * step_s)
+            force_weights = _force_weights_of_step(
+                pole_pair, step_s
+            )  # (2, 1 + _PAST), the newest first
+            force_gain = pole_pair / impedance_slope_pair / self.plant.beam.bending_stiffness_n_m2
+            if pole_pair[0].imag > 0:
+                a, b = step_decay[0].real, step_decay[0].imag
+                by_state[state_rows, state_rows] = [[a, -b], [b, a]]
                 real_weights = np.array([force_weights[0].real, force_weights[0].imag])
-                output[i, rows] = 2 * gain[0].real, -2 * gain[0].imag
-            elif np.isnan(pair[0]):
+                speed_output[i, state_rows] = 2 * force_gain[0].real, -2 * force_gain[0].imag
+            elif np.isnan(pole_pair[0]):
                 continue
             else:
-                by_state[rows, rows] = np.diag(decay.real)
+                by_state[state_rows, state_rows] = np.diag(step_decay.real)
                 real_weights = force_weights.real
-                output[i, rows] = gain.real
-            by_force[rows, i] = real_weights[:, 0]
-            by_state[rows, 2 * n + i :: n] = real_weights[:, 1:]
+                speed_output[i, state_rows] = force_gain.real
+            by_force[state_rows, i] = real_weights[:, 0]
+            by_state[state_rows, 2 * n + i :: n] = real_weights[:, 1:]
         # Shift the stored forces by one step.
         by_force[2 * n : 3 * n] = np.eye(n)
         by_state[3 * n :, 2 * n : -n] = np.eye((_PAST_FORCES - 1) * n)
         # The new force is not known yet: it is extrapolated from the last three for the speed.
-        with_extrapolated_force = by_state[: 2 * n].copy()
-        for steps_back, factor in enumerate((3.0, -3.0, 1.0)):
-            columns = slice((2 + steps_back) * n, (3 + steps_back) * n)
-            with_extrapolated_force[:, columns] += factor * by_force[: 2 * n]
-        return output[:, : 2 * n] @ with_extrapolated_force, by_state, by_force
+        extrapolating_matrix = by_state[: 2 * n].copy()
+        for steps_back, extrapolation_factor in enumerate((3.0, -3.0, 1.0)):
+            force_columns = slice((2 + steps_back) * n, (3 + steps_back) * n)
+            extrapolating_matrix[:, force_columns] += extrapolation_factor * by_force[: 2 * n]
+        return speed_output[:, : 2 * n] @ extrapolating_matrix, by_state, by_force
 
     def _impedance_slopes(self) -> Complex:
-        """Return the derivative of Z_i by s at both poles of each mode, shape (modes, 2)."""
+        """Return the derivative of the modal impedance Z_i by s at both poles, shape (modes, 2)."""
         s, damping = self._pole_pairs, self.plant.damping
-        ratio = self.plant.beam.density_over_stiffness
+        density_over_stiffness = self.plant.beam.density_over_stiffness
         log_s = np.log(s)
-        external = damping.gamma * np.exp(damping.lambda_ * log_s)
-        internal = damping.zeta * np.exp(damping.alpha * log_s)
-        k = -(ratio * s * s + external) / (1 + internal)  # since Z = 0 at the poles
-        slopes: Complex = (
-            2 * ratio * s + (damping.lambda_ * external + damping.alpha * k * internal) / s
+        external_damping = damping.gamma * np.exp(damping.lambda_ * log_s)
+        internal_damping = damping.zeta * np.exp(damping.alpha * log_s)
+        k = -(density_over_stiffness * s * s + external_damping) / (
+            1 + internal_damping
+        )  # since Z = 0 at the poles
+        impedance_slopes: Complex = (
+            2 * density_over_stiffness * s
+            + (damping.lambda_ * external_damping + damping.alpha * k * internal_damping) / s
         )
-        return slopes
+        return impedance_slopes
 
     @property
     def _point_to_modal_forces(self) -> Real:
-        """Return the matrix from point forces to modal forces and root moment."""
+        """Return the matrix that converts forces at the beam points to modal forces.
+
+        Its last row gives the moment about the root.
+        """
         return np.vstack([self._grid.to_modes, self._grid.to_moment])
 
-    def _modal_forces(self, force: Real) -> Real:
-        """Return modal forces and, last, root moment, shape (modes + 1, 3 m), of point forces."""
-        modal: Real = self._point_to_modal_forces @ force.T
-        return modal
+    def _modal_forces(self, point_force: Real) -> Real:
+        """Convert forces at the beam points to modal forces and, last, the moment about the root.
 
-    def _transform_forces(self, forces: Real) -> Complex:
-        """Transform modal forces and root moment to the points `s`, shape (modes + 1, bins)."""
-        transforms = np.fft.rfft(forces / self._growth, _OVERSAMPLING * self._length)
-        spectra: Complex = transforms[:, : self.s.size] / _OVERSAMPLING
-        return spectra
+        The result has the shape (modes + 1, 3 m).
+        """
+        modal_forces: Real = self._point_to_modal_forces @ point_force.T
+        return modal_forces
 
-    def _torque_transform(self, spectra: Complex) -> Complex:
-        """Return the transform of the torque by modal forces and root moment, without the delay."""
-        torque: Complex = self._leverage @ (self._inertial_response * spectra[:-1]) - spectra[-1]
-        return torque
+    def _transform_forces(self, modal_forces: Real) -> Complex:
+        """Return the Laplace transform of modal forces and root moment at the points `s`.
 
-    def _torque_over_time(self, forces: Real) -> Real:
-        """Return the sampled torque in N·m by modal forces and root moment over time."""
-        return self.in_time(self._torque_transform(self._transform_forces(forces)))
+        Its shape is (modes + 1, bins).
+        """
+        fine_transforms = np.fft.rfft(modal_forces / self._growth, _OVERSAMPLING * self._length)
+        force_spectra: Complex = fine_transforms[:, : self.s.size] / _OVERSAMPLING
+        return force_spectra
 
-    def in_time(self, torque: Complex) -> Real:
-        """Convert the transform of a torque to samples, after the torque channel, (..., m).
+    def _torque_transform(self, force_spectra: Complex) -> Complex:
+        """Return the Laplace transform of the torque that modal forces and root moment cause.
+
+        It is in N·m·s at the points `s`, without the delay of the torque.
+        """
+        torque_spectrum: Complex = (
+            self._leverage @ (self._inertial_response * force_spectra[:-1]) - force_spectra[-1]
+        )
+        return torque_spectrum
+
+    def _torque_over_time(self, modal_forces: Real) -> Real:
+        """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
+        return self.in_time(self._torque_transform(self._transform_forces(modal_forces)))
+
+    def in_time(self, torque_transform: Complex) -> Real:
+        """Convert the Laplace transform of a torque to samples in N·m, shape (..., m).
+
+        The samples include delay and filters of the torque channel.
 
         Parameters
         ----------
-        torque : ndarray of complex, shape (..., bins)
+        torque_transform : ndarray of complex, shape (..., bins)
             Transform of the torque at the points `s`.
         """
-        values = np.fft.irfft(torque * self._torque_channel, self._length)[..., : self._samples]
-        values *= self._growth[::_OVERSAMPLING]
-        return values
+        torque_nm = np.fft.irfft(torque_transform * self._torque_channel, self._length)[
+            ..., : self._samples
+        ]
+        torque_nm *= self._growth[::_OVERSAMPLING]
+        return torque_nm
 
-    def modal_torque(self, mode: int) -> Complex:
+    def modal_torque(self, mode_number: int) -> Complex:
         """Return the transform of the linear torque by one mode, without the delay, shape (bins,).
 
         Modes are numbered from 1. This part of the linear torque contains its whole dependence on
         the poles of the mode.
         """
-        torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode - 1]
-        torque: Complex = (
-            torque_factor * self._inertia_term * self._modal_speed_by_angle[mode - 1] / self.s
+        torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode_number - 1]
+        torque_spectrum: Complex = (
+            torque_factor
+            * self._inertia_term
+            * self._modal_speed_by_angle[mode_number - 1]
+            / self.s
         )
-        return torque
+        return torque_spectrum
 
-    def _oversampled_values(self, spectrum: Complex) -> Real:
-        """Return the values of a transform at three times the sampling rate, shape (..., 3 m)."""
-        fine = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
-        values: Real = fine[..., : self._growth.size] * self._growth
-        return values
+    def _oversampled_values(self, laplace_transform: Complex) -> Real:
+        """Convert a Laplace transform to values over time, at three times the sampling rate.
+
+        Their shape is (..., 3 m).
+        """
+        fine_samples = np.fft.irfft(_OVERSAMPLING * laplace_transform, _OVERSAMPLING * self._length)
+        oversampled_values: Real = fine_samples[..., : self._growth.size] * self._growth
+        return oversampled_values
 
 
-def _drag_force(speed: Real, law: DragLaw) -> Real:
-    """Return the drag force per metre in N/m, of the shape of the speeds."""
-    magnitude = np.abs(speed)
-    per_speed = law.constant_m * magnitude
+def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:
+    """Return the drag force per length of the beam in N/m, at speeds in m/s of the same shape."""
+    speed_magnitude = np.abs(speed_m_s)
+    force_per_speed = law.constant_m * speed_magnitude
     if law.slowing:
-        per_speed += law.slowing * np.cbrt(magnitude)
-    force: Real = -HALF_AIR_DENSITY_KG_PER_M3 * per_speed * speed
-    return force
+        force_per_speed += law.slowing * np.cbrt(speed_magnitude)
+    force_n_per_m: Real = -HALF_AIR_DENSITY_KG_PER_M3 * force_per_speed * speed_m_s
+    return force_n_per_m
 
 
 def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
-    """Return both poles of each mode, shape (modes, 2), from its ``(k L)^4``."""
-    pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
-    return pairs.astype(np.complex128)
+    """Return both poles of each mode in rad/s, shape (modes, 2), from its ``(k L)^4``."""
+    pole_pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
+    return pole_pairs.astype(np.complex128)
 
 
-def _force_weights_of_step(pole: Complex, step_s: float) -> Complex:
-    """Return the weights of the last forces in one time step of ``z' = p z + F``.
+def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
+    """Return the weights of the last forces F in one time step of the equation ``z' = p z + F``.
 
-    They have the shape (poles, 1 + `_PAST_FORCES`), with the newest force first. Between the
-    instants the force is the polynomial through all of these forces.
+    p are the given poles. The weights have the shape (poles, 1 + `_PAST_FORCES`), with the newest
+    force first. Between the instants the force is the polynomial through all of these forces.
     """
-    node, weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
-    fraction = 0.5 * (node + 1)
-    nodes = 1.0 - np.arange(1 + _PAST_FORCES)
-    lagrange = np.array(
+    quadrature_node, quadrature_weight = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
+    step_fraction = 0.5 * (quadrature_node + 1)
+    force_instants = 1.0 - np.arange(1 + _PAST_FORCES)
+    lagrange_values = np.array(
         [
             np.prod(
                 [
-                    (fraction - other_node) / (own_node - other_node)
-                    for other_node in nodes
-                    if other_node != own_node
+                    (step_fraction - other_instant) / (own_instant - other_instant)
+                    for other_instant in force_instants
+                    if other_instant != own_instant
                 ],
                 axis=0,
             )
-            for own_node in nodes
+            for own_instant in force_instants
         ]
     )
-    decay = np.exp(pole[:, None] * (step_s * (1 - fraction)))
-    weights_of_forces: Complex = decay * (0.5 * step_s * weight) @ lagrange.T
+    remaining_decay = np.exp(poles_per_s[:, None] * (step_s * (1 - step_fraction)))
+    weights_of_forces: Complex = (
+        remaining_decay * (0.5 * step_s * quadrature_weight) @ lagrange_values.T
+    )
     return weights_of_forces
 
 
@@ -584,9 +667,15 @@ class DragExpansion:
     top_speed_m_s: float
 
     def change_to(
-        self, plant: Plant, poles: Sequence[Pole], names: Sequence[str], parameter_slopes: Real
+        self,
+        plant: Plant,
+        poles: Sequence[Pole],
+        parameter_names: Sequence[str],
+        parameter_slopes: Real,
     ) -> tuple[Complex, Complex]:
-        """Return how the drag torque changes for another beam, and the derivatives of this change.
+        """Return the change of the drag torque if another beam replaces this one.
+
+        Its derivatives by the unknowns of the other beam are returned as well.
 
         Parameters
         ----------
@@ -594,7 +683,7 @@ class DragExpansion:
             Rig with the other beam.
         poles : sequence of Pole
             Poles of the other beam, differentiated by the unknowns.
-        names : sequence of str
+        parameter_names : sequence of str
             Names of the parameters, as in `Unknowns`.
         parameter_slopes : ndarray, shape (len(names), k)
             Derivatives of the parameters by the unknowns, with density over stiffness and stiffness
@@ -602,52 +691,55 @@ class DragExpansion:
 
         Returns
         -------
-        change : ndarray of complex, shape (K,)
+        torque_change : ndarray of complex, shape (K,)
             Spectrum of the change of the torque, in the band.
-        jacobian : ndarray of complex, shape (k, K)
+        torque_jacobian : ndarray of complex, shape (k, K)
             Derivatives of the change by the unknowns.
         """
-        rows, steps, slopes = [], [], []
+        derivative_spectra, parameter_steps, step_slopes = [], [], []
         own_poles = {
             pole.mode: pole.at_rad_s for pole in mode_poles(self.plant, len(self.by_pole), ())
         }
         for pole in poles:
             if pole.mode in self.by_pole and pole.oscillates and pole.mode in own_poles:
                 pole_step = pole.at_rad_s - own_poles[pole.mode]
-                remainder, remainder_slopes = self._torque_beyond_first_order(
+                higher_order_torque, remainder_slopes = self._torque_beyond_first_order(
                     pole.mode, own_poles[pole.mode], pole.at_rad_s
                 )
                 by_pole = self.by_pole[pole.mode]
                 # Derivatives at the pole of the other beam; the remainder itself is a separate row.
-                rows += [*by_pole, *remainder_slopes, remainder]
-                steps += [pole_step.real, pole_step.imag, 0.0, 0.0, -1.0]
+                derivative_spectra += [*by_pole, *remainder_slopes, higher_order_torque]
+                parameter_steps += [pole_step.real, pole_step.imag, 0.0, 0.0, -1.0]
                 pole_slopes = [pole.derivative.real, pole.derivative.imag]
-                slopes += [
+                step_slopes += [
                     *pole_slopes,
                     *(-pole_slope for pole_slope in pole_slopes),
                     np.zeros(parameter_slopes.shape[1]),
                 ]
-        rows.append(self.by_ln_density)
+        derivative_spectra.append(self.by_ln_density)
         own_density, other_density = self.plant.beam.density_kg_per_m, plant.beam.density_kg_per_m
-        steps.append(np.log(other_density / own_density))
+        parameter_steps.append(np.log(other_density / own_density))
         # ln(mass per length) is the sum of ln(rho/EI) and ln(EI).
-        slopes.append(_parameter_rows(parameter_slopes, names, BEAM_PARAMETERS).sum(axis=0))
-        for by_external, values in zip(
+        step_slopes.append(
+            _parameter_rows(parameter_slopes, parameter_names, BEAM_PARAMETERS).sum(axis=0)
+        )
+        for by_external, damping_change in zip(
             self.by_external, self._external_damping_change(plant), strict=True
         ):
-            rows += list(by_external)
-            steps += values[:, 0].tolist()
-            slopes += list(
-                values[:, 1:] @ _parameter_rows(parameter_slopes, names, _EXTERNAL_PARAMETERS)
+            derivative_spectra += list(by_external)
+            parameter_steps += damping_change[:, 0].tolist()
+            step_slopes += list(
+                damping_change[:, 1:]
+                @ _parameter_rows(parameter_slopes, parameter_names, _EXTERNAL_PARAMETERS)
             )
-        rows.append(self.by_delay)
-        steps.append(plant.delay_s - self.plant.delay_s)
-        slopes += list(_parameter_rows(parameter_slopes, names, ("delay_s",)))
+        derivative_spectra.append(self.by_delay)
+        parameter_steps.append(plant.delay_s - self.plant.delay_s)
+        step_slopes += list(_parameter_rows(parameter_slopes, parameter_names, ("delay_s",)))
         # A real view suffices, since the spectra are multiplied by real numbers only.
-        real_rows = np.array(rows).view(np.float64)
-        change: Complex = (np.array(steps) @ real_rows).view(np.complex128)
-        jacobian: Complex = (np.array(slopes).T @ real_rows).view(np.complex128)
-        return change, jacobian
+        real_spectra = np.array(derivative_spectra).view(np.float64)
+        torque_change: Complex = (np.array(parameter_steps) @ real_spectra).view(np.complex128)
+        torque_jacobian: Complex = (np.array(step_slopes).T @ real_spectra).view(np.complex128)
+        return torque_change, torque_jacobian
 
     def _external_damping_change(self, plant: Plant) -> list[Real]:
         """Return the external damping of another beam minus that of this beam, for two modes.
@@ -663,46 +755,64 @@ class DragExpansion:
             lambda.
         """
         own_damping, other_damping = self.plant.damping, plant.damping
-        differences = []
+        linear_terms = []
         for s in self.response.poles[_LOWEST_MODE_INDICES].tolist():
             if not s.imag > 0:  # no such oscillation
-                differences.append(np.zeros((2, 3)))
+                linear_terms.append(np.zeros((2, 3)))
                 continue
             log_s, per_gamma = np.log(s), s**other_damping.lambda_
-            difference = (
+            damping_difference = (
                 other_damping.gamma * per_gamma - own_damping.gamma * s**own_damping.lambda_
             )
-            values = np.array([difference, per_gamma, other_damping.gamma * log_s * per_gamma])
-            linear_term = values.imag / s.imag
-            differences.append(np.array([values.real - linear_term * s.real, linear_term]))
-        return differences
+            damping_and_slopes = np.array(
+                [damping_difference, per_gamma, other_damping.gamma * log_s * per_gamma]
+            )
+            linear_term = damping_and_slopes.imag / s.imag
+            linear_terms.append(
+                np.array([damping_and_slopes.real - linear_term * s.real, linear_term])
+            )
+        return linear_terms
 
     def _torque_beyond_first_order(
-        self, mode: int, own_pole: complex, other_pole: complex
+        self, mode_number: int, own_pole: complex, other_pole: complex
     ) -> tuple[Complex, Complex]:
-        """Return the part of one mode's linear torque beyond first order in its pole.
+        """Return the change of one mode's torque with its pole, without the first-order part.
 
-        The torque spectrum has the shape (K,). It is returned with its derivatives by the real and
+        The spectrum has the shape (K,). It is returned with its derivatives by the real and
         the imaginary part of the pole, shape (2, K).
         """
-        s, torque = self.response.s, self.response.modal_torque(mode)
+        s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
         pole_step = other_pole - own_pole
         own_term, own_conjugate_term = 1 / (s - own_pole), 1 / (s - own_pole.conjugate())
         other_term, other_conjugate_term = 1 / (s - other_pole), 1 / (s - other_pole.conjugate())
-        ratio = other_term * other_conjugate_term / (own_term * own_conjugate_term)
-        first_order = pole_step * own_term + pole_step.conjugate() * own_conjugate_term
-        by_real_part = ratio * (other_term + other_conjugate_term) - (own_term + own_conjugate_term)
-        by_imaginary_part = 1j * (
-            ratio * (other_term - other_conjugate_term) - (own_term - own_conjugate_term)
+        term_ratio = other_term * other_conjugate_term / (own_term * own_conjugate_term)
+        first_order_change = pole_step * own_term + pole_step.conjugate() * own_conjugate_term
+        by_real_part = term_ratio * (other_term + other_conjugate_term) - (
+            own_term + own_conjugate_term
         )
-        spectra = torque * np.array([ratio - 1 - first_order, by_real_part, by_imaginary_part])
-        remainder, *remainder_slopes = self.band(self.response.in_time(spectra))
+        by_imaginary_part = 1j * (
+            term_ratio * (other_term - other_conjugate_term) - (own_term - own_conjugate_term)
+        )
+        remainder_transforms = torque_spectrum * np.array(
+            [term_ratio - 1 - first_order_change, by_real_part, by_imaginary_part]
+        )
+        remainder, *remainder_slopes = self.band(self.response.in_time(remainder_transforms))
         return remainder, np.array(remainder_slopes)
 
 
-def _parameter_rows(derivatives: Real, names: Sequence[str], parameters: Sequence[str]) -> Real:
-    """Return the rows of a derivative matrix for some parameters, zero for missing ones, (n, k)."""
+def _parameter_rows(
+    derivatives: Real, derivative_names: Sequence[str], wanted_names: Sequence[str]
+) -> Real:
+    """Return the derivatives of the wanted parameters by the unknowns, shape (n, k).
+
+    `derivative_names` are the parameters of the given rows. A missing parameter gets zeros.
+    """
     zero_row = np.zeros(derivatives.shape[1])
     return np.array(
-        [derivatives[names.index(name)] if name in names else zero_row for name in parameters]
+        [
+            derivatives[derivative_names.index(parameter_name)]
+            if parameter_name in derivative_names
+            else zero_row
+            for parameter_name in wanted_names
+        ]
     )

@@ -61,66 +61,72 @@ def count_decay_spectra(poles: Sequence[Pole]) -> int:
 
 
 def mode_poles(
-    plant: Plant, count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
+    plant: Plant, mode_count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
 ) -> tuple[Pole, ...]:
-    """Return the poles of the first `count` modes with derivatives. A mode may have none.
+    """Return the poles of the first `mode_count` modes of a beam, with their derivatives.
+
+    A mode for which no pole is found is left out.
 
     Parameters
     ----------
     plant : Plant
         Rig and beam.
-    count : int
+    mode_count : int
         Number of modes.
     wrt : sequence of str
         Parameters of the derivatives, by the names of `ResponseGrid`. Some do not affect a pole.
     near_rad_s : sequence of complex, optional
         Approximate poles in the order of the modes, if all are known.
     """
-    near_poles = np.array(near_rad_s) if len(near_rad_s) == count > 0 else None
+    start_poles = np.array(near_rad_s) if len(near_rad_s) == mode_count > 0 else None
     if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
-        return _loaded_poles(plant, count, wrt, near_poles)
-    z = eigenvalues(count).copy()
-    for index, offset in enumerate(plant.stiffness_offsets[: count - 1], start=1):
-        z[index] *= (1 + offset) ** 0.25
-    poles = []
-    for i, pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, near_poles)):
-        if np.isnan(pair[0]):
+        return _loaded_poles(plant, mode_count, wrt, start_poles)
+    z = eigenvalues(mode_count).copy()
+    for mode_index, stiffness_offset in enumerate(
+        plant.stiffness_offsets[: mode_count - 1], start=1
+    ):
+        z[mode_index] *= (1 + stiffness_offset) ** 0.25
+    found_poles = []
+    for i, pole_pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, start_poles)):
+        if np.isnan(pole_pair[0]):
             continue
         k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
-        for pole in pair[: 1 if pair[0].imag else 2]:
+        for pole in pole_pair[: 1 if pole_pair[0].imag else 2]:
             pole_derivative = pole_gradient(
                 complex(pole), k4_per_m4, plant.beam, plant.damping, wrt
             )
-            poles.append(
+            found_poles.append(
                 Pole(i + 1, complex(pole), pole_derivative.astype(np.complex128, copy=False))
             )
-    return tuple(poles)
+    return tuple(found_poles)
 
 
 def _loaded_poles(
-    plant: Plant, count: int, wrt: Sequence[str], near: NDArray[np.complex128] | None
+    plant: Plant, mode_count: int, wrt: Sequence[str], start_poles: NDArray[np.complex128] | None
 ) -> tuple[Pole, ...]:
     """Return the poles of a uniform beam with a tip mass or an elastic clamp, with derivatives."""
-    loaded = LoadedBeam(
+    loaded_beam = LoadedBeam(
         plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
     )
     mode_and_pole = [
-        (mode, pole)
-        for mode, pair in enumerate(loaded.poles(eigenvalues(count), near), start=1)
-        if not np.isnan(pair).any()
-        for pole in pair[: 1 if pair[0].imag else 2]
+        (mode_number, pole)
+        for mode_number, pole_pair in enumerate(
+            loaded_beam.poles(eigenvalues(mode_count), start_poles), start=1
+        )
+        if not np.isnan(pole_pair).any()
+        for pole in pole_pair[: 1 if pole_pair[0].imag else 2]
     ]
-    pole_derivatives = loaded.pole_gradients(
+    pole_derivatives = loaded_beam.pole_gradients(
         np.array([pole for _, pole in mode_and_pole], dtype=np.complex128), wrt
     )
     return tuple(
-        Pole(mode, complex(pole), row)
-        for (mode, pole), row in zip(mode_and_pole, pole_derivatives, strict=True)
+        Pole(mode_number, complex(pole), row)
+        for (mode_number, pole), row in zip(mode_and_pole, pole_derivatives, strict=True)
     )
 
 
 class DecaySpectra:
-    """Discrete Fourier transforms of free decays over a number of samples, at some bins.
+    """Computation of the spectra of free decays of the beam, at given frequencies.
 
     Parameters
     ----------
@@ -134,9 +140,9 @@ class DecaySpectra:
 
     __slots__ = ("_duration_s", "_period_s", "_sample_rotation")
 
-    def __init__(self, samples: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
+    def __init__(self, sample_count: int, rate_hz: float, omega_rad_s: NDArray[np.float64]) -> None:
         self._period_s = 1 / rate_hz
-        self._duration_s = samples / rate_hz
+        self._duration_s = sample_count / rate_hz
         self._sample_rotation = np.exp(-1j * omega_rad_s * self._period_s)
 
     def columns(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
@@ -159,24 +165,30 @@ class DecaySpectra:
             Amplitude of each decay spectrum, in N·m.
         """
         weighted_derivatives = []
-        index = 0
+        amplitude_index = 0
         for pole in poles:
             if pole.oscillates:
                 # t exp(p t) times the derivative of the pole, for the two amplitudes.
-                derivative = complex(amplitudes[index], -amplitudes[index + 1]) * pole.derivative
-                weighted_derivatives += [derivative.real, -derivative.imag]
-                index += 2
+                pole_slope = (
+                    complex(amplitudes[amplitude_index], -amplitudes[amplitude_index + 1])
+                    * pole.derivative
+                )
+                weighted_derivatives += [pole_slope.real, -pole_slope.imag]
+                amplitude_index += 2
             else:
-                weighted_derivatives.append(amplitudes[index] * pole.derivative.real)
-                index += 1
+                weighted_derivatives.append(amplitudes[amplitude_index] * pole.derivative.real)
+                amplitude_index += 1
         real_parts: NDArray[np.float64] = np.array(weighted_derivatives).T @ self.growing(
             poles
         ).view(np.float64)
-        gradient: NDArray[np.complex128] = real_parts.view(np.complex128)
-        return gradient
+        spectrum_slopes: NDArray[np.complex128] = real_parts.view(np.complex128)
+        return spectrum_slopes
 
     def growing(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the spectra of the decays times the time since the first sample, shape (m, K)."""
+        """Return the spectra of ``t exp(p t)`` of each pole p, shape (m, K).
+
+        The time t begins at the first sample.
+        """
         return self._real_spectra(poles, self._transform_of_growing_decay)
 
     def hum(self, frequency_hz: Sequence[float]) -> NDArray[np.complex128]:
@@ -198,36 +210,40 @@ class DecaySpectra:
         self, poles: Sequence[Pole], spectrum_of_pole: Callable[[complex], NDArray[np.complex128]]
     ) -> NDArray[np.complex128]:
         """Return one spectrum for each real pole, two for each oscillating one, shape (m, K)."""
-        rows = np.empty((count_decay_spectra(poles), self._sample_rotation.size), complex)
-        index = 0
+        real_spectra = np.empty((count_decay_spectra(poles), self._sample_rotation.size), complex)
+        row_index = 0
         for pole in poles:
             pole_spectrum = spectrum_of_pole(pole.at_rad_s)
             if pole.oscillates:
                 conjugate_spectrum = spectrum_of_pole(pole.at_rad_s.conjugate())
-                np.multiply(pole_spectrum + conjugate_spectrum, 0.5, out=rows[index])
-                np.multiply(pole_spectrum - conjugate_spectrum, -0.5j, out=rows[index + 1])
-                index += 2
+                np.multiply(pole_spectrum + conjugate_spectrum, 0.5, out=real_spectra[row_index])
+                np.multiply(
+                    pole_spectrum - conjugate_spectrum, -0.5j, out=real_spectra[row_index + 1]
+                )
+                row_index += 2
             else:
-                rows[index] = pole_spectrum
-                index += 1
-        return rows
+                real_spectra[row_index] = pole_spectrum
+                row_index += 1
+        return real_spectra
 
     def _transform_of_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the discrete Fourier transform of ``exp(p t)`` over the samples, shape (K,)."""
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
-        spectrum: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (1 - step_factor)
-        return spectrum
+        decay_spectrum: NDArray[np.complex128] = (1 - np.exp(pole * self._duration_s)) / (
+            1 - step_factor
+        )
+        return decay_spectrum
 
     def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the discrete Fourier transform of ``t exp(p t)`` over the samples, shape (K,)."""
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)
         reciprocal = np.reciprocal(1 - step_factor)
-        spectrum: NDArray[np.complex128] = step_factor * reciprocal
-        spectrum *= (1 - end_value) * self._period_s
-        spectrum -= self._duration_s * end_value
-        spectrum *= reciprocal
-        return spectrum
+        decay_spectrum: NDArray[np.complex128] = step_factor * reciprocal
+        decay_spectrum *= (1 - end_value) * self._period_s
+        decay_spectrum -= self._duration_s * end_value
+        decay_spectrum *= reciprocal
+        return decay_spectrum
 
 
 class LaterDecaySpectra(DecaySpectra):
@@ -255,13 +271,13 @@ class LaterDecaySpectra(DecaySpectra):
 
     def __init__(
         self,
-        samples: int,
+        sample_count: int,
         rate_hz: float,
         omega_rad_s: NDArray[np.float64],
         first_s: float,
         tick_s: float,
     ) -> None:
-        super().__init__(samples, rate_hz, omega_rad_s)
+        super().__init__(sample_count, rate_hz, omega_rad_s)
         self._duration_s -= first_s
         self._tick_s = tick_s
         self._tick_rotation = np.exp(-1j * omega_rad_s * tick_s)
@@ -271,23 +287,23 @@ class LaterDecaySpectra(DecaySpectra):
         """Return the transform of ``exp(p t)`` from the first tick to the last sample, (K,)."""
         begin_denominator = 1 - np.exp(pole * self._tick_s) * self._tick_rotation
         end_denominator = 1 - np.exp(pole * self._period_s) * self._sample_rotation
-        spectrum: NDArray[np.complex128] = (
+        decay_spectrum: NDArray[np.complex128] = (
             self._first_tick_factor / begin_denominator
             - np.exp(pole * self._duration_s) / end_denominator
         )
-        return spectrum
+        return decay_spectrum
 
     def _transform_of_growing_decay(self, pole: complex) -> NDArray[np.complex128]:
         """Return the transform of ``t exp(p t)`` from the first tick to the last sample, (K,)."""
         tick_factor = np.exp(pole * self._tick_s) * self._tick_rotation
         step_factor = np.exp(pole * self._period_s) * self._sample_rotation
         end_value = np.exp(pole * self._duration_s)
-        spectrum: NDArray[np.complex128] = (
+        decay_spectrum: NDArray[np.complex128] = (
             self._first_tick_factor * self._tick_s * tick_factor / (1 - tick_factor) ** 2
         )
-        spectrum -= (
+        decay_spectrum -= (
             end_value
             * (self._duration_s + self._period_s * step_factor / (1 - step_factor))
             / (1 - step_factor)
         )
-        return spectrum
+        return decay_spectrum

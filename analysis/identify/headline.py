@@ -90,7 +90,7 @@ class ReportedValue:
 
     Attributes
     ----------
-    value : float
+    estimated_value : float
         Estimate in SI units.
     std : float or None
         Standard deviation. None if the data do not determine it.
@@ -117,11 +117,11 @@ class ReportedValue:
 
     def as_json(self) -> dict[str, Any]:
         """Return value, standard deviation, 95 % interval and flag as a JSON-ready dict."""
-        interval_95 = None if self.interval_95 is None else list(self.interval_95)
+        interval_list = None if self.interval_95 is None else list(self.interval_95)
         return {
             "value": self.value,
             "std": self.std,
-            "interval_95": interval_95,
+            "interval_95": interval_list,
             "flag": self.flag,
         }
 
@@ -244,7 +244,7 @@ class Estimates:
     modal: ModalEstimate | None = None
 
     def doubted(self, flag: str) -> Self:
-        """Return the estimates with a flag on every number that has none.
+        """Return the estimates with a given flag on every number that has no flag yet.
 
         Parameters
         ----------
@@ -253,7 +253,10 @@ class Estimates:
         """
         return replace(
             self,
-            parameters={name: each.flagged(flag) for name, each in self.parameters.items()},
+            parameters={
+                parameter_name: each.flagged(flag)
+                for parameter_name, each in self.parameters.items()
+            },
             sizes=tuple(each.flagged(flag) for each in self.sizes),
             modes=tuple(
                 replace(
@@ -289,13 +292,13 @@ class Headline(Estimates):
 
     @property
     def flags(self) -> dict[str, str]:
-        """Return, for each parameter that is not valid, the reason why."""
+        """Return the reason why a parameter is not valid, for each flagged parameter, by name."""
         return {name: each.flag for name, each in self.parameters.items() if each.flag}
 
     @property
     def visible_modes(self) -> tuple[int, ...]:
         """Return the numbers of the modes that the record shows."""
-        return tuple(mode.number for mode in self.modes if mode.shown)
+        return tuple(reported_mode.number for reported_mode in self.modes if reported_mode.shown)
 
     def with_stiffness_law_flag(self) -> Headline:
         """Return the headline with a flag on numbers that depend on the assumed stiffness law."""
@@ -321,12 +324,12 @@ class Headline(Estimates):
         status : str
             "selected", "compatible" or "excluded".
         """
-        return tuple(name for name, its in self.structures if its == status)
+        return tuple(structure_name for structure_name, its in self.structures if its == status)
 
 
 def headline(
     candidate_set: CandidateSet,
-    orders: tuple[OrderVerdict, OrderVerdict],
+    order_verdicts: tuple[OrderVerdict, OrderVerdict],
     visible_numbers: tuple[int, ...],
     *,
     unexplained: str | None,
@@ -337,7 +340,7 @@ def headline(
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     visible_numbers : tuple of int
         Numbers of the visible modes.
@@ -345,37 +348,41 @@ def headline(
         Reason against every number. None if the residual is noise only.
     """
     freest = candidate_set.freest
-    fractional_orders = frozenset(each.order for each in orders if each.status == "fractional")
-    reasons: dict[str, str] = {
-        each.order: each.reason for each in orders if each.reason is not None
+    fractional_orders = frozenset(
+        each.order for each in order_verdicts if each.status == "fractional"
+    )
+    order_reasons: dict[str, str] = {
+        each.order: each.reason for each in order_verdicts if each.reason is not None
     }
-    intervals: dict[str, tuple[float, float]] = {
+    order_intervals: dict[str, tuple[float, float]] = {
         each.order: each.profile.interval
-        for each in orders
+        for each in order_verdicts
         if each.profile.is_computed and each.order in freest.structure.free
     }
-    result = headline_of_fit(
-        freest.name, freest.fit, visible_numbers, reasons, intervals, unexplained,
+    reported_headline = headline_of_fit(
+        freest.name, freest.fit, visible_numbers, order_reasons, order_intervals, unexplained,
         candidate_set.fit_with_both_dampings(freest),
     )  # fmt: skip
     if candidate_set.drag is not None:
-        drag = candidate_set.drag
-        reported_drag = ReportedValue(drag.value_m, drag.std_m, drag.interval_95_m, unexplained)
+        drag_estimate = candidate_set.drag
+        reported_drag = ReportedValue(
+            drag_estimate.value_m, drag_estimate.std_m, drag_estimate.interval_95_m, unexplained
+        )
         loss_factors = (
             each.flagged(WITH_DRAG_REASON) if each.damping == "external" else each
-            for each in result.sizes
+            for each in reported_headline.sizes
         )
-        result = replace(
-            result,
-            parameters={**result.parameters, "drag": reported_drag},
+        reported_headline = replace(
+            reported_headline,
+            parameters={**reported_headline.parameters, "drag": reported_drag},
             sizes=tuple(loss_factors),
-            drag_speed_m_s=drag.speed_m_s,
+            drag_speed_m_s=drag_estimate.speed_m_s,
         )
     conditional_estimate = (
         _conditional_estimate(candidate_set, fractional_orders) if unexplained is None else None
     )
     return replace(
-        result,
+        reported_headline,
         structures=structures(candidate_set, fractional_orders),
         simpler=conditional_estimate,
     )
@@ -385,8 +392,8 @@ def headline_of_fit(
     name: str,
     fit: RecordFit,
     visible_numbers: Collection[int],
-    reasons: Mapping[str, str] = _EMPTY_MAPPING,
-    intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
+    order_reasons: Mapping[str, str] = _EMPTY_MAPPING,
+    order_intervals: Mapping[str, tuple[float, float]] = _EMPTY_MAPPING,
     unexplained: str | None = None,
     both: tuple[RecordFit, bool] | None = None,
 ) -> Headline:
@@ -400,9 +407,9 @@ def headline_of_fit(
         Fit whose parameters are reported.
     visible_numbers : collection of int
         Numbers of the modes that the record shows.
-    reasons : mapping of str to str
+    order_reasons : mapping of str to str
         Reasons against "alpha" or "lambda", which also apply to the coefficients.
-    intervals : mapping of str to (float, float)
+    order_intervals : mapping of str to (float, float)
         95 % intervals of orders, used instead of those of the fit.
     unexplained : str, optional
         Reason against all numbers.
@@ -411,19 +418,21 @@ def headline_of_fit(
     """
     with_both, uses_both = both or (fit, False)
     damping_reason = ONE_MODE_REASON if len(visible_numbers) < _MODES_TO_SEPARATE_DAMPINGS else None
-    if SECOND_DAMPING_REASON in reasons.values():
+    if SECOND_DAMPING_REASON in order_reasons.values():
         damping_reason = SECOND_DAMPING_REASON
-    flags: dict[str, str] = {
-        name: reason for order, reason in reasons.items() for name in (order, COEFFICIENT_OF[order])
+    parameter_flags: dict[str, str] = {
+        parameter_name: order_reason
+        for order_name, order_reason in order_reasons.items()
+        for parameter_name in (order_name, COEFFICIENT_OF[order_name])
     }
     if damping_reason or not COEFFICIENT_OF.keys().isdisjoint(fit.at_bounds):
-        flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
+        parameter_flags |= dict.fromkeys(BEAM_PARAMETERS, _NOT_SEPARABLE_FLAG)
     return Headline(
         name=name,
         fit=fit,
         parameters={
             each: _reported_parameter(
-                fit, each, unexplained or flags.get(each), intervals.get(each)
+                fit, each, unexplained or parameter_flags.get(each), order_intervals.get(each)
             )
             for each in fit.parameters
             if fit.structure.has(each)
@@ -432,21 +441,21 @@ def headline_of_fit(
             # A loss factor is valid without its order. A coefficient is valid with its order only.
             reported_loss_factor(
                 each,
-                size,
+                loss_factor,
                 unexplained
                 or (
-                    reasons.get(DAMPING_PARAMETER_NAMES[each][1])
-                    if size.omega_rad_s is None
+                    order_reasons.get(DAMPING_PARAMETER_NAMES[each][1])
+                    if loss_factor.omega_rad_s is None
                     else None
                 )
                 or damping_reason,
             )
-            for each, size in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
-            if size is not None
+            for each, loss_factor in zip(_DAMPINGS, (fit.internal, fit.external), strict=True)
+            if loss_factor is not None
         ),
         modes=tuple(
-            _reported_mode(mode, visible_numbers, unexplained)
-            for mode in (
+            _reported_mode(mode_estimate, visible_numbers, unexplained)
+            for mode_estimate in (
                 _modes_with_wider_uncertainty(fit, with_both) if uses_both else with_both.modes
             )
         ),
@@ -484,96 +493,123 @@ def structures(
 def _structure_status(
     candidate_set: CandidateSet, candidate: Candidate, fractional_orders: frozenset[str]
 ) -> StructureStatus:
-    """Return whether the structure of a candidate is selected, compatible or excluded."""
-    freest = candidate_set.freest
-    if candidate is freest:
+    """Return "selected" for the reported structure, otherwise "compatible" or "excluded".
+
+    Excluded structures are those that the record contradicts.
+    """
+    freest_candidate = candidate_set.freest
+    if candidate is freest_candidate:
         return "selected"
-    is_special_case = set(candidate.structure.free) < set(freest.structure.free)
+    is_special_case = set(candidate.structure.free) < set(freest_candidate.structure.free)
     if not is_special_case:
-        is_less_likely = candidate.deviance - freest.deviance > EXCLUSION_DEVIANCES[0]
+        has_less_likelihood = (
+            candidate.deviance - freest_candidate.deviance > EXCLUSION_DEVIANCES[0]
+        )
         has_worse_bic = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
-        return "excluded" if is_less_likely and has_worse_bic else "compatible"
+        return "excluded" if has_less_likelihood and has_worse_bic else "compatible"
     if any(
-        candidate.structure.fixed.get(order) == 1.0  # type: ignore[call-overload]
-        for order in fractional_orders
+        candidate.structure.fixed.get(order_name) == 1.0  # type: ignore[call-overload]
+        for order_name in fractional_orders
     ):
         return "excluded"
-    missing_parameters = freest.parameters - candidate.parameters
-    limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
-    return "excluded" if candidate.deviance - freest.deviance > limit else "compatible"
+    missing_parameters = freest_candidate.parameters - candidate.parameters
+    deviance_limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
+    return (
+        "excluded"
+        if candidate.deviance - freest_candidate.deviance > deviance_limit
+        else "compatible"
+    )
 
 
 def _conditional_estimate(
     candidate_set: CandidateSet, fractional_orders: frozenset[str]
 ) -> ConditionalEstimate | None:
-    """Return the estimates of the simplest compatible structure, or None if there is none."""
-    freest = candidate_set.freest
+    """Return parameter estimates under the simplest structure that the record does not exclude.
+
+    Return None if no structure is simpler than the reported one.
+    """
+    freest_candidate = candidate_set.freest
     compatible_candidates = [
-        each
-        for each in candidate_set.candidates
-        if each.parameters < freest.parameters
-        and _structure_status(candidate_set, each, fractional_orders) == "compatible"
+        candidate
+        for candidate in candidate_set.candidates
+        if candidate.parameters < freest_candidate.parameters
+        and _structure_status(candidate_set, candidate, fractional_orders) == "compatible"
     ]
     if not compatible_candidates:
         return None
-    simplest = min(compatible_candidates, key=lambda each: each.bic)
-    fixed = {
-        order: simplest.structure.fixed[order]  # type: ignore[index]
-        for order, coefficient in COEFFICIENT_OF.items()
-        if order in simplest.structure.fixed and coefficient in simplest.structure.free
+    simplest_candidate = min(compatible_candidates, key=lambda candidate: candidate.bic)
+    fixed_orders = {
+        order_name: simplest_candidate.structure.fixed[order_name]  # type: ignore[index]
+        for order_name, coefficient_name in COEFFICIENT_OF.items()
+        if order_name in simplest_candidate.structure.fixed
+        and coefficient_name in simplest_candidate.structure.free
     }
     return ConditionalEstimate(
-        name=simplest.name,
-        fixed=fixed,
+        name=simplest_candidate.name,
+        fixed=fixed_orders,
         parameters={
-            name: _reported_parameter(simplest.fit, name, None, None)
-            for name in simplest.fit.parameters
-            if simplest.structure.has(name) and name not in fixed
+            parameter_name: _reported_parameter(simplest_candidate.fit, parameter_name, None, None)
+            for parameter_name in simplest_candidate.fit.parameters
+            if simplest_candidate.structure.has(parameter_name)
+            and parameter_name not in fixed_orders
         },
     )
 
 
 def _reported_parameter(
-    fit: RecordFit, name: str, reason: str | None, interval: tuple[float, float] | None
+    fit: RecordFit,
+    parameter_name: str,
+    doubt_reason: str | None,
+    order_interval: tuple[float, float] | None,
 ) -> ReportedValue:
     """Return the reported value of one parameter of a fit, with its interval and flag."""
-    is_free = name in fit.interval
-    interval_95 = interval or fit.interval.get(name)
-    flag = reason
-    if flag is None and name in fit.at_bounds and interval_95 is None:
-        flag = _AT_BOUND_FLAG
-    if flag is None and is_free and interval_95 is None:
-        flag = _NOT_IDENTIFIABLE_FLAG
-    return ReportedValue(fit.parameters[name], fit.std[name] if is_free else 0.0, interval_95, flag)
+    is_free = parameter_name in fit.interval
+    interval_95 = order_interval or fit.interval.get(parameter_name)
+    invalid_reason = doubt_reason
+    if invalid_reason is None and parameter_name in fit.at_bounds and interval_95 is None:
+        invalid_reason = _AT_BOUND_FLAG
+    if invalid_reason is None and is_free and interval_95 is None:
+        invalid_reason = _NOT_IDENTIFIABLE_FLAG
+    return ReportedValue(
+        fit.parameters[parameter_name],
+        fit.std[parameter_name] if is_free else 0.0,
+        interval_95,
+        invalid_reason,
+    )
 
 
 def reported_loss_factor(
-    damping: Damping, size: DampingSize, reason: str | None
+    damping: Damping, damping_size: DampingSize, invalid_reason: str | None
 ) -> ReportedLossFactor:
-    """Return the reported loss factor of a damping, with its 95 % interval.
+    """Return the loss factor of a damping as reported, with 95 % interval and flag.
 
     Parameters
     ----------
     damping : str
         "internal" or "external".
-    size : DampingSize
+    damping_size : DampingSize
         Estimated loss factor.
-    reason : str or None
+    invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     """
     # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
-    half_width = NORMAL_95 * size.std / size.value
+    relative_half_width = NORMAL_95 * damping_size.std / damping_size.value
     interval_95 = (
-        size.value * math.exp(-half_width),
-        size.value * math.exp(min(half_width, 300.0)),
+        damping_size.value * math.exp(-relative_half_width),
+        damping_size.value * math.exp(min(relative_half_width, 300.0)),
     )
     return ReportedLossFactor(
-        damping, size.omega_rad_s, ReportedValue(size.value, size.std, interval_95, reason)
+        damping,
+        damping_size.omega_rad_s,
+        ReportedValue(damping_size.value, damping_size.std, interval_95, invalid_reason),
     )
 
 
 def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Iterator[ModeEstimate]:
-    """Yield the modes of a fit with the uncertainties of the fit with both dampings."""
+    """Yield the modes of a fit, with the standard deviations of a fit with both dampings.
+
+    These are larger, since the second damping is free.
+    """
     modes_with_both = {mode.number: mode for mode in with_both.modes}
     for mode in fit.modes:
         mode_with_both = modes_with_both.get(mode.number, mode)
@@ -585,35 +621,40 @@ def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Itera
 
 
 def _reported_mode(
-    mode: ModeEstimate, visible_numbers: Collection[int], reason: str | None
+    mode_estimate: ModeEstimate, visible_numbers: Collection[int], invalid_reason: str | None
 ) -> ReportedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
-    is_visible = mode.number in visible_numbers
-    if reason is None and not is_visible:
-        reason = "computed from the model: the record does not show this mode"
+    is_visible_mode = mode_estimate.number in visible_numbers
+    if invalid_reason is None and not is_visible_mode:
+        invalid_reason = "computed from the model: the record does not show this mode"
     return ReportedMode(
-        mode.number,
-        symmetric_value(mode.frequency_hz, mode.frequency_std_hz, reason),
-        symmetric_value(mode.damping_ratio, mode.damping_ratio_std, reason),
-        is_visible,
+        mode_estimate.number,
+        symmetric_value(mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason),
+        symmetric_value(
+            mode_estimate.damping_ratio, mode_estimate.damping_ratio_std, invalid_reason
+        ),
+        is_visible_mode,
     )
 
 
 def symmetric_value(
-    value: float, std: float, reason: str | None, half_width: float = NORMAL_95
+    estimated_value: float, std: float, invalid_reason: str | None, half_width: float = NORMAL_95
 ) -> ReportedValue:
     """Return a reported value with a symmetric 95 % interval.
 
     Parameters
     ----------
-    value, std : float
+    estimated_value, std : float
         Estimate and its standard deviation.
-    reason : str or None
+    invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     half_width : float
         Half width of the interval, in standard deviations.
     """
     interval_half_width = half_width * std
     return ReportedValue(
-        value, std, (value - interval_half_width, value + interval_half_width), reason
+        estimated_value,
+        std,
+        (estimated_value - interval_half_width, estimated_value + interval_half_width),
+        invalid_reason,
     )

@@ -84,14 +84,14 @@ class NoiseSpectrum:
 
         Real and imaginary parts of the whitened noise have variance 1.
         """
-        weight: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
-        return weight
+        whitening_factor: NDArray[np.float64] = np.sqrt(2 / self.power) * self.counts
+        return whitening_factor
 
 
 def estimate_noise(
     residual: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
-    samples: int,
+    sample_count: int,
     known_fraction: float = 1.0,
     near_mode: NDArray[np.bool_] | None = None,
 ) -> NoiseSpectrum:
@@ -100,10 +100,10 @@ def estimate_noise(
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
-        Fourier transform of `samples` samples in N·m, on neighbouring bins.
+        Fourier transform of `sample_count` samples in N·m, on neighbouring bins.
     frequency_hz : ndarray, shape (K,)
         Frequencies of the bins.
-    samples : int
+    sample_count : int
         Number of samples of the residual.
     known_fraction : float
         Fraction of the samples at which the residual is known. It is 0 at the others.
@@ -116,23 +116,25 @@ def estimate_noise(
     NoiseSpectrum
         Smooth power and lines.
     """
-    power = smooth_power(residual) / known_fraction
-    counts = np.ones(power.size, dtype=bool)
-    lines: list[NoiseLine] = []
+    noise_power = smooth_power(residual) / known_fraction
+    is_compared = np.ones(noise_power.size, dtype=bool)
+    noise_lines: list[NoiseLine] = []
     if near_mode is None:
-        return NoiseSpectrum(power, counts, ())
-    for group in _find_line_groups(residual, power):
-        line_power = np.abs(residual[group]) ** 2
-        if near_mode[group][np.argmax(line_power)] or not _lasts_through_record(residual, group):
+        return NoiseSpectrum(noise_power, is_compared, ())
+    for line_bins in _find_line_groups(residual, noise_power):
+        line_power = np.abs(residual[line_bins]) ** 2
+        if near_mode[line_bins][np.argmax(line_power)] or not _lasts_through_record(
+            residual, line_bins
+        ):
             continue
-        counts[group] &= near_mode[group]
-        lines.append(
+        is_compared[line_bins] &= near_mode[line_bins]
+        noise_lines.append(
             NoiseLine(
-                frequency_hz=float(line_power @ frequency_hz[group] / line_power.sum()),
-                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (samples * known_fraction)),
+                frequency_hz=float(line_power @ frequency_hz[line_bins] / line_power.sum()),
+                amplitude_nm=float(2 * np.sqrt(line_power.sum()) / (sample_count * known_fraction)),
             )
         )
-    return NoiseSpectrum(power, counts, tuple(lines))
+    return NoiseSpectrum(noise_power, is_compared, tuple(noise_lines))
 
 
 def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> NDArray[np.float64]:
@@ -150,85 +152,111 @@ def smooth_power(residual: NDArray[np.complex128], *, finely: bool = False) -> N
     finely : bool
         Whether all blocks are narrow. Narrow blocks follow a peak of the noise.
     """
-    power = residual.real**2 + residual.imag**2
-    edges = _narrow_block_borders(power.size) if finely else _block_borders(power.size)
+    bin_power = residual.real**2 + residual.imag**2
+    block_edges = (
+        _narrow_block_borders(bin_power.size) if finely else _block_borders(bin_power.size)
+    )
     ln_power = np.array(
         [
-            np.log(max(float(np.median(power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
-            for a, b in itertools.pairwise(edges)
+            np.log(max(float(np.median(bin_power[a:b])), np.finfo(float).tiny) / _MEDIAN_OVER_MEAN)
+            for a, b in itertools.pairwise(block_edges)
         ]
     )
-    block_centres = (edges[:-1] + edges[1:] - 1) / 2
-    smooth: NDArray[np.float64] = np.exp(np.interp(np.arange(power.size), block_centres, ln_power))
-    return smooth
+    block_centres = (block_edges[:-1] + block_edges[1:] - 1) / 2
+    smoothed_power: NDArray[np.float64] = np.exp(
+        np.interp(np.arange(bin_power.size), block_centres, ln_power)
+    )
+    return smoothed_power
 
 
 def noise_power_with_peaks(
-    residual: NDArray[np.complex128], power: NDArray[np.float64], where: NDArray[np.bool_]
+    residual: NDArray[np.complex128],
+    smooth_noise_power: NDArray[np.float64],
+    is_peak_allowed: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
-    """Return the noise power with peaks that are narrower than the smoothing blocks, (K,).
+    """Return the noise power of each bin, with peaks narrower than the smoothing blocks, (K,).
 
     Parameters
     ----------
     residual : ndarray of complex, shape (K,)
         Spectrum of the residual on neighbouring bins.
-    power : ndarray, shape (K,)
+    smooth_noise_power : ndarray, shape (K,)
         Smooth power of the residual, as `smooth_power` returns it.
-    where : ndarray of bool, shape (K,)
+    is_peak_allowed : ndarray of bool, shape (K,)
         True for bins at which a peak is possible.
     """
-    power_ratio = (residual.real**2 + residual.imag**2) / power
+    power_ratio = (residual.real**2 + residual.imag**2) / smooth_noise_power
     local_ratio = np.convolve(power_ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
     # Include all bins within the averaging width around each significant one.
     is_peak = (
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
-    return np.where(is_peak & where, power * np.maximum(local_ratio, 1.0), power)
+    return np.where(
+        is_peak & is_peak_allowed,
+        smooth_noise_power * np.maximum(local_ratio, 1.0),
+        smooth_noise_power,
+    )
 
 
-def _block_borders(bins: int) -> NDArray[np.intp]:
-    """Return the borders of the blocks.
+def _block_borders(bin_count: int) -> NDArray[np.intp]:
+    """Return the borders of the smoothing blocks, as indices of bins.
 
     Their widths increase with frequency from `_MIN_BLOCK_BINS`.
     """
-    positions = bins * np.linspace(0, 1, _BLOCK_COUNT + 1) ** 2
-    edges = [0]
-    for position in positions[1:-1]:
-        if position - edges[-1] >= _MIN_BLOCK_BINS and bins - position >= _MIN_BLOCK_BINS:
-            edges.append(round(float(position)))
-    return np.array([*edges, bins])
+    ideal_positions = bin_count * np.linspace(0, 1, _BLOCK_COUNT + 1) ** 2
+    block_edges = [0]
+    for ideal_position in ideal_positions[1:-1]:
+        if (
+            ideal_position - block_edges[-1] >= _MIN_BLOCK_BINS
+            and bin_count - ideal_position >= _MIN_BLOCK_BINS
+        ):
+            block_edges.append(round(float(ideal_position)))
+    return np.array([*block_edges, bin_count])
 
 
-def _narrow_block_borders(bins: int) -> NDArray[np.intp]:
-    """Return the borders of equal blocks of `_NARROW_BLOCK_BINS` bins or a little more."""
-    return np.linspace(0, bins, max(bins // _NARROW_BLOCK_BINS, 1) + 1).round().astype(np.intp)
+def _narrow_block_borders(bin_count: int) -> NDArray[np.intp]:
+    """Return the borders of equal smoothing blocks, as indices of bins.
+
+    A block has `_NARROW_BLOCK_BINS` bins or a little more.
+    """
+    return (
+        np.linspace(0, bin_count, max(bin_count // _NARROW_BLOCK_BINS, 1) + 1)
+        .round()
+        .astype(np.intp)
+    )
 
 
-def _find_line_groups(residual: NDArray[np.complex128], power: NDArray[np.float64]) -> list[slice]:
-    """Return the groups of bins far above the noise, each as a slice with its skirts.
+def _find_line_groups(
+    residual: NDArray[np.complex128], noise_power: NDArray[np.float64]
+) -> list[slice]:
+    """Return the ranges of bins whose power is far above the noise, with neighbouring bins.
 
     A line leaks into its neighbours as 1 / distance: at three times the distance at which it is
     significant the leakage is below the noise.
     """
-    bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * power)
-    if bins.size == 0:
+    loud_bins = np.flatnonzero(np.abs(residual) ** 2 > _LINE_POWER_RATIO * noise_power)
+    if loud_bins.size == 0:
         return []
-    groups = np.split(bins, np.flatnonzero(np.diff(bins) > _DURATION_BINS // 2) + 1)
+    bin_groups = np.split(loud_bins, np.flatnonzero(np.diff(loud_bins) > _DURATION_BINS // 2) + 1)
     groups_with_skirts = []
-    for group in groups:
-        first_bin, last_bin = int(group[0]), int(group[-1])
-        skirt = max(last_bin - first_bin, 2)
-        groups_with_skirts.append(slice(max(first_bin - skirt, 0), last_bin + skirt + 1))
+    for bin_group in bin_groups:
+        first_bin, last_bin = int(bin_group[0]), int(bin_group[-1])
+        skirt_bins = max(last_bin - first_bin, 2)
+        groups_with_skirts.append(slice(max(first_bin - skirt_bins, 0), last_bin + skirt_bins + 1))
     return groups_with_skirts
 
 
-def _lasts_through_record(residual: NDArray[np.complex128], group: slice) -> bool:
-    """Return whether the power in a group of bins lasts through the whole record.
+def _lasts_through_record(residual: NDArray[np.complex128], line_bins: slice) -> bool:
+    """Return whether a narrow-band disturbance lasts through the whole record.
+
+    `line_bins` is the range of its bins.
 
     The residual of a wrong model at a mode begins when the sweep passes the mode, and decays.
     """
-    bins_around = residual[max(group.start - _DURATION_BINS, 0) : group.stop + _DURATION_BINS]
-    length = _RECORD_PARTS * (-(-4 * bins_around.size // _RECORD_PARTS))
-    envelope = np.abs(np.fft.ifft(bins_around, length)) ** 2
-    eighths = envelope.reshape(_RECORD_PARTS, -1).mean(axis=1)
-    return bool(eighths.min() > _MIN_PART_POWER_RATIO * eighths.mean())
+    bins_around = residual[
+        max(line_bins.start - _DURATION_BINS, 0) : line_bins.stop + _DURATION_BINS
+    ]
+    padded_length = _RECORD_PARTS * (-(-4 * bins_around.size // _RECORD_PARTS))
+    power_envelope = np.abs(np.fft.ifft(bins_around, padded_length)) ** 2
+    mean_power_of_eighths = power_envelope.reshape(_RECORD_PARTS, -1).mean(axis=1)
+    return bool(mean_power_of_eighths.min() > _MIN_PART_POWER_RATIO * mean_power_of_eighths.mean())

@@ -91,8 +91,10 @@ class Unknowns:
     omega_rad_s: tuple[float, float]
 
     @classmethod
-    def of(cls, structure: Structure, nominal: Plant, free: tuple[Setting, ...]) -> Unknowns:
-        """Return the unknowns of a structure with some settings free.
+    def of(
+        cls, structure: Structure, nominal: Plant, free_settings: tuple[Setting, ...]
+    ) -> Unknowns:
+        """Return the unknowns of a structure with some settings of the rig free.
 
         Parameters
         ----------
@@ -100,12 +102,16 @@ class Unknowns:
             Structure that states which damping parameters are free.
         nominal : Plant
             Beam and rig as the file states them.
-        free : tuple of str
+        free_settings : tuple of str
             Names of the settings that are estimated.
         """
-        first_omega, second_omega = map(float, undamped_frequencies_rad_s(nominal.beam, 2))
-        ordered = tuple(name for name in SETTINGS if name in free)
-        return cls(structure, nominal, ordered, (first_omega, second_omega))
+        first_omega_rad_s, second_omega_rad_s = map(
+            float, undamped_frequencies_rad_s(nominal.beam, 2)
+        )
+        ordered_settings = tuple(
+            setting_name for setting_name in SETTINGS if setting_name in free_settings
+        )
+        return cls(structure, nominal, ordered_settings, (first_omega_rad_s, second_omega_rad_s))
 
     @cached_property
     def names(self) -> tuple[str, ...]:
@@ -114,46 +120,55 @@ class Unknowns:
 
     @cached_property
     def gradient_names(self) -> tuple[str, ...]:
-        """Return the names of the free parameters as the prediction uses them for derivatives."""
-        return tuple(_GRADIENT_NAMES.get(name, name) for name in self.names)
+        """Return the names of the free parameters as the derivatives of the response use them.
+
+        Beam parameters are logarithms there.
+        """
+        return tuple(
+            _GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in self.names
+        )
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the lower and the upper bounds of the unknowns, each of shape (k,)."""
         ln_size_range = (math.log(SIZE_RANGE[0]), math.log(SIZE_RANGE[1]))
-        largest_delay = _DELAY_RANGE_S / _DELAY_UNIT_S
-        ranges = {
+        largest_scaled_delay = _DELAY_RANGE_S / _DELAY_UNIT_S
+        unknown_ranges = {
             "zeta": ln_size_range,
             "alpha": ORDER_RANGE,
             "gamma": ln_size_range,
             "lambda": ORDER_RANGE,
             "density_over_stiffness": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
             "bending_stiffness_n_m2": (-_LN_BEAM_HALF_RANGE, _LN_BEAM_HALF_RANGE),
-            "delay_s": (-largest_delay, largest_delay),
+            "delay_s": (-largest_scaled_delay, largest_scaled_delay),
             "tool_inertia_kg_m2": (0.0, 1.0),
         }
-        lower_bounds, upper_bounds = zip(*(ranges[name] for name in self.names), strict=True)
+        lower_bounds, upper_bounds = zip(
+            *(unknown_ranges[parameter_name] for parameter_name in self.names), strict=True
+        )
         return np.array(lower_bounds), np.array(upper_bounds)
 
-    def start(self, sizes: NDArray[np.float64]) -> NDArray[np.float64]:
+    def start(self, damping_sizes: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns for given damping sizes, with nominal settings, shape (k,).
 
         Parameters
         ----------
-        sizes : ndarray, shape (len(structure.free),)
+        damping_sizes : ndarray, shape (len(structure.free),)
             Those of ``ln z``, ``alpha``, ``ln g`` and ``lambda`` that are free.
         """
-        at: dict[str, float] = {
+        unknown_values: dict[str, float] = {
             **dict(self.structure.fixed.items()),
-            **dict(zip(self.structure.free, sizes.tolist(), strict=True)),
+            **dict(zip(self.structure.free, damping_sizes.tolist(), strict=True)),
             "density_over_stiffness": 0.0,
             "bending_stiffness_n_m2": 0.0,
             **self._linear_unknowns(self.nominal),
         }
-        for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda")):
-            if coefficient in self.names:
-                at[coefficient] += math.log(math.sin(_QUARTER_TURN_RAD * at[order]))
-        return np.array([at[name] for name in self.names])
+        for damping_coefficient, order_name in (("zeta", "alpha"), ("gamma", "lambda")):
+            if damping_coefficient in self.names:
+                unknown_values[damping_coefficient] += math.log(
+                    math.sin(_QUARTER_TURN_RAD * unknown_values[order_name])
+                )
+        return np.array([unknown_values[parameter_name] for parameter_name in self.names])
 
     def vector(self, plant: Plant) -> NDArray[np.float64]:
         """Return the unknowns that describe a plant, shape (k,): the inverse of `plant`.
@@ -165,36 +180,59 @@ class Unknowns:
             order, the damping keeps its loss at the mode. Absent damping starts small, with order
             1.
         """
-        damping, nominal = plant.damping, self.nominal.beam
-        first_omega, second_omega = self.omega_rad_s
+        damping, nominal_beam = plant.damping, self.nominal.beam
+        first_omega_rad_s, second_omega_rad_s = self.omega_rad_s
         density_over_stiffness = plant.beam.density_over_stiffness
-        ln_ratio = math.log(density_over_stiffness / nominal.density_over_stiffness)
-        ln_stiffness = math.log(plant.beam.bending_stiffness_n_m2 / nominal.bending_stiffness_n_m2)
-        at = {
+        ln_ratio = math.log(density_over_stiffness / nominal_beam.density_over_stiffness)
+        ln_stiffness = math.log(
+            plant.beam.bending_stiffness_n_m2 / nominal_beam.bending_stiffness_n_m2
+        )
+        unknown_values = {
             "zeta": math.log(_LOSS_OF_NEW_DAMPING),
             "alpha": 1.0,
             "gamma": math.log(_LOSS_OF_NEW_DAMPING),
             "lambda": 1.0,
         }
-        at |= self._linear_unknowns(plant)
+        unknown_values |= self._linear_unknowns(plant)
         if damping.zeta > 0:
-            damping_size, phase = (
-                damping.zeta * second_omega**damping.alpha,
+            damping_size, damping_phase_rad = (
+                damping.zeta * second_omega_rad_s**damping.alpha,
                 _QUARTER_TURN_RAD * damping.alpha,
             )
-            at["zeta"], at["alpha"] = math.log(damping_size * math.sin(phase)), damping.alpha
-            stiffening = math.log(abs(1 + damping_size * complex(math.cos(phase), math.sin(phase))))
-            ln_ratio -= stiffening
-            ln_stiffness += stiffening
+            unknown_values["zeta"], unknown_values["alpha"] = (
+                math.log(damping_size * math.sin(damping_phase_rad)),
+                damping.alpha,
+            )
+            ln_stiffening = math.log(
+                abs(
+                    1
+                    + damping_size
+                    * complex(math.cos(damping_phase_rad), math.sin(damping_phase_rad))
+                )
+            )
+            ln_ratio -= ln_stiffening
+            ln_stiffness += ln_stiffening
         if damping.gamma > 0:
             damping_size = (
-                damping.gamma / density_over_stiffness * first_omega ** (damping.lambda_ - 2)
+                damping.gamma / density_over_stiffness * first_omega_rad_s ** (damping.lambda_ - 2)
             )
-            phase = _QUARTER_TURN_RAD * damping.lambda_
-            at["gamma"], at["lambda"] = math.log(damping_size * math.sin(phase)), damping.lambda_
-            ln_ratio += math.log(abs(1 - damping_size * complex(math.cos(phase), math.sin(phase))))
-        at |= {"density_over_stiffness": ln_ratio, "bending_stiffness_n_m2": ln_stiffness}
-        return np.array([at[name] for name in self.names])
+            damping_phase_rad = _QUARTER_TURN_RAD * damping.lambda_
+            unknown_values["gamma"], unknown_values["lambda"] = (
+                math.log(damping_size * math.sin(damping_phase_rad)),
+                damping.lambda_,
+            )
+            ln_ratio += math.log(
+                abs(
+                    1
+                    - damping_size
+                    * complex(math.cos(damping_phase_rad), math.sin(damping_phase_rad))
+                )
+            )
+        unknown_values |= {
+            "density_over_stiffness": ln_ratio,
+            "bending_stiffness_n_m2": ln_stiffness,
+        }
+        return np.array([unknown_values[parameter_name] for parameter_name in self.names])
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
         """Return the plant that a vector of unknowns describes."""
@@ -206,24 +244,31 @@ class Unknowns:
         The derivatives have the shape (k, k): [parameter, unknown]. The parameters are
         `gradient_names`, where zeta and gamma are not logarithms.
         """
-        values, derivative = self._values_and_derivatives(x)
-        for index, name in enumerate(self.names):
-            if name in ("zeta", "gamma"):
-                derivative[index] *= values[name]
-        return self._plant_of(values), derivative
+        parameter_values, parameter_slopes = self._values_and_derivatives(x)
+        for unknown_index, parameter_name in enumerate(self.names):
+            if parameter_name in ("zeta", "gamma"):
+                parameter_slopes[unknown_index] *= parameter_values[parameter_name]
+        return self._plant_of(parameter_values), parameter_slopes
 
-    def _plant_of(self, values: Mapping[str, float]) -> Plant:
-        """Return the plant with given values of all parameters."""
-        density_over_stiffness, stiffness = (
-            values["density_over_stiffness"],
-            values["bending_stiffness_n_m2"],
+    def _plant_of(self, parameter_values: Mapping[str, float]) -> Plant:
+        """Return the rig and beam for values of all parameters, by name."""
+        density_over_stiffness, stiffness_n_m2 = (
+            parameter_values["density_over_stiffness"],
+            parameter_values["bending_stiffness_n_m2"],
         )
         return replace(
             self.nominal,
-            beam=Beam(self.nominal.beam.length_m, density_over_stiffness * stiffness, stiffness),
-            damping=self.structure.damping({name: values[name] for name in self.structure.free}),
-            delay_s=values["delay_s"],
-            tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+            beam=Beam(
+                self.nominal.beam.length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2
+            ),
+            damping=self.structure.damping(
+                {
+                    parameter_name: parameter_values[parameter_name]
+                    for parameter_name in self.structure.free
+                }
+            ),
+            delay_s=parameter_values["delay_s"],
+            tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
         )
 
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
@@ -232,29 +277,35 @@ class Unknowns:
 
     @cached_property
     def units(self) -> Mapping[str, float]:
-        """Return, for delay and tool inertia, the value that corresponds to 1 of the unknown."""
-        beam = self.nominal.beam
-        units = {
+        """Return the value of delay and tool inertia for which the unknown is 1, by name.
+
+        The tool inertia is that between torque sensor and beam.
+        """
+        nominal_beam = self.nominal.beam
+        unknown_units = {
             "delay_s": _DELAY_UNIT_S,
-            "tool_inertia_kg_m2": beam.inertia_kg_m2,
+            "tool_inertia_kg_m2": nominal_beam.inertia_kg_m2,
         }
-        return MappingProxyType(units)
+        return MappingProxyType(unknown_units)
 
     @cached_property
     def _indices(self) -> Mapping[str, int]:
         """Return the index of each free parameter in the vector of unknowns."""
-        return MappingProxyType({name: i for i, name in enumerate(self.names)})
+        return MappingProxyType({parameter_name: i for i, parameter_name in enumerate(self.names)})
 
     @cached_property
     def _fixed_values(self) -> Mapping[str, float]:
         """Return nominal settings and fixed damping parameters, by name."""
-        fixed = dict(self.structure.fixed.items())
-        return MappingProxyType({**self.nominal.parameters, **fixed})
+        fixed_values = dict(self.structure.fixed.items())
+        return MappingProxyType({**self.nominal.parameters, **fixed_values})
 
     def _linear_unknowns(self, plant: Plant) -> dict[str, float]:
-        """Return delay and tool inertia of a plant in the units of the unknowns, by name."""
-        values = plant.parameters
-        return {name: values[name] / unit for name, unit in self.units.items()}
+        """Return delay and tool inertia of a plant, divided by `units`, by name."""
+        parameter_values = plant.parameters
+        return {
+            parameter_name: parameter_values[parameter_name] / unknown_unit
+            for parameter_name, unknown_unit in self.units.items()
+        }
 
     def estimates_by_unknowns(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the derivatives of the free parameters by the unknowns, shape (k, k).
@@ -262,81 +313,111 @@ class Unknowns:
         The indices are [parameter, unknown]. Parameters in `LOGARITHMIC_PARAMETERS` count as
         logarithms.
         """
-        derivative: NDArray[np.float64] = self._values_and_derivatives(x)[1]
-        return derivative
+        parameter_slopes: NDArray[np.float64] = self._values_and_derivatives(x)[1]
+        return parameter_slopes
 
     def _values_and_derivatives(
         self, x: NDArray[np.float64]
     ) -> tuple[dict[str, float], NDArray[np.float64]]:
-        """Return all parameters for a vector of unknowns, and `estimates_by_unknowns`."""
-        indices = self._indices
+        """Return all plant parameters by name, and their derivatives by the unknowns.
+
+        The derivatives are those of `estimates_by_unknowns`.
+        """
+        unknown_indices = self._indices
         unknown_values: dict[str, float] = dict(zip(self.names, x.tolist(), strict=True))
-        values: dict[str, float] = dict(self._fixed_values)
-        derivative = np.eye(x.size)
-        first_omega, second_omega = self.omega_rad_s
+        parameter_values: dict[str, float] = dict(self._fixed_values)
+        parameter_slopes = np.eye(x.size)
+        first_omega_rad_s, second_omega_rad_s = self.omega_rad_s
         # ln of the factor by which damping changes stiffness and inertia, with its derivatives.
         stiffness_change, inertia_change = np.zeros((2, x.size + 1))
         if self.structure.internal:
-            values["alpha"] = order = unknown_values.get("alpha", values["alpha"])
-            ln_z, slope = _ln_damping_size(unknown_values["zeta"], order)
-            values["zeta"] = math.exp(ln_z - order * math.log(second_omega))
-            stiffness_change = self._ln_factor_of_damping(ln_z, order, 1.0, "zeta", "alpha", slope)
-            if "alpha" in indices:
-                derivative[indices["zeta"], indices["alpha"]] = slope - math.log(second_omega)
-        if self.structure.external:
-            values["lambda"] = order = unknown_values.get("lambda", values["lambda"])
-            ln_g, slope = _ln_damping_size(unknown_values["gamma"], order)
-            inertia_change = self._ln_factor_of_damping(ln_g, order, -1.0, "gamma", "lambda", slope)
-            if "lambda" in indices:
-                derivative[indices["gamma"], indices["lambda"]] = slope - math.log(first_omega)
-        for name, sign in (("density_over_stiffness", 1.0), ("bending_stiffness_n_m2", -1.0)):
-            if name in indices:
-                ln_factor = sign * stiffness_change - (inertia_change if sign > 0 else 0.0)
-                values[name] *= math.exp(unknown_values[name] + ln_factor[-1])
-                derivative[indices[name]] += ln_factor[:-1]
-        if self.structure.external:
-            density_over_stiffness = values["density_over_stiffness"]
-            values["gamma"] = density_over_stiffness * math.exp(
-                ln_g + (2 - values["lambda"]) * math.log(first_omega)
+            parameter_values["alpha"] = damping_order = unknown_values.get(
+                "alpha", parameter_values["alpha"]
             )
-            if "density_over_stiffness" in indices:
-                derivative[indices["gamma"]] += derivative[indices["density_over_stiffness"]]
-        units = self.units
-        for name in units.keys() & indices.keys():
-            values[name] = unknown_values[name] * units[name]
-            derivative[indices[name], indices[name]] = units[name]
-        return values, derivative
+            ln_z, ln_size_slope = _ln_damping_size(unknown_values["zeta"], damping_order)
+            parameter_values["zeta"] = math.exp(ln_z - damping_order * math.log(second_omega_rad_s))
+            stiffness_change = self._ln_factor_of_damping(
+                ln_z, damping_order, 1.0, "zeta", "alpha", ln_size_slope
+            )
+            if "alpha" in unknown_indices:
+                parameter_slopes[unknown_indices["zeta"], unknown_indices["alpha"]] = (
+                    ln_size_slope - math.log(second_omega_rad_s)
+                )
+        if self.structure.external:
+            parameter_values["lambda"] = damping_order = unknown_values.get(
+                "lambda", parameter_values["lambda"]
+            )
+            ln_g, ln_size_slope = _ln_damping_size(unknown_values["gamma"], damping_order)
+            inertia_change = self._ln_factor_of_damping(
+                ln_g, damping_order, -1.0, "gamma", "lambda", ln_size_slope
+            )
+            if "lambda" in unknown_indices:
+                parameter_slopes[unknown_indices["gamma"], unknown_indices["lambda"]] = (
+                    ln_size_slope - math.log(first_omega_rad_s)
+                )
+        for parameter_name, term_sign in (
+            ("density_over_stiffness", 1.0),
+            ("bending_stiffness_n_m2", -1.0),
+        ):
+            if parameter_name in unknown_indices:
+                ln_factor = term_sign * stiffness_change - (
+                    inertia_change if term_sign > 0 else 0.0
+                )
+                parameter_values[parameter_name] *= math.exp(
+                    unknown_values[parameter_name] + ln_factor[-1]
+                )
+                parameter_slopes[unknown_indices[parameter_name]] += ln_factor[:-1]
+        if self.structure.external:
+            density_over_stiffness = parameter_values["density_over_stiffness"]
+            parameter_values["gamma"] = density_over_stiffness * math.exp(
+                ln_g + (2 - parameter_values["lambda"]) * math.log(first_omega_rad_s)
+            )
+            if "density_over_stiffness" in unknown_indices:
+                parameter_slopes[unknown_indices["gamma"]] += parameter_slopes[
+                    unknown_indices["density_over_stiffness"]
+                ]
+        unknown_units = self.units
+        for parameter_name in unknown_units.keys() & unknown_indices.keys():
+            parameter_values[parameter_name] = (
+                unknown_values[parameter_name] * unknown_units[parameter_name]
+            )
+            parameter_slopes[unknown_indices[parameter_name], unknown_indices[parameter_name]] = (
+                unknown_units[parameter_name]
+            )
+        return parameter_values, parameter_slopes
 
     def _ln_factor_of_damping(
         self,
         ln_size: float,
         order: float,
-        sign: float,
+        term_sign: float,
         loss_name: str,
         order_name: str,
-        slope: float,
+        ln_size_slope: float,
     ) -> NDArray[np.float64]:
-        """Return ``ln |1 ± size exp(j order pi/2)|`` with its derivatives by the unknowns.
+        """Return ``ln |1 ± signed_size exp(j order pi/2)|`` with its derivatives by the unknowns.
 
-        The result has the shape (k + 1,): the derivatives, then the value. `slope` is the
+        The result has the shape (k + 1,): the derivatives, then the value. `ln_size_slope` is the
         derivative of `ln_size` by the order at constant loss.
         """
-        size, phase = sign * math.exp(ln_size), _QUARTER_TURN_RAD * order
-        square = 1 + 2 * size * math.cos(phase) + size * size
-        by_ln_size = size * (math.cos(phase) + size) / square
-        addition = np.zeros(len(self.names) + 1)
-        addition[self._indices[loss_name]] = by_ln_size
+        signed_size, order_phase_rad = term_sign * math.exp(ln_size), _QUARTER_TURN_RAD * order
+        squared_factor = 1 + 2 * signed_size * math.cos(order_phase_rad) + signed_size * signed_size
+        by_ln_size = signed_size * (math.cos(order_phase_rad) + signed_size) / squared_factor
+        derivatives_and_value = np.zeros(len(self.names) + 1)
+        derivatives_and_value[self._indices[loss_name]] = by_ln_size
         if order_name in self._indices:
-            by_phase = -_QUARTER_TURN_RAD * size * math.sin(phase) / square
-            addition[self._indices[order_name]] = by_ln_size * slope + by_phase
-        addition[-1] = math.log(square) / 2
-        return addition
+            by_phase = -_QUARTER_TURN_RAD * signed_size * math.sin(order_phase_rad) / squared_factor
+            derivatives_and_value[self._indices[order_name]] = by_ln_size * ln_size_slope + by_phase
+        derivatives_and_value[-1] = math.log(squared_factor) / 2
+        return derivatives_and_value
 
 
 def _ln_damping_size(ln_loss: float, order: float) -> tuple[float, float]:
     """Return ``ln size`` of a damping with a given loss, and its derivative by the order."""
-    phase = _QUARTER_TURN_RAD * order
-    return ln_loss - math.log(math.sin(phase)), -_QUARTER_TURN_RAD / math.tan(phase)
+    order_phase_rad = _QUARTER_TURN_RAD * order
+    return ln_loss - math.log(math.sin(order_phase_rad)), -_QUARTER_TURN_RAD / math.tan(
+        order_phase_rad
+    )
 
 
 # Steps
@@ -353,7 +434,7 @@ _MAX_GROWTH_EXPONENT: Final = 50.0
 
 @dataclass(frozen=True, slots=True)
 class Steps:
-    """Curved steps of a descent from a vector of unknowns, and their limits.
+    """Rule of the steps of a descent: their curve in the space of the unknowns, and limits.
 
     Attributes
     ----------
@@ -378,7 +459,7 @@ class Steps:
 
     @classmethod
     def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
-        """Return the steps for the unknowns of a structure.
+        """Return the rule of the steps for the unknowns of a structure.
 
         Parameters
         ----------
@@ -387,18 +468,22 @@ class Steps:
         linear_below : float
             Loss below which a step changes the loss itself.
         """
-        names = unknowns.names
-        dampings = tuple(
-            (names.index(coefficient), names.index(order), coefficient == "zeta")
-            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
-            if order in names
+        unknown_names = unknowns.names
+        damping_indices = tuple(
+            (
+                unknown_names.index(coefficient_name),
+                unknown_names.index(order_name),
+                coefficient_name == "zeta",
+            )
+            for coefficient_name, order_name in (("zeta", "alpha"), ("gamma", "lambda"))
+            if order_name in unknown_names
         )
-        losses = tuple(
-            names.index(coefficient)
-            for coefficient, order in (("zeta", "alpha"), ("gamma", "lambda"))
-            if coefficient in names and order not in names
+        loss_indices = tuple(
+            unknown_names.index(coefficient_name)
+            for coefficient_name, order_name in (("zeta", "alpha"), ("gamma", "lambda"))
+            if coefficient_name in unknown_names and order_name not in unknown_names
         )
-        return cls(*unknowns.bounds, dampings, losses, linear_below)
+        return cls(*unknowns.bounds, damping_indices, loss_indices, linear_below)
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the smallest and largest admissible step of each unknown, each of shape (k,).
@@ -406,91 +491,111 @@ class Steps:
         An order approaches 0 and 2 by a fraction of its distance at a time: the effect of damping
         depends on the logarithm of that distance. The order of a vanished damping is constant.
         """
-        smallest, largest = self.lower - x, self.upper - x
-        for loss, order, _ in self.dampings:
-            fraction = _MAX_ORDER_STEP_FRACTION if x[loss] > self.lower[loss] else 0.0
-            smallest[order] = max(smallest[order], -fraction * x[order])
-            largest[order] = min(largest[order], fraction * (2 - x[order]))
-        return smallest, largest
+        smallest_steps, largest_steps = self.lower - x, self.upper - x
+        for loss_index, order_index, _ in self.dampings:
+            step_fraction = (
+                _MAX_ORDER_STEP_FRACTION if x[loss_index] > self.lower[loss_index] else 0.0
+            )
+            smallest_steps[order_index] = max(
+                smallest_steps[order_index], -step_fraction * x[order_index]
+            )
+            largest_steps[order_index] = min(
+                largest_steps[order_index], step_fraction * (2 - x[order_index])
+            )
+        return smallest_steps, largest_steps
 
-    def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
+    def end(self, x: NDArray[np.float64], unknown_step: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the unknowns after a step along the curve, within the bounds, shape (k,).
 
         Parameters
         ----------
         x : ndarray, shape (k,)
             Unknowns before the step.
-        step : ndarray, shape (k,)
+        unknown_step : ndarray, shape (k,)
             Step within the `limits`, tangent to the curve at `x`.
         """
-        end = np.clip(x + step, self.lower, self.upper)
+        end = np.clip(x + unknown_step, self.lower, self.upper)
         for i in self.losses:
-            if step[i] > 0 and math.exp(x[i]) < self.linear_below:
-                end[i] = min(x[i] + math.log1p(step[i]), self.upper[i])
+            if unknown_step[i] > 0 and math.exp(x[i]) < self.linear_below:
+                end[i] = min(x[i] + math.log1p(unknown_step[i]), self.upper[i])
         for i, j, adds_stiffness in self.dampings:
-            if step[i] != 0:
+            if unknown_step[i] != 0:
                 phase_before, phase_after = (
                     _phase_of_order(x[j], adds_stiffness),
                     _phase_of_order(end[j], adds_stiffness),
                 )
                 largest_loss = math.exp(self.upper[i])
-                loss = math.exp(x[i])
-                linear = loss < self.linear_below
-                loss, phase = _loss_and_phase_after_step(
-                    loss, float(step[i]), phase_before, phase_after, largest_loss, linear=linear
+                loss_factor = math.exp(x[i])
+                is_linear = loss_factor < self.linear_below
+                loss_factor, phase_rad = _loss_and_phase_after_step(
+                    loss_factor,
+                    float(unknown_step[i]),
+                    phase_before,
+                    phase_after,
+                    largest_loss,
+                    is_linear=is_linear,
                 )
-                end[i] = math.log(loss) if loss > 0 else self.lower[i]
-                if phase != phase_after:
-                    end[j] = _order_of_phase(phase, adds_stiffness)
-        clipped: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
-        return clipped
+                end[i] = math.log(loss_factor) if loss_factor > 0 else self.lower[i]
+                if phase_rad != phase_after:
+                    end[j] = _order_of_phase(phase_rad, adds_stiffness)
+        bounded_unknowns: NDArray[np.float64] = np.clip(end, self.lower, self.upper)
+        return bounded_unknowns
 
 
 def _loss_and_phase_after_step(
-    loss: float,
-    step: float,
+    loss_factor: float,
+    ln_loss_step: float,
     phase_before: float,
     phase_after: float,
     largest_loss: float,
     *,
-    linear: bool,
+    is_linear: bool,
 ) -> tuple[float, float]:
-    """Return loss and phase of a damping after a step of ``ln loss`` and phase.
+    """Return the loss factor and the phase in rad of a damping after a step of the descent.
 
     The phase changes from `phase_before` to `phase_after`. If no loss up to `largest_loss` gives
     the required phase, the largest loss is combined with the phase that it gives.
     """
-    size = loss / math.sin(phase_before)
-    real_part = 1 + size * math.cos(phase_before)
+    damping_size = loss_factor / math.sin(phase_before)
+    real_part = 1 + damping_size * math.cos(phase_before)
     # d ln tan(theta/2) = (d ln loss + size / sin(turn) d turn) / |1 + size exp(j turn)|
     ln_tan_step = (
-        step + size / math.sin(phase_before) * (phase_after - phase_before)
-    ) / math.hypot(real_part, loss)
-    if ln_tan_step <= -1 and loss < VANISHING_LOSS:
+        ln_loss_step + damping_size / math.sin(phase_before) * (phase_after - phase_before)
+    ) / math.hypot(real_part, loss_factor)
+    if ln_tan_step <= -1 and loss_factor < VANISHING_LOSS:
         return (
             0.0,
             phase_after,
         )  # a step in proportion to the effect would change the sign of the loss
-    theta = math.atan2(loss, real_part)
-    growth = (
+    loss_angle_rad = math.atan2(loss_factor, real_part)
+    growth_factor = (
         1 + ln_tan_step
-        if linear and ln_tan_step > 0
+        if is_linear and ln_tan_step > 0
         else math.exp(min(ln_tan_step, _MAX_GROWTH_EXPONENT))
     )
-    theta = 2 * math.atan(math.tan(theta / 2) * growth)
-    if theta < phase_after:
-        loss = math.sin(theta) / math.sin(phase_after - theta) * math.sin(phase_after)
-        if loss <= largest_loss:
-            return loss, phase_after
-    return largest_loss, theta + math.asin(min(math.sin(theta) ** 2 / largest_loss, 1.0))
+    loss_angle_rad = 2 * math.atan(math.tan(loss_angle_rad / 2) * growth_factor)
+    if loss_angle_rad < phase_after:
+        loss_factor = (
+            math.sin(loss_angle_rad)
+            / math.sin(phase_after - loss_angle_rad)
+            * math.sin(phase_after)
+        )
+        if loss_factor <= largest_loss:
+            return loss_factor, phase_after
+    return largest_loss, loss_angle_rad + math.asin(
+        min(math.sin(loss_angle_rad) ** 2 / largest_loss, 1.0)
+    )
 
 
 def _phase_of_order(order: float, adds_stiffness: bool) -> float:
-    """Return the phase of a damping relative to stiffness or inertia, 0 to pi, from its order."""
-    phase = math.pi / 2 * float(order)
-    return phase if adds_stiffness else math.pi - phase
+    """Return the phase in rad of a damping of given order relative to stiffness or inertia.
+
+    It is between 0 and pi.
+    """
+    phase_rad = math.pi / 2 * float(order)
+    return phase_rad if adds_stiffness else math.pi - phase_rad
 
 
-def _order_of_phase(phase: float, adds_stiffness: bool) -> float:
-    """Return the order of a damping from its phase relative to stiffness or inertia."""
-    return (phase if adds_stiffness else math.pi - phase) / (math.pi / 2)
+def _order_of_phase(phase_rad: float, adds_stiffness: bool) -> float:
+    """Return the order of a damping from its phase in rad relative to stiffness or inertia."""
+    return (phase_rad if adds_stiffness else math.pi - phase_rad) / (math.pi / 2)

@@ -80,7 +80,7 @@ class LikelihoodProfile:
 
     @classmethod
     def undetermined(cls, candidate: Candidate, order: Order) -> LikelihoodProfile:
-        """Return the profile of an undetermined order: one value, an interval of the whole range.
+        """Return the profile of an order that was not profiled: one value, the whole range 0 to 2.
 
         Parameters
         ----------
@@ -94,7 +94,7 @@ class LikelihoodProfile:
 
     @property
     def is_computed(self) -> bool:
-        """Return whether the profile has more than one value of the order."""
+        """Return whether deviances were computed for more than one value of the order."""
         return len(self.values) > 1
 
     @property
@@ -104,7 +104,7 @@ class LikelihoodProfile:
 
     @property
     def identifiable(self) -> bool:
-        """Return whether the record determines this order to a useful precision."""
+        """Return whether the 95 % interval is narrow and closed, and contains one local minimum."""
         is_narrow = self.relative_width <= MAX_IDENTIFIABLE_FRACTION and not (
             self.open_below or self.open_above
         )
@@ -118,7 +118,7 @@ class LikelihoodProfile:
 
 @dataclass(frozen=True, slots=True)
 class ProfileWithPlants:
-    """Profile of one order, with the fitted plants at its local minima.
+    """Likelihood profile of one damping order, with the fitted plants at its local minima.
 
     Attributes
     ----------
@@ -169,28 +169,28 @@ def profile(
     profiler.extend_from_candidates()
     if search_other_minima:
         profiler.extend_from_other_minima()
-    values, deviance = profiler.curve()
-    minima = local_minima(values, deviance)
-    interval, open_below, open_above = admitted_interval(values, deviance)
-    lowest = min(profiler.costs.values())
+    order_values, deviances = profiler.curve()
+    minimum_values = local_minima(order_values, deviances)
+    order_interval, open_below, open_above = admitted_interval(order_values, deviances)
+    lowest_cost = min(profiler.costs.values())
     return ProfileWithPlants(
         profile=LikelihoodProfile(
             order=order,
             structure=candidate.name,
-            values=tuple(values.tolist()),
-            deviance=tuple(deviance.tolist()),
-            estimate=minima[0],
-            local_minima=minima,
-            interval=interval,
+            values=tuple(order_values.tolist()),
+            deviance=tuple(deviances.tolist()),
+            estimate=minimum_values[0],
+            local_minima=minimum_values,
+            interval=order_interval,
             open_below=open_below,
             open_above=open_above,
             gain=0.0
             if order in candidate.structure.free
-            else candidate.values * math.log(max(candidate.fit.cost / lowest, 1.0)),
+            else candidate.values * math.log(max(candidate.fit.cost / lowest_cost, 1.0)),
         ),
         structure=profiler.structure,
-        plants=tuple(profiler.plant(value) for value in minima),
-        cost=lowest,
+        plants=tuple(profiler.plant(order_value) for order_value in minimum_values),
+        cost=lowest_cost,
     )
 
 
@@ -225,45 +225,50 @@ def profile_both_orders(
     alpha, lambda_ : LikelihoodProfile
         Profiles of both orders.
     """
-    for round_ in range(1, _MAX_ROUNDS + 1):
-        freest = candidate_set.freest
+    for round_index in range(1, _MAX_ROUNDS + 1):
+        freest_candidate = candidate_set.freest
         # The order of an insignificant damping is undetermined: no profile would help.
         profiles = {
             order: profile(
-                candidate_set, freest, order, search_other_minima=order not in determined
+                candidate_set, freest_candidate, order, search_other_minima=order not in determined
             )
             for order in _BOTH_ORDERS
-            if compute and freest.structure.has(order)
+            if compute and freest_candidate.structure.has(order)
         }
         costs_before = [candidate.fit.cost for candidate in candidate_set.candidates]
-        if round_ == _MAX_ROUNDS:
+        if round_index == _MAX_ROUNDS:
             break
         for profile_fit in profiles.values():
             if _may_improve(candidate_set, profile_fit):
-                for plant in profile_fit.plants:
-                    candidate_set = candidate_set.restart_from_plant(plant)
+                for minimum_plant in profile_fit.plants:
+                    candidate_set = candidate_set.restart_from_plant(minimum_plant)
         if [candidate.fit.cost for candidate in candidate_set.candidates] == costs_before:
             break
     alpha_profile, lambda_profile = (
         profiles[order].profile
         if order in profiles
-        else LikelihoodProfile.undetermined(freest, order)
+        else LikelihoodProfile.undetermined(freest_candidate, order)
         for order in _BOTH_ORDERS
     )
     return candidate_set, alpha_profile, lambda_profile
 
 
 def _may_improve(candidate_set: CandidateSet, profile_fit: ProfileWithPlants) -> bool:
-    """Return whether a refit from the minima of a profile may lower the cost of a candidate."""
+    """Return whether a fit that starts at the minima of a profile may improve a candidate.
+
+    That is so if the profile has other minima, or a lower sum of squares.
+    """
     if len(profile_fit.plants) > 1:
         return True
-    free_parameters = set(profile_fit.structure.free)
-    costs = [
+    free_names = set(profile_fit.structure.free)
+    candidate_costs = [
         candidate.fit.cost
         for candidate in candidate_set.candidates
-        if free_parameters <= set(candidate.structure.free)
+        if free_names <= set(candidate.structure.free)
     ]
-    return bool(costs) and profile_fit.cost < min(costs) * (1 - MISSED_COST_FRACTION)
+    return bool(candidate_costs) and profile_fit.cost < min(candidate_costs) * (
+        1 - MISSED_COST_FRACTION
+    )
 
 
 # Profile of one order
@@ -318,10 +323,16 @@ def with_free_order(structure: Structure, order: Order) -> Structure:
     order : {"alpha", "lambda"}
         Order to be free.
     """
-    coefficient = COEFFICIENT_OF[order]
-    fixed = {name: at for name, at in structure.fixed.items() if name not in (coefficient, order)}
-    free_parameters = tuple(name for name in PARAMETERS if name not in fixed)
-    return Structure(structure.name, free_parameters, MappingProxyType(fixed))
+    damping_coefficient = COEFFICIENT_OF[order]
+    fixed_values = {
+        parameter_name: at
+        for parameter_name, at in structure.fixed.items()
+        if parameter_name not in (damping_coefficient, order)
+    }
+    free_names = tuple(
+        parameter_name for parameter_name in PARAMETERS if parameter_name not in fixed_values
+    )
+    return Structure(structure.name, free_names, MappingProxyType(fixed_values))
 
 
 class OrderProfiler:
@@ -350,47 +361,49 @@ class OrderProfiler:
         self._refits: dict[float, Refit] = {}
         self._start_at(first_minimum)
 
-    def _start_at(self, minimum: Refit) -> None:
-        """Store a minimum with free order, and continue the profile from it."""
-        self._minimum = minimum
-        self._minimum_order = float(minimum.x[self._order_index])
-        self._store_lower(self._minimum_order, minimum)
+    def _start_at(self, free_order_fit: Refit) -> None:
+        """Store a fit with free order as the minimum from which the profile is continued."""
+        self._minimum = free_order_fit
+        self._minimum_order = float(free_order_fit.x[self._order_index])
+        self._store_lower(self._minimum_order, free_order_fit)
 
-    def plant(self, value: float) -> Plant:
-        """Return the plant that was fitted at a computed value of the order."""
-        return self._refits[value].plant
+    def plant(self, order_value: float) -> Plant:
+        """Return the plant that was fitted with the order fixed at a value, already computed."""
+        return self._refits[order_value].plant
 
     def curve(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the computed order values, increasing, and their deviances, each of shape (n,)."""
-        values = np.array(sorted(self.costs))
-        costs = np.array([self.costs[value] for value in values])
-        return values, self._value_count * np.log(costs / costs.min())
+        order_values = np.array(sorted(self.costs))
+        order_costs = np.array([self.costs[order_value] for order_value in order_values])
+        return order_values, self._value_count * np.log(order_costs / order_costs.min())
 
     def extend_both_ways(self) -> None:
         """Extend the profile in both directions from the current minimum."""
-        for sign in (-1.0, 1.0):
-            self._extend(sign)
+        for direction in (-1.0, 1.0):
+            self._extend(direction)
 
     def extend_from_candidates(self) -> None:
-        """Extend the profile from equally good candidates whose order is outside of the interval.
+        """Extend the profile from candidates that fit as well, outside of the 95 % interval.
 
         Most of them fix the order at 1. A barrier may separate them from the minimum.
         """
-        coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
+        damping_coefficient, free_parameters = COEFFICIENT_OF[self.order], set(self.structure.free)
         for candidate in self._candidate_set.candidates:
-            is_special_case = candidate.structure.has(coefficient) and free_parameters > set(
-                candidate.structure.free
-            )
+            is_special_case = candidate.structure.has(
+                damping_coefficient
+            ) and free_parameters > set(candidate.structure.free)
             if not is_special_case:
                 continue
             (lower_end, upper_end), *_ = admitted_interval(*self.curve())
-            deviance = self._value_count * math.log(candidate.fit.cost / min(self.costs.values()))
+            candidate_deviance = self._value_count * math.log(
+                candidate.fit.cost / min(self.costs.values())
+            )
             if (
-                deviance < CHI_SQUARE_95
+                candidate_deviance < CHI_SQUARE_95
                 and not lower_end <= candidate.fit.parameters[self.order] <= upper_end
             ):
-                start = self._unknowns.vector(candidate.fit.plant)
-                self._start_at(self._descend(start, _MAX_EVALUATIONS, hold=(self.order,)))
+                start_unknowns = self._unknowns.vector(candidate.fit.plant)
+                self._start_at(self._descend(start_unknowns, _MAX_EVALUATIONS, hold=(self.order,)))
                 self.extend_both_ways()
 
     def extend_from_other_minima(self) -> None:
@@ -399,80 +412,97 @@ class OrderProfiler:
         Extend the profile from each of them.
         """
         (lower_end, upper_end), open_below, open_above = admitted_interval(*self.curve())
-        is_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-        orders = values_outside_known(list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING)
-        if not (is_wide or open_below or open_above) or not orders:
+        is_interval_wide = upper_end - lower_end > _DOUBTFUL_FRACTION * (
+            ORDER_RANGE[1] - ORDER_RANGE[0]
+        )
+        trial_orders = values_outside_known(list(self.costs), ORDER_RANGE, _TRIAL_ORDER_SPACING)
+        if not (is_interval_wide or open_below or open_above) or not trial_orders:
             return
         # Loss and order are separate unknowns: the loss stays constant as the order changes.
-        trials = {}
-        for value in orders:
-            start = self._minimum.x.copy()
-            start[self._order_index] = value
-            trials[value] = self._descend(start, _TRIAL_EVALUATIONS, hold=(self.order,))
+        trial_fits = {}
+        for trial_order in trial_orders:
+            start_unknowns = self._minimum.x.copy()
+            start_unknowns[self._order_index] = trial_order
+            trial_fits[trial_order] = self._descend(
+                start_unknowns, _TRIAL_EVALUATIONS, hold=(self.order,)
+            )
         highest_cost = min(self.costs.values()) * math.exp(
             FAR_BEHIND_BIC_DIFFERENCE / self._value_count
         )
-        for value in coarse_minima_values({value: trial.cost for value, trial in trials.items()}):
-            minimum = self._descend(
-                trials[value].x, _MAX_EVALUATIONS, hopeless=(_TRIAL_EVALUATIONS, highest_cost)
+        for trial_order in coarse_minima_values(
+            {trial_order: trial_fit.cost for trial_order, trial_fit in trial_fits.items()}
+        ):
+            refined_fit = self._descend(
+                trial_fits[trial_order].x,
+                _MAX_EVALUATIONS,
+                hopeless=(_TRIAL_EVALUATIONS, highest_cost),
             )
-            values, deviance = self.curve()
-            at = float(minimum.x[self._order_index])
-            minimum_deviance = self._value_count * math.log(minimum.cost / min(self.costs.values()))
-            known_deviance = float(np.interp(at, values, deviance, math.inf, math.inf))
+            order_values, deviances = self.curve()
+            at = float(refined_fit.x[self._order_index])
+            minimum_deviance = self._value_count * math.log(
+                refined_fit.cost / min(self.costs.values())
+            )
+            known_deviance = float(np.interp(at, order_values, deviances, math.inf, math.inf))
             if minimum_deviance < min(CHI_SQUARE_95, known_deviance - MIN_BARRIER_DEVIANCE):
-                self._start_at(minimum)
+                self._start_at(refined_fit)
                 self.extend_both_ways()
 
-    def _store_lower(self, value: float, refit: Refit) -> None:
-        """Store a refit at one value of the order, unless a stored one has a lower cost."""
-        if refit.cost < self.costs.get(value, math.inf):
-            self.costs[value], self._refits[value] = refit.cost, refit
+    def _store_lower(self, order_value: float, refit: Refit) -> None:
+        """Store the fit with the order fixed at a value, unless a stored one has a lower cost."""
+        if refit.cost < self.costs.get(order_value, math.inf):
+            self.costs[order_value], self._refits[order_value] = refit.cost, refit
 
-    def _extend(self, sign: float) -> None:
+    def _extend(self, direction: float) -> None:
         """Extend the profile in one direction until the record excludes the values beyond.
 
         Then refine the value at which the deviance crosses the 95 % limit.
         """
         smallest_order, largest_order = ORDER_RANGE
-        value, distance, root = self._minimum_order, self._order_std(), 0.0
-        inside_value, outside_value = value, None
-        while smallest_order < value < largest_order and root**2 < _LAST_DEVIANCE:
-            nearest_refit = self._refits[value]
-            value = min(max(self._minimum_order + sign * distance, smallest_order), largest_order)
-            root = self._refit_at(value, nearest_refit)
-            if root**2 < CHI_SQUARE_95:
-                inside_value, target_deviance = value, CHI_SQUARE_95
+        order_value, order_distance, deviance_root = self._minimum_order, self._order_std(), 0.0
+        inside_order, outside_order = order_value, None
+        while smallest_order < order_value < largest_order and deviance_root**2 < _LAST_DEVIANCE:
+            nearest_refit = self._refits[order_value]
+            order_value = min(
+                max(self._minimum_order + direction * order_distance, smallest_order), largest_order
+            )
+            deviance_root = self._refit_at(order_value, nearest_refit)
+            if deviance_root**2 < CHI_SQUARE_95:
+                inside_order, target_deviance = order_value, CHI_SQUARE_95
             else:
-                outside_value, target_deviance = (
-                    outside_value if outside_value is not None else value,
+                outside_order, target_deviance = (
+                    outside_order if outside_order is not None else order_value,
                     _LAST_DEVIANCE,
                 )
-            growth = _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(root, 1e-3)
-            distance *= min(max(growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
-        for _ in range(_MAX_LIMIT_REFITS if outside_value is not None else 0):
-            assert outside_value is not None
-            if abs(inside_value - self._minimum_order) >= abs(outside_value - self._minimum_order):
+            distance_growth = (
+                _OVERSHOOT_FACTOR * math.sqrt(target_deviance) / max(deviance_root, 1e-3)
+            )
+            order_distance *= min(max(distance_growth, _MIN_DISTANCE_GROWTH), _MAX_DISTANCE_GROWTH)
+        for _ in range(_MAX_LIMIT_REFITS if outside_order is not None else 0):
+            assert outside_order is not None
+            if abs(inside_order - self._minimum_order) >= abs(outside_order - self._minimum_order):
                 break  # there is a barrier between
             inside_root, outside_root = (
-                self._deviance_root(inside_value),
-                self._deviance_root(outside_value),
+                self._deviance_root(inside_order),
+                self._deviance_root(outside_order),
             )
             if outside_root - inside_root < _INTERPOLATION_ROOT_DIFFERENCE:
                 break
-            trial_value = limit_crossing(
-                inside_value, outside_value, inside_root**2, outside_root**2
+            trial_order = limit_crossing(
+                inside_order, outside_order, inside_root**2, outside_root**2
             )
-            if self._refit_at(trial_value, self._refits[inside_value]) ** 2 < CHI_SQUARE_95:
-                inside_value = trial_value
+            if self._refit_at(trial_order, self._refits[inside_order]) ** 2 < CHI_SQUARE_95:
+                inside_order = trial_order
             else:
-                outside_value = trial_value
+                outside_order = trial_order
 
     def _order_std(self) -> float:
-        """Return the standard deviation of the order at the minimum, within 1e-4 to 0.25."""
-        (scaled_hessian, scale), index = self._minimum.equations.scaled_hessian(), self._order_index
-        inverse = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))
-        variance = inverse[index, index] / scale[index] ** 2
+        """Return the standard deviation of the order at the minimum, limited to 1e-4 to 0.25."""
+        (scaled_hessian, hessian_scale), order_index = (
+            self._minimum.equations.scaled_hessian(),
+            self._order_index,
+        )
+        inverse_hessian = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(hessian_scale.size))
+        variance = inverse_hessian[order_index, order_index] / hessian_scale[order_index] ** 2
         std = (
             math.sqrt(variance * self._minimum.cost / self._value_count)
             if variance > 0
@@ -480,64 +510,73 @@ class OrderProfiler:
         )
         return min(max(std, 1e-4), 0.25)
 
-    def _deviance_root(self, value: float) -> float:
+    def _deviance_root(self, order_value: float) -> float:
         """Return the square root of the deviance at a computed value of the order."""
-        lowest = self.costs[self._minimum_order]
-        return math.sqrt(max(self._value_count * math.log(self.costs[value] / lowest), 0.0))
+        lowest_cost = self.costs[self._minimum_order]
+        return math.sqrt(
+            max(self._value_count * math.log(self.costs[order_value] / lowest_cost), 0.0)
+        )
 
-    def _refit_at(self, value: float, nearest_refit: Refit) -> float:
-        """Fit all other parameters at a fixed order. Return the square root of the deviance."""
-        hold, highest_cost = (
+    def _refit_at(self, order_value: float, nearest_refit: Refit) -> float:
+        """Fit all other parameters with the order fixed at a value, and store the fit.
+
+        Return the square root of its deviance.
+        """
+        fixed_names, highest_cost = (
             (self.order,),
             self.costs[self._minimum_order]
             * math.exp(FAR_BEHIND_BIC_DIFFERENCE / self._value_count),
         )
         refit = self._descend(
-            self._tangent(value, nearest_refit),
+            self._tangent(order_value, nearest_refit),
             _MAX_EVALUATIONS,
-            hold=hold,
+            hold=fixed_names,
             hopeless=(_TRIAL_EVALUATIONS, highest_cost),
         )
         if refit.cost > highest_cost:
             # Near 0 and 2 damping acts as stiffness or inertia, and the tangent may lead to a point
             # from which no descent converges. So all other unknowns keep their values.
             refit = self._better_refit(
-                refit, nearest_refit, value, (_TRIAL_EVALUATIONS, highest_cost)
+                refit, nearest_refit, order_value, (_TRIAL_EVALUATIONS, highest_cost)
             )
         if refit.cost > highest_cost:
             # Without the damping its order has no effect on the cost.
-            refit = self._better_refit(refit, self._without_damping, value)
-        self._store_lower(value, refit)
-        return self._deviance_root(value)
+            refit = self._better_refit(refit, self._without_damping, order_value)
+        self._store_lower(order_value, refit)
+        return self._deviance_root(order_value)
 
     def _better_refit(
         self,
         first_refit: Refit,
         start_refit: Refit,
-        value: float,
+        order_value: float,
         hopeless: tuple[int, float] | None = None,
     ) -> Refit:
-        """Fit from the unknowns of another refit at a fixed order.
+        """Fit with the order fixed at a value, starting at the unknowns of `start_refit`.
 
-        Return the better of both fits.
+        Return this fit or `first_refit`, whichever has the lower cost.
         """
-        start = start_refit.x.copy()
-        start[self._order_index] = value
-        second_refit = self._descend(start, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless)
+        start_unknowns = start_refit.x.copy()
+        start_unknowns[self._order_index] = order_value
+        second_refit = self._descend(
+            start_unknowns, _MAX_EVALUATIONS, hold=(self.order,), hopeless=hopeless
+        )
         return min(first_refit, second_refit, key=lambda refit: refit.cost)
 
     @cached_property
     def _without_damping(self) -> Refit:
-        """Return the fit without the damping of this order, whose cost holds for any order."""
-        coefficient = COEFFICIENT_OF[self.order]
-        start = self._minimum.x.copy()
-        index = self._unknowns.names.index(coefficient)
-        start[index] = self._unknowns.bounds[0][index]
-        return self._descend(start, _MAX_EVALUATIONS, hold=(self.order, coefficient))
+        """Return the fit with the smallest damping. Its cost does not depend on the order."""
+        damping_coefficient = COEFFICIENT_OF[self.order]
+        start_unknowns = self._minimum.x.copy()
+        coefficient_index = self._unknowns.names.index(damping_coefficient)
+        start_unknowns[coefficient_index] = self._unknowns.bounds[0][coefficient_index]
+        return self._descend(
+            start_unknowns, _MAX_EVALUATIONS, hold=(self.order, damping_coefficient)
+        )
 
     def _descend(
         self,
-        start: NDArray[np.float64],
+        start_unknowns: NDArray[np.float64],
         max_evaluations: int,
         *,
         hold: tuple[str, ...] = (),
@@ -548,7 +587,7 @@ class OrderProfiler:
         return Refit.descend(
             candidate_set.comparison,
             self._unknowns,
-            start,
+            start_unknowns,
             candidate_set.noise,
             candidate_set.columns,
             max_evaluations=max_evaluations,
@@ -557,20 +596,20 @@ class OrderProfiler:
             hopeless=hopeless,
         )
 
-    def _tangent(self, value: float, nearest_refit: Refit) -> NDArray[np.float64]:
+    def _tangent(self, order_value: float, nearest_refit: Refit) -> NDArray[np.float64]:
         """Extrapolate the optimal unknowns linearly to another value of the order, shape (k,)."""
-        x, index = nearest_refit.x.copy(), self._order_index
-        scaled_hessian, scale = nearest_refit.equations.scaled_hessian()
-        lower, upper = self._unknowns.bounds
-        is_free = (x > lower) & (x < upper) & (np.arange(x.size) != index)
+        x, order_index = nearest_refit.x.copy(), self._order_index
+        scaled_hessian, hessian_scale = nearest_refit.equations.scaled_hessian()
+        lower_bounds, upper_bounds = self._unknowns.bounds
+        is_free = (x > lower_bounds) & (x < upper_bounds) & (np.arange(x.size) != order_index)
         free_hessian = scaled_hessian[np.ix_(is_free, is_free)] + 1e-9 * np.eye(int(is_free.sum()))
-        slope = (
-            -np.linalg.solve(free_hessian, scaled_hessian[is_free, index])
-            / scale[is_free]
-            * scale[index]
+        unknown_slopes = (
+            -np.linalg.solve(free_hessian, scaled_hessian[is_free, order_index])
+            / hessian_scale[is_free]
+            * hessian_scale[order_index]
         )
-        x[is_free] += slope * (value - x[index])
-        x[index] = value
+        x[is_free] += unknown_slopes * (order_value - x[order_index])
+        x[order_index] = order_value
         return x
 
 
@@ -584,40 +623,51 @@ MIN_BARRIER_DEVIANCE: Final = 0.5
 far larger than the tolerance of the refits."""
 
 
-def local_minima(values: NDArray[np.float64], deviance: NDArray[np.float64]) -> tuple[float, ...]:
-    """Return the order values at the local minima within the 95 % limit, the lowest first.
+def local_minima(
+    order_values: NDArray[np.float64], deviances: NDArray[np.float64]
+) -> tuple[float, ...]:
+    """Return the order values at the local minima of the deviance within the 95 % limit.
+
+    The one with the lowest deviance is first.
 
     Parameters
     ----------
-    values : ndarray of float, shape (n,)
+    order_values : ndarray of float, shape (n,)
         Values of the order, increasing.
-    deviance : ndarray of float, shape (n,)
+    deviances : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
     """
-    padded_deviance = np.concatenate([[np.inf], deviance, [np.inf]])
+    padded_deviance = np.concatenate([[np.inf], deviances, [np.inf]])
     minimum_indices = np.flatnonzero(
         (padded_deviance[1:-1] <= padded_deviance[:-2])
         & (padded_deviance[1:-1] < padded_deviance[2:])
     )
-    minimum_indices = minimum_indices[deviance[minimum_indices] < CHI_SQUARE_95]
-    distinct: list[int] = []
-    for low in minimum_indices[np.argsort(deviance[minimum_indices], kind="stable")].tolist():
-        barriers = (deviance[min(low, k) : max(low, k) + 1].max() for k in distinct)
-        if all(barrier > deviance[low] + MIN_BARRIER_DEVIANCE for barrier in barriers):
-            distinct.append(low)
-    return tuple(values[distinct].tolist())
+    minimum_indices = minimum_indices[deviances[minimum_indices] < CHI_SQUARE_95]
+    distinct_indices: list[int] = []
+    for low in minimum_indices[np.argsort(deviances[minimum_indices], kind="stable")].tolist():
+        barrier_deviances = (
+            deviances[min(low, k) : max(low, k) + 1].max() for k in distinct_indices
+        )
+        if all(
+            barrier_deviance > deviances[low] + MIN_BARRIER_DEVIANCE
+            for barrier_deviance in barrier_deviances
+        ):
+            distinct_indices.append(low)
+    return tuple(order_values[distinct_indices].tolist())
 
 
 def admitted_interval(
-    values: NDArray[np.float64], deviance: NDArray[np.float64]
+    order_values: NDArray[np.float64], deviances: NDArray[np.float64]
 ) -> tuple[tuple[float, float], bool, bool]:
-    """Return the interval of all order values within the 95 % limit, barriers included.
+    """Return the interval of the order values whose deviance is within the 95 % limit.
+
+    Barriers of higher deviance between them are included.
 
     Parameters
     ----------
-    values : ndarray of float, shape (n,)
+    order_values : ndarray of float, shape (n,)
         Values of the order, increasing.
-    deviance : ndarray of float, shape (n,)
+    deviances : ndarray of float, shape (n,)
         Deviance at each value, minus the lowest one.
 
     Returns
@@ -627,81 +677,102 @@ def admitted_interval(
     open_below, open_above : bool
         Whether the deviance stays within the limit down to the first, and up to the last value.
     """
-    inside_indices = np.flatnonzero(deviance <= CHI_SQUARE_95)
+    inside_indices = np.flatnonzero(deviances <= CHI_SQUARE_95)
     first_inside, last_inside = int(inside_indices[0]), int(inside_indices[-1])
     lower_end = (
-        values[0]
+        order_values[0]
         if first_inside == 0
-        else _limit_crossing_between(values, deviance, first_inside, first_inside - 1)
+        else _limit_crossing_between(order_values, deviances, first_inside, first_inside - 1)
     )
     upper_end = (
-        values[-1]
-        if last_inside == values.size - 1
-        else _limit_crossing_between(values, deviance, last_inside, last_inside + 1)
+        order_values[-1]
+        if last_inside == order_values.size - 1
+        else _limit_crossing_between(order_values, deviances, last_inside, last_inside + 1)
     )
-    return (float(lower_end), float(upper_end)), first_inside == 0, last_inside == values.size - 1
+    return (
+        (float(lower_end), float(upper_end)),
+        first_inside == 0,
+        last_inside == order_values.size - 1,
+    )
 
 
-def limit_crossing(inside: float, outside: float, below: float, above: float) -> float:
+def limit_crossing(
+    inside_value: float, outside_value: float, deviance_inside: float, deviance_outside: float
+) -> float:
     """Interpolate the value at which a deviance crosses the 95 % limit.
 
     The square root of the deviance is almost linear in the value.
 
     Parameters
     ----------
-    inside, outside : float
+    inside_value, outside_value : float
         Values on either side of the limit.
-    below, above : float
+    deviance_inside, deviance_outside : float
         Deviances at these values.
     """
-    root_inside, root_outside = math.sqrt(max(below, 0.0)), math.sqrt(max(above, 0.0))
-    fraction = (math.sqrt(CHI_SQUARE_95) - root_inside) / (root_outside - root_inside)
-    return inside + fraction * (outside - inside)
+    root_inside, root_outside = (
+        math.sqrt(max(deviance_inside, 0.0)),
+        math.sqrt(max(deviance_outside, 0.0)),
+    )
+    crossing_fraction = (math.sqrt(CHI_SQUARE_95) - root_inside) / (root_outside - root_inside)
+    return inside_value + crossing_fraction * (outside_value - inside_value)
 
 
 def values_outside_known(
-    known: list[float], span: tuple[float, float], spacing: float
+    known_values: list[float], value_range: tuple[float, float], spacing: float
 ) -> list[float]:
-    """Return equally spaced values of a span that are outside the range of all known values.
+    """Return equally spaced values within a span, without those between known values.
 
     Parameters
     ----------
-    known : list of float
+    known_values : list of float
         Values at which the profile is known.
-    span : tuple of float
+    value_range : tuple of float
         First and last value of the span.
     spacing : float
         Distance between neighbouring values.
     """
-    grid = np.arange(span[0] + spacing / 2, span[1], spacing).tolist()
-    smallest_known, largest_known = min(known), max(known)
+    spaced_values = np.arange(value_range[0] + spacing / 2, value_range[1], spacing).tolist()
+    smallest_known, largest_known = min(known_values), max(known_values)
     return [
-        value
-        for value in grid
-        if value < smallest_known - spacing / 4 or value > largest_known + spacing / 4
+        spaced_value
+        for spaced_value in spaced_values
+        if spaced_value < smallest_known - spacing / 4 or spaced_value > largest_known + spacing / 4
     ]
 
 
-def coarse_minima_values(curve: dict[float, float]) -> list[float]:
-    """Return the values at the local minima of a coarse curve, including its ends."""
-    values = sorted(curve)
-    heights = [math.inf, *(curve[value] for value in values), math.inf]
+def coarse_minima_values(height_by_value: dict[float, float]) -> list[float]:
+    """Return the positions of the local minima of a sampled curve, including its ends."""
+    sorted_values = sorted(height_by_value)
+    curve_heights = [
+        math.inf,
+        *(height_by_value[curve_value] for curve_value in sorted_values),
+        math.inf,
+    ]
     return [
-        value
-        for value, (left_height, height, right_height) in zip(
-            values, zip(heights, heights[1:], heights[2:], strict=False), strict=True
+        curve_value
+        for curve_value, (left_height, own_height, right_height) in zip(
+            sorted_values,
+            zip(curve_heights, curve_heights[1:], curve_heights[2:], strict=False),
+            strict=True,
         )
-        if height <= left_height and height <= right_height
+        if own_height <= left_height and own_height <= right_height
     ]
 
 
 def _limit_crossing_between(
-    values: NDArray[np.float64], deviance: NDArray[np.float64], inside: int, outside: int
+    order_values: NDArray[np.float64],
+    deviances: NDArray[np.float64],
+    inside_index: int,
+    outside_index: int,
 ) -> float:
-    """Interpolate the value at the 95 % limit between two indices of a profile."""
+    """Return the order value at which the deviance crosses the 95 % limit.
+
+    It is interpolated between one index within the limit and one outside.
+    """
     return limit_crossing(
-        float(values[inside]),
-        float(values[outside]),
-        float(deviance[inside]),
-        float(deviance[outside]),
+        float(order_values[inside_index]),
+        float(order_values[outside_index]),
+        float(deviances[inside_index]),
+        float(deviances[outside_index]),
     )

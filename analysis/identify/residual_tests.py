@@ -33,9 +33,9 @@ SIGNIFICANT_STD: Final = 5.0
 tests together."""
 
 
-def largest_deviate_limit(count: int) -> float:
-    """Return the significance limit of x²/2 for the largest x of `count` normal deviates."""
-    return SIGNIFICANT_STD**2 / 2 + math.log(max(count, 1))
+def largest_deviate_limit(deviate_count: int) -> float:
+    """Return the significance limit of x²/2 for the largest of several normal deviates x."""
+    return SIGNIFICANT_STD**2 / 2 + math.log(max(deviate_count, 1))
 
 
 # Whiteness, and coherence with the input
@@ -72,7 +72,7 @@ multisine."""
 
 @dataclass(frozen=True, slots=True)
 class Whiteness:
-    """Whiteness test of a residual by its power (Bartlett's cumulative periodogram).
+    """Result of the test whether a residual is white, by Bartlett's cumulative periodogram.
 
     Attributes
     ----------
@@ -99,7 +99,7 @@ class Whiteness:
 
     @property
     def white(self) -> bool:
-        """Return whether the residual is consistent with noise alone."""
+        """Return whether the power of the residual is distributed over frequency as noise is."""
         return self.probability > _NOT_WHITE_PROBABILITY and not self.loud
 
     @property
@@ -110,7 +110,7 @@ class Whiteness:
 
 @dataclass(frozen=True, slots=True)
 class InputRelation:
-    """Test of whether a residual still follows the angle: linear dynamics outside the model.
+    """Result of the test whether a residual follows the angle, by dynamics outside the model.
 
     Attributes
     ----------
@@ -150,9 +150,9 @@ def cumulative_periodogram(residual: NDArray[np.complex128]) -> NDArray[np.float
     >>> print(cumulative_periodogram(np.array([1, 1j, -1, 1])))
     [0.25 0.5  0.75 1.  ]
     """
-    power = np.cumsum(residual.real**2 + residual.imag**2)
-    cumulative: NDArray[np.float64] = power / power[-1]
-    return cumulative
+    cumulative_power = np.cumsum(residual.real**2 + residual.imag**2)
+    power_fraction: NDArray[np.float64] = cumulative_power / cumulative_power[-1]
+    return power_fraction
 
 
 def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64]) -> Whiteness:
@@ -165,103 +165,113 @@ def whiteness(residual: NDArray[np.complex128], frequency_hz: NDArray[np.float64
     frequency_hz : ndarray, shape (K,)
         Frequencies of these bins.
     """
-    count = residual.size
-    straight_line = np.arange(1, count + 1) / count
-    distance = float(np.abs(cumulative_periodogram(residual) - straight_line).max())
-    power = residual.real**2 + residual.imag**2
-    cumulative_power = np.concatenate([[0.0], np.cumsum(power)])
-    loudest, edges, loudest_ratio, loud = -math.inf, (0.0, 0.0), 1.0, False
-    for width in _WINDOW_BINS:
-        if width >= count:
+    bin_count = residual.size
+    straight_line = np.arange(1, bin_count + 1) / bin_count
+    largest_distance = float(np.abs(cumulative_periodogram(residual) - straight_line).max())
+    bin_power = residual.real**2 + residual.imag**2
+    cumulative_power = np.concatenate([[0.0], np.cumsum(bin_power)])
+    largest_deviate, loudest_hz, loudest_ratio, is_loud = -math.inf, (0.0, 0.0), 1.0, False
+    for window_bins in _WINDOW_BINS:
+        if window_bins >= bin_count:
             continue
-        window_power = cumulative_power[width:] - cumulative_power[:-width]
+        window_power = cumulative_power[window_bins:] - cumulative_power[:-window_bins]
         i = int(np.argmax(window_power))
-        deviate = chi_square_deviate(float(window_power[i]), 2 * width)
-        if deviate > loudest:
-            loudest = deviate
-            edges = (float(frequency_hz[i]), float(frequency_hz[i + width - 1]))
-            loudest_ratio = float(window_power[i]) / (2 * width)
-        loud |= (
-            deviate > SIGNIFICANT_STD + 0.5
-            and float(window_power[i]) / (2 * width) > _LOUD_POWER_RATIO
+        window_deviate = chi_square_deviate(float(window_power[i]), 2 * window_bins)
+        if window_deviate > largest_deviate:
+            largest_deviate = window_deviate
+            loudest_hz = (float(frequency_hz[i]), float(frequency_hz[i + window_bins - 1]))
+            loudest_ratio = float(window_power[i]) / (2 * window_bins)
+        is_loud |= (
+            window_deviate > SIGNIFICANT_STD + 0.5
+            and float(window_power[i]) / (2 * window_bins) > _LOUD_POWER_RATIO
         )
     return Whiteness(
-        distance=distance,
-        band=KOLMOGOROV_95 / math.sqrt(count),
-        probability=kolmogorov_p_value(distance * math.sqrt(count)),
-        loudest_hz=edges,
+        distance=largest_distance,
+        band=KOLMOGOROV_95 / math.sqrt(bin_count),
+        probability=kolmogorov_p_value(largest_distance * math.sqrt(bin_count)),
+        loudest_hz=loudest_hz,
         loudest_ratio=loudest_ratio,
-        loud=loud,
+        loud=is_loud,
     )
 
 
 def input_relation(
     residual: NDArray[np.complex128],
-    angle: NDArray[np.complex128],
+    angle_transform: NDArray[np.complex128],
     frequency_hz: NDArray[np.float64],
 ) -> InputRelation:
     """Test whether a residual is linearly related to the angle.
 
     Parameters
     ----------
-    residual, angle : ndarray of complex, shape (K,)
+    residual, angle_transform : ndarray of complex, shape (K,)
         Whitened residual, and Fourier transform of the angle.
     frequency_hz : ndarray, shape (K,)
         Frequencies of the bins, equally spaced.
     """
     # Where the motor was not driven, the angle is the response of the loop to the torque's noise.
     # Such bins would show a relation of residual and angle, so they have almost no weight here.
-    power = np.abs(angle) ** 2
-    neighbours = min(_AVERAGING_BINS, power.size)
-    mean_power = np.convolve(power, np.full(neighbours, 1 / neighbours), mode="same")
-    normalized_angle = angle / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
+    angle_power_per_bin = np.abs(angle_transform) ** 2
+    averaged_bins = min(_AVERAGING_BINS, angle_power_per_bin.size)
+    mean_power = np.convolve(
+        angle_power_per_bin, np.full(averaged_bins, 1 / averaged_bins), mode="same"
+    )
+    normalized_angle = angle_transform / np.sqrt(np.maximum(mean_power, np.finfo(float).tiny))
     # The limit keeps a hum, which is no linear dynamics, from dominating.
     limited_residual = residual / np.maximum(np.abs(residual) / _RESIDUAL_LIMIT, 1.0)
     cross_spectrum = limited_residual * normalized_angle.conj()
     block_count = residual.size // _COHERENT_BINS
     first_bins = np.arange(0, block_count * _COHERENT_BINS, _COHERENT_BINS)
 
-    def block_sums(values: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the sum of values over each block of neighbouring bins."""
-        sums: NDArray[np.complex128] = np.add.reduceat(
-            values[: block_count * _COHERENT_BINS], first_bins
+    def block_sums(bin_values: NDArray[np.complex128]) -> NDArray[np.complex128]:
+        """Return the sum of values over each group of `_COHERENT_BINS` neighbouring bins."""
+        sums_per_block: NDArray[np.complex128] = np.add.reduceat(
+            bin_values[: block_count * _COHERENT_BINS], first_bins
         )
-        return sums
+        return sums_per_block
 
-    angle_power = block_sums(normalized_angle * normalized_angle.conj()).real
-    used_blocks = np.flatnonzero(angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
+    block_angle_power = block_sums(normalized_angle * normalized_angle.conj()).real
+    driven_blocks = np.flatnonzero(block_angle_power > _DRIVEN_POWER_RATIO * _COHERENT_BINS)
     largest_cross_power = (
-        block_sums(limited_residual * limited_residual.conj()).real[used_blocks]
-        * angle_power[used_blocks]
+        block_sums(limited_residual * limited_residual.conj()).real[driven_blocks]
+        * block_angle_power[driven_blocks]
     )
-    coherence = np.abs(block_sums(cross_spectrum)[used_blocks]) ** 2 / np.maximum(
+    coherence = np.abs(block_sums(cross_spectrum)[driven_blocks]) ** 2 / np.maximum(
         largest_cross_power, np.finfo(float).tiny
     )
     # Under chance (1 - coherence)^(m - 1) is uniform, whatever the angle.
     ln_chance = -(_COHERENT_BINS - 1) * np.log1p(-np.minimum(coherence, 1 - 1e-12))
-    least_likely = int(np.argmax(ln_chance))
-    local = bool(ln_chance[least_likely] > largest_deviate_limit(used_blocks.size))
-    deviate = chi_square_deviate(2 * float(ln_chance.sum()), 2 * used_blocks.size)
+    least_likely_index = int(np.argmax(ln_chance))
+    is_locally_related = bool(
+        ln_chance[least_likely_index] > largest_deviate_limit(driven_blocks.size)
+    )
+    summed_deviate = chi_square_deviate(2 * float(ln_chance.sum()), 2 * driven_blocks.size)
 
     spacing_hz = float(frequency_hz[1] - frequency_hz[0])
-    length = 4 * residual.size
-    lags = np.fft.ifft(cross_spectrum, length)
-    at_s = np.fft.fftfreq(length, spacing_hz)  # bins are spaced as the lags' inverse
-    carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
-    correlation = np.abs((lags * carrier).real) * length / np.linalg.norm(normalized_angle)
+    padded_length = 4 * residual.size
+    lag_transform = np.fft.ifft(cross_spectrum, padded_length)
+    at_s = np.fft.fftfreq(padded_length, spacing_hz)  # bins are spaced as the lags' inverse
+    first_bin_carrier = np.exp(2j * np.pi * frequency_hz[0] * at_s)
+    correlation = (
+        np.abs((lag_transform * first_bin_carrier).real)
+        * padded_length
+        / np.linalg.norm(normalized_angle)
+    )
     correlation[np.abs(at_s) > _MAX_LAG_S] = 0.0
     at = int(np.argmax(correlation))
     lag_count = int(np.count_nonzero(correlation))
     return InputRelation(
-        coherence=float(coherence[least_likely]),
-        at_hz=float(frequency_hz[first_bins[used_blocks[least_likely]] + _COHERENT_BINS // 2]),
-        local=local,
-        deviate=deviate,
+        coherence=float(coherence[least_likely_index]),
+        at_hz=float(
+            frequency_hz[first_bins[driven_blocks[least_likely_index]] + _COHERENT_BINS // 2]
+        ),
+        local=is_locally_related,
+        deviate=summed_deviate,
         correlation=float(correlation[at]),
         lag_s=float(at_s[at]),
         related=bool(
-            local
-            or deviate > SIGNIFICANT_STD
+            is_locally_related
+            or summed_deviate > SIGNIFICANT_STD
             or correlation[at] ** 2 / 2 > largest_deviate_limit(lag_count)
         ),
     )
@@ -288,7 +298,7 @@ _MIN_BLOCKS: Final = 5
 
 @dataclass(frozen=True, slots=True)
 class Harmonic:
-    """Test of a residual at one multiple of the drive frequency of a sweep.
+    """Result of the test for one harmonic of the sweep in a residual.
 
     Attributes
     ----------
@@ -325,57 +335,67 @@ def harmonics(
     band_hz : tuple of float
         First and last frequency at which the residual is known.
     """
-    length = round(_BLOCK_S * rate_hz)
-    block_count = angle_rad.size // length
-    analytic = _analytic_signal(angle_rad)[: block_count * length].reshape(block_count, length)
-    phase = np.unwrap(np.angle(analytic), axis=1)
-    drive_hz = (phase[:, -1] - phase[:, 0]) / (2 * np.pi * (length - 1) / rate_hz)
-    amplitude = np.abs(analytic).mean(axis=1)
-    # The frequency of a sweep hardly varies within a block, so its phase is a smooth curve.
-    time = np.linspace(-1, 1, length)
-    phase_curve = np.polynomial.polynomial.polyfit(time, phase.T, 2)
-    phase_deviation = np.abs(phase - np.polynomial.polynomial.polyval(time, phase_curve)).mean(
-        axis=1
+    block_length = round(_BLOCK_S * rate_hz)
+    block_count = angle_rad.size // block_length
+    analytic_blocks = _analytic_signal(angle_rad)[: block_count * block_length].reshape(
+        block_count, block_length
     )
-    usable = (
+    phase_rad = np.unwrap(np.angle(analytic_blocks), axis=1)
+    drive_hz = (phase_rad[:, -1] - phase_rad[:, 0]) / (2 * np.pi * (block_length - 1) / rate_hz)
+    block_amplitude = np.abs(analytic_blocks).mean(axis=1)
+    # The frequency of a sweep hardly varies within a block, so its phase is a smooth curve.
+    block_time = np.linspace(-1, 1, block_length)
+    phase_coefficients = np.polynomial.polynomial.polyfit(block_time, phase_rad.T, 2)
+    phase_deviation = np.abs(
+        phase_rad - np.polynomial.polynomial.polyval(block_time, phase_coefficients)
+    ).mean(axis=1)
+    is_steady_block = (
         (phase_deviation < _STEADINESS_LIMIT)
-        & (amplitude > _STEADINESS_LIMIT * np.median(amplitude))
+        & (block_amplitude > _STEADINESS_LIMIT * np.median(block_amplitude))
         & (drive_hz > _MIN_DRIVE_HZ)
     )
-    window = np.hanning(length)
-    windowed_blocks = residual[: block_count * length].reshape(block_count, length) * window
-    tests = []
+    hann_window = np.hanning(block_length)
+    windowed_blocks = (
+        residual[: block_count * block_length].reshape(block_count, block_length) * hann_window
+    )
+    harmonic_tests = []
     for multiple in TESTED_MULTIPLES:
-        usable_blocks = (
-            usable & (multiple * drive_hz > band_hz[0] + 2) & (multiple * drive_hz < band_hz[1] - 2)
+        is_tested_block = (
+            is_steady_block
+            & (multiple * drive_hz > band_hz[0] + 2)
+            & (multiple * drive_hz < band_hz[1] - 2)
         )
-        if np.count_nonzero(usable_blocks) < _MIN_BLOCKS:
+        if np.count_nonzero(is_tested_block) < _MIN_BLOCKS:
             continue
         harmonic_amplitudes = np.sum(
-            windowed_blocks[usable_blocks] * np.exp(-1j * multiple * phase[usable_blocks]), axis=1
+            windowed_blocks[is_tested_block] * np.exp(-1j * multiple * phase_rad[is_tested_block]),
+            axis=1,
         )
-        chi_square = 2 * np.abs(harmonic_amplitudes) ** 2 / np.sum(window**2)
-        deviate = chi_square_deviate(float(chi_square.sum()), 2 * chi_square.size)
-        largest = int(np.argmax(chi_square))
-        tests.append(
+        chi_square = 2 * np.abs(harmonic_amplitudes) ** 2 / np.sum(hann_window**2)
+        harmonic_deviate = chi_square_deviate(float(chi_square.sum()), 2 * chi_square.size)
+        largest_index = int(np.argmax(chi_square))
+        harmonic_tests.append(
             Harmonic(
                 multiple=multiple,
-                deviate=deviate,
-                drive_hz=float(drive_hz[usable_blocks][largest]),
+                deviate=harmonic_deviate,
+                drive_hz=float(drive_hz[is_tested_block][largest_index]),
                 present=bool(
-                    deviate > SIGNIFICANT_STD
-                    or chi_square[largest] / 2 > largest_deviate_limit(chi_square.size)
+                    harmonic_deviate > SIGNIFICANT_STD
+                    or chi_square[largest_index] / 2 > largest_deviate_limit(chi_square.size)
                 ),
             )
         )
-    return tuple(tests)
+    return tuple(harmonic_tests)
 
 
-def _analytic_signal(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-    """Return the analytic signal, which has no negative frequencies, shape (n,)."""
-    spectrum = np.fft.fft(values - values.mean())
-    n = values.size
-    spectrum[(n + 1) // 2 :] = 0
-    spectrum[1 : (n + 1) // 2] *= 2
-    analytic: NDArray[np.complex128] = np.fft.ifft(spectrum)
-    return analytic
+def _analytic_signal(real_samples: NDArray[np.float64]) -> NDArray[np.complex128]:
+    """Return the analytic signal of real samples without their mean, shape (n,).
+
+    Its spectrum has no negative frequencies.
+    """
+    one_sided_spectrum = np.fft.fft(real_samples - real_samples.mean())
+    n = real_samples.size
+    one_sided_spectrum[(n + 1) // 2 :] = 0
+    one_sided_spectrum[1 : (n + 1) // 2] *= 2
+    analytic_signal: NDArray[np.complex128] = np.fft.ifft(one_sided_spectrum)
+    return analytic_signal

@@ -62,20 +62,25 @@ def parameters_compensate_scales(fit: RecordFit) -> bool:
     fit : RecordFit
         Fit to a record. If a beam parameter or a tool inertia is fixed, the result is False.
     """
-    held_tool = _TOOL_INERTIA not in fit.interval and fit.parameters[_TOOL_INERTIA] != 0
-    return all(name in fit.interval for name in _COMPENSATING_PARAMETERS) and not held_tool
+    has_fixed_tool_inertia = (
+        _TOOL_INERTIA not in fit.interval and fit.parameters[_TOOL_INERTIA] != 0
+    )
+    return (
+        all(parameter_name in fit.interval for parameter_name in _COMPENSATING_PARAMETERS)
+        and not has_fixed_tool_inertia
+    )
 
 
 def with_scale_uncertainty(
-    parameters: Mapping[str, ReportedValue], uncertainty: Mapping[str, float]
+    reported_parameters: Mapping[str, ReportedValue], scale_uncertainty: Mapping[str, float]
 ) -> dict[str, ReportedValue]:
-    """Combine the statistical uncertainties of parameters with those of the scales.
+    """Add the uncertainties of the scales, such as length, to those of the parameters.
 
     Parameters
     ----------
-    parameters : mapping of str to ReportedValue
+    reported_parameters : mapping of str to ReportedValue
         Parameters with statistical uncertainties, by the names of `RecordFit`.
-    uncertainty : mapping of str to float
+    scale_uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale" and "length", if stated.
 
     Returns
@@ -85,42 +90,63 @@ def with_scale_uncertainty(
         combined standard uncertainty and 95 % interval.
     """
     return {
-        name: _with_scale_uncertainty(each, relative, logarithmic=name in LOGARITHMIC_PARAMETERS)
-        for name, each in parameters.items()
-        if each.interval_95 is not None
-        and (relative := _relative_scale_uncertainty(SCALE_EXPONENTS.get(name, {}), uncertainty))
+        parameter_name: _with_scale_uncertainty(
+            reported_value, relative_std, is_logarithmic=parameter_name in LOGARITHMIC_PARAMETERS
+        )
+        for parameter_name, reported_value in reported_parameters.items()
+        if reported_value.interval_95 is not None
+        and (
+            relative_std := _relative_scale_uncertainty(
+                SCALE_EXPONENTS.get(parameter_name, {}), scale_uncertainty
+            )
+        )
     }
 
 
 def _relative_scale_uncertainty(
-    exponents: Mapping[str, int], uncertainty: Mapping[str, float]
+    scale_exponents: Mapping[str, int], scale_uncertainty: Mapping[str, float]
 ) -> float:
-    """Return the relative standard uncertainty of a parameter by the scales."""
-    return math.hypot(*(power * uncertainty.get(scale, 0.0) for scale, power in exponents.items()))
+    """Return the relative standard uncertainty of a parameter by those of the scales.
+
+    `scale_exponents` are the powers of the scales, such as length, to which the parameter is
+    proportional.
+    """
+    return math.hypot(
+        *(
+            scale_exponent * scale_uncertainty.get(scale_name, 0.0)
+            for scale_name, scale_exponent in scale_exponents.items()
+        )
+    )
 
 
 def _with_scale_uncertainty(
-    quantity: ReportedValue, relative: float, *, logarithmic: bool
+    reported_value: ReportedValue, relative_std: float, *, is_logarithmic: bool
 ) -> ReportedValue:
-    """Return a value whose 95 % interval includes the uncertainty of the scales, in quadrature."""
-    assert quantity.interval_95 is not None
-    value, (lower_end, upper_end) = quantity.value, quantity.interval_95
-    std = math.hypot(quantity.std or 0.0, value * relative)
-    if logarithmic:
+    """Return a reported value whose uncertainty includes that of torque scale and length.
+
+    `relative_std` is the relative uncertainty by these scales. Both are added in quadrature.
+    """
+    assert reported_value.interval_95 is not None
+    estimated_value, (lower_end, upper_end) = reported_value.value, reported_value.interval_95
+    std = math.hypot(reported_value.std or 0.0, estimated_value * relative_std)
+    if is_logarithmic:
         ln_below, ln_above = (
-            math.hypot(math.log(end / value), NORMAL_95 * relative)
+            math.hypot(math.log(end / estimated_value), NORMAL_95 * relative_std)
             for end in (lower_end, upper_end)
         )
-        interval_95 = value * math.exp(-ln_below), value * math.exp(min(ln_above, 300.0))
-    else:
-        half_width = NORMAL_95 * relative * value
         interval_95 = (
-            value - math.hypot(value - lower_end, half_width),
-            value + math.hypot(upper_end - value, half_width),
+            estimated_value * math.exp(-ln_below),
+            estimated_value * math.exp(min(ln_above, 300.0)),
+        )
+    else:
+        interval_half_width = NORMAL_95 * relative_std * estimated_value
+        interval_95 = (
+            estimated_value - math.hypot(estimated_value - lower_end, interval_half_width),
+            estimated_value + math.hypot(upper_end - estimated_value, interval_half_width),
         )
         # The interval of a quantity that cannot be negative ends at 0.
         interval_95 = max(interval_95[0], 0.0), interval_95[1]
-    return replace(quantity, std=std, interval_95=interval_95)
+    return replace(reported_value, std=std, interval_95=interval_95)
 
 
 @dataclass(frozen=True, slots=True)
@@ -145,14 +171,14 @@ class DensityCheck:
     @property
     def agree(self) -> bool:
         """Return whether estimated and stated mass per length agree within the 95 % limit."""
-        difference = abs(self.found_kg_per_m - self.stated_kg_per_m)
-        return difference <= NORMAL_95 * math.hypot(
+        density_difference = abs(self.found_kg_per_m - self.stated_kg_per_m)
+        return density_difference <= NORMAL_95 * math.hypot(
             self.found_std_kg_per_m, self.stated_std_kg_per_m
         )
 
 
 def density_check(
-    fit: RecordFit, stated_kg_per_m: float, uncertainty: Mapping[str, float]
+    fit: RecordFit, stated_kg_per_m: float, scale_uncertainty: Mapping[str, float]
 ) -> DensityCheck | None:
     """Compare the mass per length of the beam from a fit with the stated one.
 
@@ -162,7 +188,7 @@ def density_check(
         Fit to the record.
     stated_kg_per_m : float
         Mass per length that the file states.
-    uncertainty : mapping of str to float
+    scale_uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale", "length" and "density".
 
     Returns
@@ -170,18 +196,22 @@ def density_check(
     DensityCheck or None
         None unless all three uncertainties are stated and the fit determines rho/EI and EI.
     """
-    determined = all(name in fit.determined for name in _COMPENSATING_PARAMETERS)
-    if not determined or not uncertainty.keys() >= {*_DENSITY_EXPONENTS, "density"}:
+    is_density_determined = all(name in fit.determined for name in _COMPENSATING_PARAMETERS)
+    if not is_density_determined or not scale_uncertainty.keys() >= {
+        *_DENSITY_EXPONENTS,
+        "density",
+    }:
         return None
-    indices = [fit.determined.index(name) for name in _COMPENSATING_PARAMETERS]
-    statistical_variance = float(fit.covariance[np.ix_(indices, indices)].sum())
+    parameter_indices = [fit.determined.index(name) for name in _COMPENSATING_PARAMETERS]
+    statistical_variance = float(fit.covariance[np.ix_(parameter_indices, parameter_indices)].sum())
     found_kg_per_m = fit.parameters[_DENSITY_OVER_STIFFNESS] * fit.parameters[_BENDING_STIFFNESS]
-    relative = math.sqrt(
-        statistical_variance + _relative_scale_uncertainty(_DENSITY_EXPONENTS, uncertainty) ** 2
+    relative_std = math.sqrt(
+        statistical_variance
+        + _relative_scale_uncertainty(_DENSITY_EXPONENTS, scale_uncertainty) ** 2
     )
     return DensityCheck(
         found_kg_per_m,
-        found_kg_per_m * relative,
+        found_kg_per_m * relative_std,
         stated_kg_per_m,
-        stated_kg_per_m * uncertainty["density"],
+        stated_kg_per_m * scale_uncertainty["density"],
     )

@@ -50,7 +50,7 @@ LOSS_NAMES: Final[Mapping[Order, str]] = {
 
 
 def headline_sentences(
-    headline: Headline, orders: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
+    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict], *, without_rival: bool
 ) -> list[str]:
     """Return the sentences on modes, damping and conditions of the reported numbers.
 
@@ -58,7 +58,7 @@ def headline_sentences(
     ----------
     headline : Headline
         Headline of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     without_rival : bool
         Whether no other model explains the record as well.
@@ -66,11 +66,16 @@ def headline_sentences(
     if len(headline.visible_modes) < _MIN_MODES_TO_SEPARATE_DAMPINGS:
         sentences = [f"{ONE_MODE_REASON.capitalize()}, nor does it determine their orders."]
     else:
-        sentences = [*uniformity(headline.uniform_beam), *_damping_sentences(headline, orders)]
+        sentences = [
+            *uniformity(headline.uniform_beam),
+            *_damping_sentences(headline, order_verdicts),
+        ]
     if headline.tolerant is None:
-        sentences += [order_sentence(each) for each in orders]
+        sentences += [order_sentence(order_verdict) for order_verdict in order_verdicts]
     else:
-        sentences += [order_slope_sentence(headline, each) for each in orders]
+        sentences += [
+            order_slope_sentence(headline, order_verdict) for order_verdict in order_verdicts
+        ]
         sentences += _exact_order_sentences(headline)
     if headline.explained:
         sentences.append(
@@ -81,42 +86,48 @@ def headline_sentences(
     return sentences
 
 
-def uniformity(test: UniformBeamTest | None) -> list[str]:
+def uniformity(beam_test: UniformBeamTest | None) -> list[str]:
     """Return the sentence on the uniform-beam test, or no sentence if there was no test.
 
     Parameters
     ----------
-    test : UniformBeamTest or None
+    beam_test : UniformBeamTest or None
         Test on the record. None if no mode is visible.
     """
-    if test is None or test.p_value is None:
+    if beam_test is None or beam_test.p_value is None:
         return []
-    modes = listed([str(number) for number in test.modes])
-    chance = test.summary.chance
-    if test.status == "passed":
+    mode_list = listed([str(mode_number) for mode_number in beam_test.modes])
+    chance_text = beam_test.summary.chance
+    if beam_test.status == "passed":
         return [
             "A uniform beam predicts frequencies, damping ratios and residues of modes "
-            f"{modes} ({chance})."
+            f"{mode_list} ({chance_text})."
         ]
     return [
         "A uniform beam does not predict frequencies, damping ratios and residues of modes "
-        f"{modes} ({chance}): the modes are reported without it."
+        f"{mode_list} ({chance_text}): the modes are reported without it."
     ]
 
 
-def _damping_sentences(headline: Headline, orders: tuple[OrderVerdict, OrderVerdict]) -> list[str]:
-    """Return the sentences on the dampings and on the excluded structures."""
+def _damping_sentences(
+    headline: Headline, order_verdicts: tuple[OrderVerdict, OrderVerdict]
+) -> list[str]:
+    """Return the sentences on the dampings that a beam has, and on the excluded structures."""
     if headline.tolerant is not None:
-        excluded = headline.structures_with_status("excluded")
-        return [f"Excluded by the losses: {_list_structures(excluded)}."] if excluded else []
-    structure = headline.fit.structure
-    dampings = _DAMPING_PHRASES[structure.name]
-    if any(each.reason == SECOND_DAMPING_REASON for each in orders):
-        dampings = dampings.replace("only", "alone would do")
-    sentences = [f"{dampings}. Numbers are those of type {headline.name}, all orders free."]
-    excluded = headline.structures_with_status("excluded")
-    if headline.explained and excluded:
-        sentences.append(f"Excluded: {_list_structures(excluded)}.")
+        excluded_names = headline.structures_with_status("excluded")
+        return (
+            [f"Excluded by the losses: {_list_structures(excluded_names)}."]
+            if excluded_names
+            else []
+        )
+    reported_structure = headline.fit.structure
+    damping_phrase = _DAMPING_PHRASES[reported_structure.name]
+    if any(each.reason == SECOND_DAMPING_REASON for each in order_verdicts):
+        damping_phrase = damping_phrase.replace("only", "alone would do")
+    sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]
+    excluded_names = headline.structures_with_status("excluded")
+    if headline.explained and excluded_names:
+        sentences.append(f"Excluded: {_list_structures(excluded_names)}.")
     if headline.simpler is not None and headline.simpler.fixed:
         sentences.append(_conditional_sentence(headline.simpler))
     return sentences
@@ -132,25 +143,33 @@ def order_slope_sentence(headline: Headline, verdict: OrderVerdict) -> str:
     verdict : OrderVerdict
         Verdict on the order.
     """
-    estimate = headline.tolerant
-    assert estimate is not None
-    name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
+    tolerant_estimate = headline.tolerant
+    assert tolerant_estimate is not None
+    order_name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
     if verdict.value is None or verdict.interval is None:
-        return f"The order {name} of the {damping_name} is not identifiable: {verdict.reason}."
-    shown_hz = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
+        return (
+            f"The order {order_name} of the {damping_name} is not identifiable: {verdict.reason}."
+        )
+    visible_hz = [mode.frequency_hz.value for mode in headline.modes if mode.shown]
     return loss_slope_sentence(
-        name, verdict.value, verdict.interval, shown_hz, estimate, verdict.status, verdict.reason
+        order_name,
+        verdict.value,
+        verdict.interval,
+        visible_hz,
+        tolerant_estimate,
+        verdict.status,
+        verdict.reason,
     )
 
 
 def loss_slope_sentence(
     order: Order,
-    value: float,
-    interval: tuple[float, float],
+    order_value: float,
+    order_interval: tuple[float, float],
     shown_hz: Sequence[float],
     estimate: TolerantEstimate,
     status: Status,
-    reason: str | None,
+    doubt_reason: str | None,
 ) -> str:
     """Return the sentence on the growth of a loss over the visible modes, and its conditions.
 
@@ -158,9 +177,9 @@ def loss_slope_sentence(
     ----------
     order : str
         "alpha" or "lambda".
-    value : float
+    order_value : float
         Estimate of the order.
-    interval : (float, float)
+    order_interval : (float, float)
         95 % interval of the order.
     shown_hz : sequence of float
         Frequencies of the visible modes in hertz.
@@ -168,25 +187,27 @@ def loss_slope_sentence(
         Estimate that contains the order.
     status : str
         "compatible", "fractional" or "open".
-    reason : str or None
+    doubt_reason : str or None
         Reason why the order is not established. None if it is established.
     """
-    std = (interval[1] - interval[0]) / (2 * NORMAL_95)
-    value_text, low_text, high_text = to_uncertainty((value, *interval), std)
-    condition = "by damping ratios and residue phases alone"
+    std = (order_interval[1] - order_interval[0]) / (2 * NORMAL_95)
+    value_text, low_text, high_text = to_uncertainty((order_value, *order_interval), std)
+    condition_text = "by damping ratios and residue phases alone"
     if estimate.basis == "geometry":
-        condition = f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
-    sentence = (
+        condition_text = (
+            f"if frequencies are those of a uniform beam to {100 * estimate.uniformity:g} %"
+        )
+    slope_sentence = (
         f"Between {min(shown_hz):.3g} and {max(shown_hz):.3g} Hz the {LOSS_NAMES[order]} grows as "
-        f"f^{value_text} ({order}; 95 %: {low_text} to {high_text}), {condition}"
+        f"f^{value_text} ({order}; 95 %: {low_text} to {high_text}), {condition_text}"
     )
-    if reason is not None:
-        return f"{sentence}; not established, because {reason}."
-    conclusion = {
+    if doubt_reason is not None:
+        return f"{slope_sentence}; not established, because {doubt_reason}."
+    conclusion_text = {
         "compatible": "consistent with order 1",
         "fractional": "damping ratios and residue phases alone exclude order 1",
     }.get(status, "order 1 is doubtful, but damping ratios and residue phases do not exclude it")
-    return f"{sentence}: {conclusion}."
+    return f"{slope_sentence}: {conclusion_text}."
 
 
 def _exact_order_sentences(headline: Headline) -> list[str]:
@@ -194,92 +215,103 @@ def _exact_order_sentences(headline: Headline) -> list[str]:
     exact_estimates = headline.exact
     if exact_estimates is None:
         return []
-    numbers = [
-        f"{name} = {_value_and_interval_text(exact_estimates.parameters[name])}"
-        for name in ("alpha", "lambda")
-        if name in exact_estimates.parameters and exact_estimates.parameters[name].flag is None
+    number_texts = [
+        f"{order_name} = {_value_and_interval_text(exact_estimates.parameters[order_name])}"
+        for order_name in ("alpha", "lambda")
+        if order_name in exact_estimates.parameters
+        and exact_estimates.parameters[order_name].flag is None
     ]
-    if not numbers:
+    if not number_texts:
         return []
-    return [f"{EXACTLY_UNIFORM_CONDITION.capitalize()}: {', '.join(numbers)}."]
+    return [f"{EXACTLY_UNIFORM_CONDITION.capitalize()}: {', '.join(number_texts)}."]
 
 
-def order_sentence(verdict: OrderVerdict) -> str:
+def order_sentence(order_verdict: OrderVerdict) -> str:
     """Return the sentence on one order, estimated on an exactly uniform beam."""
-    profile = verdict.profile
-    lower_end, upper_end = profile.interval
-    name, damping_name = verdict.order, _DAMPING_OF_ORDER[verdict.order]
+    order_profile = order_verdict.profile
+    lower_end, upper_end = order_profile.interval
+    order_name, damping_name = order_verdict.order, _DAMPING_OF_ORDER[order_verdict.order]
     std = (upper_end - lower_end) / (2 * NORMAL_95)
     estimate_text, first_text, last_text = to_uncertainty(
-        (profile.estimate, lower_end, upper_end), std
+        (order_profile.estimate, lower_end, upper_end), std
     )
-    value = f"{estimate_text} (95 %: {first_text} to {last_text})"
-    if verdict.status == "absent":
-        return f"No {damping_name} was found, so its order {name} has no meaning."
-    if verdict.status == "not identifiable":
+    order_text = f"{estimate_text} (95 %: {first_text} to {last_text})"
+    if order_verdict.status == "absent":
+        return f"No {damping_name} was found, so its order {order_name} has no meaning."
+    if order_verdict.status == "not identifiable":
         return (
-            f"The order {name} of the {damping_name} is not identifiable: "
-            f"{_unidentifiable_reason(verdict)}."
+            f"The order {order_name} of the {damping_name} is not identifiable: "
+            f"{_unidentifiable_reason(order_verdict)}."
         )
-    if verdict.reason is not None:
+    if order_verdict.reason is not None:
         return (
-            f"The order {name} of the {damping_name} is not established: {value} fits, but "
-            f"{verdict.reason}. "
+            f"The order {order_name} of the {damping_name} is not established: {order_text} fits, "
+            f"but {order_verdict.reason}. "
             "Do not interpret it."
         )
-    if verdict.status == "compatible":
-        return f"The order {name} of the {damping_name} is {value}, consistent with 1."
-    if verdict.status == "fractional":
-        return f"The order {name} of the {damping_name} is {value}; 1 is excluded."
+    if order_verdict.status == "compatible":
+        return f"The order {order_name} of the {damping_name} is {order_text}, consistent with 1."
+    if order_verdict.status == "fractional":
+        return f"The order {order_name} of the {damping_name} is {order_text}; 1 is excluded."
     return (
-        f"The order {name} of the {damping_name} is {value}: 1 is doubtful, but not excluded (p = "
-        f"{math.erfc(math.sqrt(deviance_of_order_one(profile) / 2)):.1g})."
+        f"The order {order_name} of the {damping_name} is {order_text}: 1 is doubtful, but not "
+        f"excluded (p = {math.erfc(math.sqrt(deviance_of_order_one(order_profile) / 2)):.1g})."
     )
 
 
-def _list_structures(names: tuple[str, ...]) -> str:
+def _list_structures(structure_names: tuple[str, ...]) -> str:
     """Return "type" or "types" with the sorted names of structures."""
-    return f"type{'s' if len(names) > 1 else ''} {listed(sorted(names))}"
+    return f"type{'s' if len(structure_names) > 1 else ''} {listed(sorted(structure_names))}"
 
 
 def _conditional_sentence(simpler: ConditionalEstimate) -> str:
     """Return the sentence on the conditional estimate of a simpler structure."""
-    assumption = " and ".join(f"{name} = {value:g}" for name, value in simpler.fixed.items())
-    numbers = [
-        f"{name} = {_value_and_interval_text(simpler.parameters[name])}"
-        for name in ("zeta", "alpha", "gamma", "lambda")
-        if name in simpler.parameters
+    condition = " and ".join(
+        f"{parameter_name} = {fixed_value:g}"
+        for parameter_name, fixed_value in simpler.fixed.items()
+    )
+    number_texts = [
+        f"{parameter_name} = {_value_and_interval_text(simpler.parameters[parameter_name])}"
+        for parameter_name in ("zeta", "alpha", "gamma", "lambda")
+        if parameter_name in simpler.parameters
     ]
     return (
-        f"{assumption[0].upper()}{assumption[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
+        f"{condition[0].upper()}{condition[1:]} {'is' if len(simpler.fixed) == 1 else 'are'} "
         "not excluded; "
-        f"if true (type {simpler.name}): {', '.join(numbers)}."
+        f"if true (type {simpler.name}): {', '.join(number_texts)}."
     )
 
 
-def _value_and_interval_text(quantity: ReportedValue) -> str:
-    """Return a value with its 95 % interval as text, rounded to significant digits."""
-    if quantity.interval_95 is None or not quantity.std:
-        return f"{quantity.value:.4g}"
-    lower_end, upper_end = quantity.interval_95
-    power = math.floor(math.log10(abs(quantity.value))) if quantity.value else 0
-    scale = 10.0**power if power < -2 else 1.0
-    digits = decimals(quantity.std / scale)
-    exponent = f"e{power}" if power < -2 else ""
+def _value_and_interval_text(reported_value: ReportedValue) -> str:
+    """Return a reported value with its 95 % interval as text, rounded to its uncertainty."""
+    if reported_value.interval_95 is None or not reported_value.std:
+        return f"{reported_value.value:.4g}"
+    lower_end, upper_end = reported_value.interval_95
+    decimal_exponent = (
+        math.floor(math.log10(abs(reported_value.value))) if reported_value.value else 0
+    )
+    divisor = 10.0**decimal_exponent if decimal_exponent < -2 else 1.0
+    digit_count = decimals(reported_value.std / divisor)
+    power_text = f"e{decimal_exponent}" if decimal_exponent < -2 else ""
     return (
-        f"{quantity.value / scale:.{digits}f}{exponent} "
-        f"({lower_end / scale:.{digits}f}{exponent} to {upper_end / scale:.{digits}f}{exponent})"
+        f"{reported_value.value / divisor:.{digit_count}f}{power_text} "
+        f"({lower_end / divisor:.{digit_count}f}{power_text} to "
+        f"{upper_end / divisor:.{digit_count}f}{power_text})"
     )
 
 
-def _unidentifiable_reason(verdict: OrderVerdict) -> str:
+def _unidentifiable_reason(order_verdict: OrderVerdict) -> str:
     """Return, as part of a sentence, why an order is not identifiable."""
-    profile = verdict.profile
-    lower_end, upper_end = profile.interval
-    if verdict.reason is not None and (profile.identifiable or not profile.is_computed):
-        return verdict.reason
-    if len(profile.local_minima) > 1:
-        minima_text = " and ".join(f"{value:.3f}" for value in sorted(profile.local_minima))
+    order_profile = order_verdict.profile
+    lower_end, upper_end = order_profile.interval
+    if order_verdict.reason is not None and (
+        order_profile.identifiable or not order_profile.is_computed
+    ):
+        return order_verdict.reason
+    if len(order_profile.local_minima) > 1:
+        minima_text = " and ".join(
+            f"{order_value:.3f}" for order_value in sorted(order_profile.local_minima)
+        )
         return (
             f"{minima_text} fit the record equally well, each with a different damping (95 %: "
             f"{lower_end:.3f} "
@@ -287,11 +319,11 @@ def _unidentifiable_reason(verdict: OrderVerdict) -> str:
         )
     return (
         "any value between 0 and 2 fits"
-        if profile.open_below and profile.open_above
+        if order_profile.open_below and order_profile.open_above
         else f"anything below {upper_end:.2f} fits"
-        if profile.open_below
+        if order_profile.open_below
         else f"anything above {lower_end:.2f} fits"
-        if profile.open_above
+        if order_profile.open_above
         else f"anything from {lower_end:.2f} to {upper_end:.2f} fits"
     )
 
@@ -310,7 +342,7 @@ _MODE_ORDINALS: Final = {1: "first", 2: "second"}
 
 def experiments(
     candidate_set: CandidateSet,
-    orders: tuple[OrderVerdict, ...],
+    order_verdicts: tuple[OrderVerdict, ...],
     visible_numbers: tuple[int, ...],
     findings: tuple[Finding, ...],
     close_rivals: tuple[Candidate, ...],
@@ -321,7 +353,7 @@ def experiments(
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    orders : tuple of OrderVerdict
+    order_verdicts : tuple of OrderVerdict
         Verdicts on alpha and lambda.
     visible_numbers : tuple of int
         Numbers of the visible modes.
@@ -330,54 +362,62 @@ def experiments(
     close_rivals : tuple of Candidate
         Candidates that explain the record about as well as the selected one.
     """
-    advice = []
-    unidentifiable = [o for o in orders if o.status == "not identifiable"]
-    if unidentifiable:
-        order_names = " and ".join(o.order for o in unidentifiable)
+    advice_sentences = []
+    unidentifiable_orders = [o for o in order_verdicts if o.status == "not identifiable"]
+    if unidentifiable_orders:
+        order_names = " and ".join(o.order for o in unidentifiable_orders)
         if len(visible_numbers) < _MIN_MODES_FOR_AN_ORDER:
-            advice.append(
+            advice_sentences.append(
                 f"To determine {order_names}, "
                 f"{_advice_for_two_modes(candidate_set, visible_numbers)}"
             )
         else:
-            advice.append(
+            advice_sentences.append(
                 f"To determine {order_names}, run narrow, slow sweeps around the modes, or a "
                 "wider sweep "
                 "that reaches one more mode."
             )
-    unexplained = any(finding.kind == "unexplained" for finding in findings)
-    if close_rivals or (not unexplained and any(o.status == "open" for o in orders)):
-        advice.append(
+    has_unexplained_residual = any(finding.kind == "unexplained" for finding in findings)
+    if close_rivals or (
+        not has_unexplained_residual and any(o.status == "open" for o in order_verdicts)
+    ):
+        advice_sentences.append(
             "To tell the structures apart, excite one more mode (a wider sweep), or sweep longer."
         )
-    return advice
+    return advice_sentences
 
 
 def _advice_for_two_modes(candidate_set: CandidateSet, visible_numbers: tuple[int, ...]) -> str:
     """Return the advice, as part of a sentence, how to make both of the first two modes visible."""
-    modes = {mode.number: mode.frequency_hz for mode in candidate_set.best.fit.modes}
-    first_hz = modes.get(1, 0.0)
-    at_hz = {1: first_hz, 2: modes.get(2, _SECOND_OVER_FIRST_FREQUENCY * first_hz)}
-    missing_mode = next(number for number in (1, 2) if number not in visible_numbers)
+    frequency_by_mode = {
+        mode_estimate.number: mode_estimate.frequency_hz
+        for mode_estimate in candidate_set.best.fit.modes
+    }
+    first_hz = frequency_by_mode.get(1, 0.0)
+    expected_hz = {
+        1: first_hz,
+        2: frequency_by_mode.get(2, _SECOND_OVER_FIRST_FREQUENCY * first_hz),
+    }
+    missing_mode = next(mode_number for mode_number in (1, 2) if mode_number not in visible_numbers)
     other_mode = 3 - missing_mode
     last_hz = float(candidate_set.comparison.frequency_hz[-1])
-    if at_hz[missing_mode] > last_hz:
+    if expected_hz[missing_mode] > last_hz:
         return (
             f"analyse and excite the {_MODE_ORDINALS[missing_mode]} mode as well: band and sweep "
             "up to at "
-            f"least {1.3 * at_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
+            f"least {1.3 * expected_hz[missing_mode]:.0f} Hz (the band ends at {last_hz:.0f} Hz)."
         )
     if not is_excited(
-        candidate_set.comparison, at_hz[missing_mode], relative_to_hz=at_hz[other_mode]
+        candidate_set.comparison, expected_hz[missing_mode], relative_to_hz=expected_hz[other_mode]
     ):
         return f"excite the {_MODE_ORDINALS[missing_mode]} mode as well: sweep " + (
-            f"up to at least {1.3 * at_hz[2]:.0f} Hz."
+            f"up to at least {1.3 * expected_hz[2]:.0f} Hz."
             if missing_mode == 2
-            else f"from below {0.7 * at_hz[1]:.1f} Hz."
+            else f"from below {0.7 * expected_hz[1]:.1f} Hz."
         )
     return (
         f"raise the {_MODE_ORDINALS[missing_mode]} mode above the noise: it was driven at its "
-        f"{at_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or "
+        f"{expected_hz[missing_mode]:.1f} Hz, so increase the amplitude (twice), sweep slower or "
         "repeat; a "
         "wider band does not help."
     )

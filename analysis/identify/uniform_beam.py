@@ -162,32 +162,34 @@ class UniformBeamProblem:
         uniformity: float = 0.0,
         tilt_deg: float | None = None,
     ) -> None:
-        rows = fit.rows(modes)
+        constant_rows = fit.rows(modes)
         mode_count = len(modes)
         self.modes = tuple(modes)
         self.nominal = nominal
         self.uniformity = uniformity
-        self.measured = fit.constants[rows]
+        self.measured = fit.constants[constant_rows]
         tolerance_std = np.zeros((mode_count, len(MODE_CONSTANT_NAMES)))
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = 3 * uniformity
-        self.covariance = fit.covariance[np.ix_(rows, rows)] + np.diag(tolerance_std.ravel() ** 2)
+        self.covariance = fit.covariance[np.ix_(constant_rows, constant_rows)] + np.diag(
+            tolerance_std.ravel() ** 2
+        )
         self.compared = mode_count * len(MODE_CONSTANT_NAMES)
         self._whitener = np.linalg.inv(np.linalg.cholesky(self.covariance))
-        length = nominal.beam.length_m
+        length_m = nominal.beam.length_m
         z = clamped_free_eigenvalues(max(modes))[np.array(modes) - 1]
         self.stated = Alteration.stated(nominal, tilt_deg)
         self.terms = galerkin_mode_terms(self.stated, nominal.beam, self.modes)
-        constants = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
-        self._omega_rad_s = 2 * np.pi * np.exp(constants[:, 0])
-        self._damping_ratios = np.exp(constants[:, 1])
+        constants_by_mode = self.measured.reshape(-1, len(MODE_CONSTANT_NAMES))
+        self._omega_rad_s = 2 * np.pi * np.exp(constants_by_mode[:, 0])
+        self._damping_ratios = np.exp(constants_by_mode[:, 1])
         self._poles = self._omega_rad_s * (1j - self._damping_ratios)
         # The search starts at the mean of all modes.
-        mass = self.terms.mass + self.terms.lump
+        modal_masses = self.terms.mass + self.terms.lump
         self._ln_density_over_stiffness = float(
-            np.mean(np.log((z / length) ** 4 / mass) - 2 * np.log(self._omega_rad_s))
+            np.mean(np.log((z / length_m) ** 4 / modal_masses) - 2 * np.log(self._omega_rad_s))
         )
-        ln_stiffness = constants[:, 2] - np.log(self._omega_rad_s) + np.log(length / 2)
+        ln_stiffness = constants_by_mode[:, 2] - np.log(self._omega_rad_s) + np.log(length_m / 2)
         self._ln_stiffness = float(np.mean(ln_stiffness))
         smallest_ln_loss, largest_ln_loss = _LN_LOSS_RANGE
         self.lower = np.array(
@@ -234,74 +236,105 @@ class UniformBeamProblem:
         return x @ self.transform.T + self._offset
 
     def plant(self, x: NDArray[np.float64]) -> Plant:
-        """Return the rig with the uniform beam and damping that a vector of unknowns describes."""
-        zeta, alpha, gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(x).tolist()
-        bending_stiffness = math.exp(ln_stiffness)
+        """Return the rig with the uniform beam and damping for a vector of unknowns, shape (7,)."""
+        ln_zeta, alpha, ln_gamma, lambda_, ln_ratio, ln_stiffness, delay_s = self.parameters(
+            x
+        ).tolist()
+        stiffness_n_m2 = math.exp(ln_stiffness)
         return replace(
             self.nominal,
             beam=Beam(
                 length_m=self.nominal.beam.length_m,
-                density_kg_per_m=math.exp(ln_ratio) * bending_stiffness,
-                bending_stiffness_n_m2=bending_stiffness,
+                density_kg_per_m=math.exp(ln_ratio) * stiffness_n_m2,
+                bending_stiffness_n_m2=stiffness_n_m2,
             ),
             damping=Damping(
-                zeta=math.exp(zeta), alpha=alpha, gamma=math.exp(gamma), lambda_=lambda_
+                zeta=math.exp(ln_zeta), alpha=alpha, gamma=math.exp(ln_gamma), lambda_=lambda_
             ),
             delay_s=delay_s,
         )
 
     def constants(
-        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Predict the modal constants of m beams with n modes, shape (m, 4 n).
+        """Predict the modal constants of m uniform beams with n modes each, shape (m, 4 n).
+
+        The four constants of a mode are `MODE_CONSTANT_NAMES`. A mode without pole gives NaN.
 
         Parameters
         ----------
         x : ndarray of float, shape (m, 7)
             One vector of unknowns for each beam.
-        terms : ModeTerms, optional
+        mode_terms : ModeTerms, optional
             Modal integrals of another beam than the one the file states.
         """
-        terms = self.terms if terms is None else terms
-        zeta, alpha, gamma, lambda_, ratio, stiffness, delay = self.parameters(x).T[..., None]
+        mode_terms = self.terms if mode_terms is None else mode_terms
+        zeta, alpha, gamma, lambda_, density_over_stiffness, ln_stiffness, delay_s = (
+            self.parameters(x).T[..., None]
+        )
         zeta, gamma = np.exp(zeta), np.exp(gamma)
         density_ratio = 1.0
-        if terms.density_kg_per_m is not None:
-            density_ratio = terms.density_kg_per_m * np.exp(-ratio - stiffness)
-        ratio = np.exp(ratio)
-        mass, lever_arm = (
-            terms.mass + density_ratio * terms.lump,
-            terms.mass_arm + density_ratio * terms.lump_arm,
+        if mode_terms.density_kg_per_m is not None:
+            density_ratio = mode_terms.density_kg_per_m * np.exp(
+                -density_over_stiffness - ln_stiffness
+            )
+        density_over_stiffness = np.exp(density_over_stiffness)
+        modal_mass, lever_arm = (
+            mode_terms.mass + density_ratio * mode_terms.lump,
+            mode_terms.mass_arm + density_ratio * mode_terms.lump_arm,
         )
-        static_stiffness = terms.stiffness + terms.clamp + ratio * terms.tension
-        relaxation_strength, time_s = terms.alteration.relaxation
+        static_modal_stiffness = (
+            mode_terms.stiffness + mode_terms.clamp + density_over_stiffness * mode_terms.tension
+        )
+        relaxation_strength, relaxation_time_s = mode_terms.alteration.relaxation
         s = np.broadcast_to(self._poles, (len(x), self._poles.size))
         for _ in range(_MAX_NEWTON_ITERATIONS):
             log_s = np.log(s)
-            internal = zeta * np.exp(alpha * log_s) * terms.stiffness
-            external = gamma * np.exp(lambda_ * log_s)
-            inertia = ratio * s * s
-            impedance_slope = (alpha * internal + lambda_ * external) / s + 2 * ratio * s * mass
-            impedance = static_stiffness + internal + inertia * mass + external
+            internal_damping = zeta * np.exp(alpha * log_s) * mode_terms.stiffness
+            external_damping = gamma * np.exp(lambda_ * log_s)
+            inertia_term = density_over_stiffness * s * s
+            impedance_slope = (
+                alpha * internal_damping + lambda_ * external_damping
+            ) / s + 2 * density_over_stiffness * s * modal_mass
+            modal_impedance = (
+                static_modal_stiffness
+                + internal_damping
+                + inertia_term * modal_mass
+                + external_damping
+            )
             if relaxation_strength:
-                relaxed = relaxation_strength * time_s / (1 + time_s * s) * terms.stiffness
-                impedance = impedance + relaxed * s
-                impedance_slope = impedance_slope + relaxed / (1 + time_s * s)
-            step = impedance / impedance_slope
-            s = s - step
-            if np.abs(step).max() < _POLE_TOLERANCE * np.abs(s).max():
+                relaxed_stiffness = (
+                    relaxation_strength
+                    * relaxation_time_s
+                    / (1 + relaxation_time_s * s)
+                    * mode_terms.stiffness
+                )
+                modal_impedance = modal_impedance + relaxed_stiffness * s
+                impedance_slope = impedance_slope + relaxed_stiffness / (1 + relaxation_time_s * s)
+            pole_step = modal_impedance / impedance_slope
+            s = s - pole_step
+            if np.abs(pole_step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
         s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
-        channel = torque_channel_response(replace(self.nominal, delay_s=0.0), s) * np.exp(
-            -delay * s
+        channel_response = torque_channel_response(replace(self.nominal, delay_s=0.0), s) * np.exp(
+            -delay_s * s
         )
-        channel = channel * terms.alteration.channel(s)
-        rotation = external * terms.turn_by_medium
-        rotation = rotation + internal / terms.stiffness * terms.turn_by_internal
-        modal_force = inertia * (lever_arm + rotation)
-        modal_force = modal_force + external * terms.medium_arm + ratio * terms.tension_arm
-        volume = self.nominal.beam.length_m**3
-        log_residues = np.log(1j * volume * modal_force**2 / impedance_slope * channel) + stiffness
+        channel_response = channel_response * mode_terms.alteration.channel(s)
+        rotation_arm = external_damping * mode_terms.turn_by_medium
+        rotation_arm = (
+            rotation_arm + internal_damping / mode_terms.stiffness * mode_terms.turn_by_internal
+        )
+        modal_force = inertia_term * (lever_arm + rotation_arm)
+        modal_force = (
+            modal_force
+            + external_damping * mode_terms.medium_arm
+            + density_over_stiffness * mode_terms.tension_arm
+        )
+        length_cubed = self.nominal.beam.length_m**3
+        log_residues = (
+            np.log(1j * length_cubed * modal_force**2 / impedance_slope * channel_response)
+            + ln_stiffness
+        )
         constant_rows = (
             np.log(s.imag / (2 * np.pi)),
             np.log(-s.real / np.abs(s)),
@@ -311,37 +344,48 @@ class UniformBeamProblem:
         return np.stack(constant_rows, axis=-1).reshape(len(x), -1)
 
     def differences(
-        self, x: NDArray[np.float64], terms: ModeTerms | None = None
+        self, x: NDArray[np.float64], mode_terms: ModeTerms | None = None
     ) -> NDArray[np.float64]:
-        """Return predicted minus measured modal constants, shape (m, 4 n); phases within ±pi.
+        """Return predicted minus measured modal constants, shape (m, 4 n).
+
+        Differences of phases are between -pi and pi.
 
         Parameters
         ----------
         x : ndarray of float, shape (m, 7)
             One vector of unknowns for each beam.
-        terms : ModeTerms, optional
+        mode_terms : ModeTerms, optional
             Modal integrals of another beam than the one the file states.
         """
         with np.errstate(all="ignore"):  # a mode without a pole gives NaN
-            deviations = self.constants(x, terms) - self.measured
-        phases = deviations[
+            constant_deviations = self.constants(x, mode_terms) - self.measured
+        phase_deviations = constant_deviations[
             :, MODE_CONSTANT_NAMES.index("residue_phase_rad") :: len(MODE_CONSTANT_NAMES)
         ]
-        phases -= 2 * np.pi * np.round(phases / (2 * np.pi))
-        return deviations
+        phase_deviations -= 2 * np.pi * np.round(phase_deviations / (2 * np.pi))
+        return constant_deviations
 
     def _deviations(self, x: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return predicted minus measured constants, whitened by their covariance, (m, 4 n)."""
+        """Return predicted minus measured modal constants, shape (m, 4 n).
+
+        They are whitened: without error of the model their covariance is the unit matrix.
+        """
         return np.nan_to_num(self.differences(x) @ self._whitener.T, nan=1e6)
 
     def equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return chi-square at one vector of unknowns with its gradient and Gauss-Newton matrix."""
-        steps = _DIFFERENCE_STEP * np.eye(x.size)
-        deviations = self._deviations(np.concatenate([x[None], x + steps, x - steps]))
-        deviation = deviations[0]
-        jacobian = (deviations[1 : 1 + x.size] - deviations[1 + x.size :]) / (2 * _DIFFERENCE_STEP)
+        unknown_steps = _DIFFERENCE_STEP * np.eye(x.size)
+        whitened_deviations = self._deviations(
+            np.concatenate([x[None], x + unknown_steps, x - unknown_steps])
+        )
+        central_deviation = whitened_deviations[0]
+        jacobian = (whitened_deviations[1 : 1 + x.size] - whitened_deviations[1 + x.size :]) / (
+            2 * _DIFFERENCE_STEP
+        )
         return NormalEquations(
-            float(deviation @ deviation), jacobian @ deviation, jacobian @ jacobian.T
+            float(central_deviation @ central_deviation),
+            jacobian @ central_deviation,
+            jacobian @ jacobian.T,
         )
 
     def starts(self) -> list[NDArray[np.float64]]:
@@ -349,33 +393,41 @@ class UniformBeamProblem:
 
         The losses of each are those that best fit the measured damping ratios.
         """
-        omega, first_omega, last_omega = (
+        omega_rad_s, first_rad_s, last_rad_s = (
             self._omega_rad_s,
             self._omega_rad_s[0],
             self._omega_rad_s[-1],
         )
         start_vectors = []
         for alpha, lambda_ in itertools.product(_START_ORDERS, repeat=2):
-            internal = (omega / last_omega) ** alpha * math.sin(alpha * math.pi / 2)
-            external = (omega / first_omega) ** lambda_ * math.sin(lambda_ * math.pi / 2)
-            external *= (first_omega / omega) ** 2
-            columns = np.array([internal, external]).T / (2 * self._damping_ratios)[:, None]
-            loss_fractions, *_ = np.linalg.lstsq(columns, np.ones(omega.size), rcond=None)
-            largest_losses = np.min(
-                2 * self._damping_ratios / np.array([internal, external]), axis=1
+            internal_shape = (omega_rad_s / last_rad_s) ** alpha * math.sin(alpha * math.pi / 2)
+            external_shape = (omega_rad_s / first_rad_s) ** lambda_ * math.sin(
+                lambda_ * math.pi / 2
             )
-            losses = np.log(np.clip(loss_fractions, 0.02 * largest_losses, largest_losses))
-            delay = self.nominal.delay_s / _DELAY_UNIT_S
+            external_shape *= (first_rad_s / omega_rad_s) ** 2
+            damping_columns = (
+                np.array([internal_shape, external_shape]).T / (2 * self._damping_ratios)[:, None]
+            )
+            loss_fractions, *_ = np.linalg.lstsq(
+                damping_columns, np.ones(omega_rad_s.size), rcond=None
+            )
+            largest_mode_losses = np.min(
+                2 * self._damping_ratios / np.array([internal_shape, external_shape]), axis=1
+            )
+            ln_losses = np.log(
+                np.clip(loss_fractions, 0.02 * largest_mode_losses, largest_mode_losses)
+            )
+            scaled_delay = self.nominal.delay_s / _DELAY_UNIT_S
             start_vectors.append(
                 np.array(
                     [
-                        losses[0],
+                        ln_losses[0],
                         alpha,
-                        losses[1],
+                        ln_losses[1],
                         lambda_,
                         self._ln_density_over_stiffness,
                         self._ln_stiffness,
-                        delay,
+                        scaled_delay,
                     ]
                 )
             )
@@ -390,70 +442,80 @@ class UniformBeamProblem:
         minima = self._minimize_from(self.starts())
         for _ in range(_SHAPE_UPDATES if self.stated != Alteration() else 0):
             self.terms = galerkin_mode_terms(self.stated, self.plant(minima[0].x).beam, self.modes)
-            minima = self._minimize_from([each.x for each in minima])
+            minima = self._minimize_from([minimum.x for minimum in minima])
         return minima
 
-    def _minimize_from(self, starts: Sequence[NDArray[np.float64]]) -> list[Minimum]:
-        """Minimize chi-square from each given start. Return the minima, the lowest first."""
-        return sorted((self.minimize(x) for x in starts), key=lambda each: each.cost)
+    def _minimize_from(self, start_vectors: Sequence[NDArray[np.float64]]) -> list[Minimum]:
+        """Minimize chi-square from each start vector. Return the minima, the lowest first."""
+        return sorted((self.minimize(x) for x in start_vectors), key=lambda minimum: minimum.cost)
 
-    def minimize_without_damping(self, index: int, x: NDArray[np.float64]) -> Minimum:
-        """Minimize chi-square without one damping, whose loss is fixed at its lower bound.
+    def minimize_without_damping(self, coefficient_index: int, x: NDArray[np.float64]) -> Minimum:
+        """Minimize chi-square with the loss of one damping fixed at its lower bound.
+
+        This is a fit without internal or without external damping.
 
         Parameters
         ----------
-        index : int
+        coefficient_index : int
             Index of the damping's coefficient in `PARAMETERS`.
         x : ndarray of float, shape (7,)
             Vector of unknowns at which the descent starts.
         """
         upper_bounds = self.upper.copy()
-        upper_bounds[index] = self.lower[index]
+        upper_bounds[coefficient_index] = self.lower[coefficient_index]
         return _minimize_within_bounds(self.equations, x, self.lower, upper_bounds)
 
-    def minimize_with_fixed(self, index: int, value: float, x: NDArray[np.float64]) -> Minimum:
+    def minimize_with_fixed(
+        self, parameter_index: int, fixed_value: float, x: NDArray[np.float64]
+    ) -> Minimum:
         """Minimize chi-square with one of `PARAMETERS` fixed, and return the minimum.
 
         Parameters
         ----------
-        index : int
+        parameter_index : int
             Index of the fixed parameter in `PARAMETERS`.
-        value : float
+        fixed_value : float
             Fixed value, as `parameters` returns it.
         x : ndarray of float, shape (7,)
             Vector of unknowns at which the descent starts.
         """
         # The parameter replaces the unknown that contributes to it with factor 1.
-        forward = np.eye(x.size)
-        forward[index] = self.transform[index] / self.transform[index, index]
-        backward = np.linalg.inv(forward)
+        to_transformed = np.eye(x.size)
+        to_transformed[parameter_index] = (
+            self.transform[parameter_index] / self.transform[parameter_index, parameter_index]
+        )
+        from_transformed = np.linalg.inv(to_transformed)
         lower_bounds, upper_bounds = self.lower.copy(), self.upper.copy()
-        lower_bounds[index] = upper_bounds[index] = (value - self._offset[index]) / self.transform[
-            index, index
-        ]
+        lower_bounds[parameter_index] = upper_bounds[parameter_index] = (
+            fixed_value - self._offset[parameter_index]
+        ) / self.transform[parameter_index, parameter_index]
 
         def equations(y: NDArray[np.float64]) -> NormalEquations:
-            """Return the normal equations in the transformed unknowns."""
-            found = self.equations(backward @ y)
+            """Return chi-square and its derivatives by the transformed unknowns."""
+            original_equations = self.equations(from_transformed @ y)
             return NormalEquations(
-                found.cost, backward.T @ found.gradient, backward.T @ found.hessian @ backward
+                original_equations.cost,
+                from_transformed.T @ original_equations.gradient,
+                from_transformed.T @ original_equations.hessian @ from_transformed,
             )
 
-        found = _minimize_within_bounds(equations, forward @ x, lower_bounds, upper_bounds)
-        return replace(found, x=backward @ found.x)
+        constrained_minimum = _minimize_within_bounds(
+            equations, to_transformed @ x, lower_bounds, upper_bounds
+        )
+        return replace(constrained_minimum, x=from_transformed @ constrained_minimum.x)
 
 
 def _minimize_within_bounds(
     equations: Callable[[NDArray[np.float64]], NormalEquations],
     x: NDArray[np.float64],
-    lower: NDArray[np.float64],
-    upper: NDArray[np.float64],
+    lower_bounds: NDArray[np.float64],
+    upper_bounds: NDArray[np.float64],
 ) -> Minimum:
     """Minimize a sum of squares within bounds by Gauss-Newton descent."""
     return descend(
         equations,
         x,
-        Box(lower, upper),
+        Box(lower_bounds, upper_bounds),
         relative_tolerance=_COST_TOLERANCE,
         max_evaluations=_MAX_EVALUATIONS,
     )
@@ -461,7 +523,7 @@ def _minimize_within_bounds(
 
 @dataclass(frozen=True, slots=True)
 class UniformBeamTest:
-    """Test of whether a plain uniform beam predicts the modal constants of a record.
+    """Result of the test whether a uniform beam predicts the modal constants of a record.
 
     Attributes
     ----------
@@ -495,20 +557,20 @@ class UniformBeamTest:
         return BeamUniformity(self.status, self.p_value)
 
     def as_json(self) -> dict[str, Any]:
-        """Return the test as JSON-ready dict, in which numbers may be NaN or infinite."""
+        """Return the result of the test as a dict for JSON. Numbers may be NaN or infinite."""
         return {
             **self.summary.as_json(),
             "chi_square": self.chi_square,
             "degrees_of_freedom": self.degrees_of_freedom,
             "constants": [
                 {
-                    "mode": self.modes[index // len(MODE_CONSTANT_NAMES)],
-                    "name": MODE_CONSTANT_NAMES[index % len(MODE_CONSTANT_NAMES)],
-                    "measured": measured,
+                    "mode": self.modes[constant_index // len(MODE_CONSTANT_NAMES)],
+                    "name": MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)],
+                    "measured": measured_value,
                     "std": std,
-                    "predicted": predicted,
+                    "predicted": predicted_value,
                 }
-                for index, (measured, std, predicted) in enumerate(
+                for constant_index, (measured_value, std, predicted_value) in enumerate(
                     zip(
                         self.measured.tolist(),
                         self.std.tolist(),
@@ -566,9 +628,15 @@ class TolerantEstimate:
     deviance_without_damping: dict[str, float]
 
     def covariance_json(self) -> dict[str, Any]:
-        """Return names and covariance matrix of the parameters as a JSON-ready dict."""
-        names = [f"ln_{name}" if name in LOGARITHMIC_PARAMETERS else name for name in PARAMETERS]
-        return {"names": names, "matrix": self.covariance.tolist()}
+        """Return names and covariance matrix of the beam parameters as a dict for JSON.
+
+        A name with the prefix "ln_" means the logarithm of the parameter.
+        """
+        parameter_names = [
+            f"ln_{parameter_name}" if parameter_name in LOGARITHMIC_PARAMETERS else parameter_name
+            for parameter_name in PARAMETERS
+        ]
+        return {"names": parameter_names, "matrix": self.covariance.tolist()}
 
 
 def uniform_beam_test(
@@ -586,14 +654,19 @@ def uniform_beam_test(
         Inclination of the plane of motion along the resting beam, as the file states it, in
         degrees.
     """
-    modes = fit.visible
-    rows = fit.rows(modes)
-    measured, std = fit.constants[rows], np.sqrt(np.diag(fit.covariance)[rows])
-    degrees_of_freedom = len(rows) - len(PARAMETERS)
+    mode_numbers = fit.visible
+    constant_rows = fit.rows(mode_numbers)
+    measured_constants, std = (
+        fit.constants[constant_rows],
+        np.sqrt(np.diag(fit.covariance)[constant_rows]),
+    )
+    degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
     if degrees_of_freedom <= 0:
-        no_prediction = np.full(measured.size, np.nan)
-        return UniformBeamTest("not tested", math.nan, 0, None, modes, measured, no_prediction, std)
-    problem = UniformBeamProblem(fit, modes, nominal, tilt_deg=tilt_deg)
+        nan_prediction = np.full(measured_constants.size, np.nan)
+        return UniformBeamTest(
+            "not tested", math.nan, 0, None, mode_numbers, measured_constants, nan_prediction, std
+        )
+    problem = UniformBeamProblem(fit, mode_numbers, nominal, tilt_deg=tilt_deg)
     best_minimum = problem.minima()[0]
     degrees_of_freedom += _count_idle_unknowns(problem, best_minimum)
     p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
@@ -602,8 +675,8 @@ def uniform_beam_test(
         chi_square=best_minimum.cost,
         degrees_of_freedom=degrees_of_freedom,
         p_value=p_value,
-        modes=modes,
-        measured=measured,
+        modes=mode_numbers,
+        measured=measured_constants,
         predicted=problem.constants(best_minimum.x[None])[0],
         std=std,
     )
@@ -634,22 +707,22 @@ def tolerant_estimate(
     TolerantEstimate or None
         None if fewer than two modes are visible.
     """
-    modes = fit.visible
-    if len(modes) < _MIN_VISIBLE_MODES:
+    mode_numbers = fit.visible
+    if len(mode_numbers) < _MIN_VISIBLE_MODES:
         return None
     wider_tolerance = max(_WIDER_TOLERANCE, uniformity)
-    attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
+    tolerance_attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
         ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
         ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
         ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
-    for basis, tolerance, least_p_value in attempts:
-        problem = UniformBeamProblem(fit, modes, nominal, tolerance, tilt_deg)
+    for estimate_basis, frequency_tolerance, least_p_value in tolerance_attempts:
+        problem = UniformBeamProblem(fit, mode_numbers, nominal, frequency_tolerance, tilt_deg)
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
-        constant_count = problem.compared // (2 if basis == "losses" else 1)
+        constant_count = problem.compared // (2 if estimate_basis == "losses" else 1)
         degrees_of_freedom = constant_count - (
-            len(PARAMETERS) if basis == "geometry" else len(PARAMETERS) - 2
+            len(PARAMETERS) if estimate_basis == "geometry" else len(PARAMETERS) - 2
         )
         degrees_of_freedom += _count_idle_unknowns(problem, minima[0])
         p_value = (
@@ -660,73 +733,100 @@ def tolerant_estimate(
         if p_value is None or p_value >= least_p_value:
             break
     else:
-        basis = "none"
-    estimate = _estimate_at_minimum(problem, minima, basis, p_value)
-    orders_without_one = [
-        order for order in ("alpha", "lambda")
-        if not estimate.interval[order][0] <= 1 <= estimate.interval[order][1]
+        estimate_basis = "none"
+    beam_estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value)
+    orders_excluding_one = [
+        order_name for order_name in ("alpha", "lambda")
+        if not beam_estimate.interval[order_name][0] <= 1 <= beam_estimate.interval[order_name][1]
     ]  # fmt: skip
-    if not orders_without_one:
-        return estimate
-    if basis == "geometry":
-        problem = UniformBeamProblem(fit, modes, nominal, _LOOSE_TOLERANCE, tilt_deg)
+    if not orders_excluding_one:
+        return beam_estimate
+    if estimate_basis == "geometry":
+        problem = UniformBeamProblem(fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg)
         minima = problem.minima()
     best_minimum = minima[0]
-    deviances = {
-        order: problem.minimize_with_fixed(PARAMETERS.index(order), 1.0, best_minimum.x).cost
+    order_one_deviances = {
+        order_name: problem.minimize_with_fixed(
+            PARAMETERS.index(order_name), 1.0, best_minimum.x
+        ).cost
         - best_minimum.cost
-        for order in orders_without_one
+        for order_name in orders_excluding_one
     }
-    return replace(estimate, deviance_of_order_one=estimate.deviance_of_order_one | deviances)
+    return replace(
+        beam_estimate,
+        deviance_of_order_one=beam_estimate.deviance_of_order_one | order_one_deviances,
+    )
 
 
 def _count_idle_unknowns(problem: UniformBeamProblem, minimum: Minimum) -> int:
-    """Count the unknowns that do not affect chi-square at a minimum.
+    """Count the unknowns that are at a bound or do not affect chi-square at a minimum.
 
-    Absent damping has such unknowns.
+    The order of a vanishing damping is one of them.
     """
-    curvature = np.diag(minimum.equations.hessian)
-    at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
-    return int(np.count_nonzero(at_bound | (curvature < _IDLE_CURVATURE)))
+    chi_square_curvature = np.diag(minimum.equations.hessian)
+    is_at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
+    return int(np.count_nonzero(is_at_bound | (chi_square_curvature < _IDLE_CURVATURE)))
 
 
 def _estimate_at_minimum(
     problem: UniformBeamProblem,
     minima: Sequence[Minimum],
-    basis: EstimateBasis,
+    estimate_basis: EstimateBasis,
     p_value: float | None,
 ) -> TolerantEstimate:
-    """Return beam parameters with standard deviations and 95 % intervals at the lowest minimum."""
+    """Return the beam parameters at the lowest minimum, with their uncertainties.
+
+    The minima are sorted by chi-square, the lowest first.
+    """
     best_minimum = minima[0]
     plant = problem.plant(best_minimum.x)
-    hessian = best_minimum.equations.hessian + np.diag(1 / (problem.upper - problem.lower) ** 2)
-    covariance = problem.transform @ np.linalg.inv(hessian) @ problem.transform.T
-    values = problem.parameters(best_minimum.x)
-    spreads = np.sqrt(np.diag(covariance))
+    bounded_hessian = best_minimum.equations.hessian + np.diag(
+        1 / (problem.upper - problem.lower) ** 2
+    )
+    covariance = problem.transform @ np.linalg.inv(bounded_hessian) @ problem.transform.T
+    parameter_values = problem.parameters(best_minimum.x)
+    parameter_stds = np.sqrt(np.diag(covariance))
     deviance_without_damping = {
-        name: problem.minimize_without_damping(PARAMETERS.index(name), best_minimum.x).cost
+        parameter_name: problem.minimize_without_damping(
+            PARAMETERS.index(parameter_name), best_minimum.x
+        ).cost
         - best_minimum.cost
-        for name in _DAMPING_COEFFICIENTS
+        for parameter_name in _DAMPING_COEFFICIENTS
     }
-    near_minima = [each for each in minima if each.cost - best_minimum.cost < NORMAL_95**2]
+    near_minima = [minimum for minimum in minima if minimum.cost - best_minimum.cost < NORMAL_95**2]
     intervals: dict[str, tuple[float, float]] = {}
     std: dict[str, float] = {}
-    for index, name in enumerate(PARAMETERS):
-        value, spread = float(values[index]), float(spreads[index])
-        if name in _PROFILED_PARAMETERS:
+    for parameter_index, parameter_name in enumerate(PARAMETERS):
+        parameter_value, parameter_std = (
+            float(parameter_values[parameter_index]),
+            float(parameter_stds[parameter_index]),
+        )
+        if parameter_name in _PROFILED_PARAMETERS:
             lower_end, upper_end = (
-                _interval_end(problem, index, best_minimum, side * spread) for side in (-1.0, 1.0)
+                _interval_end(problem, parameter_index, best_minimum, interval_side * parameter_std)
+                for interval_side in (-1.0, 1.0)
             )
-            other_values = [float(problem.parameters(each.x)[index]) for each in near_minima]
-            lower_end, upper_end = min(lower_end, *other_values), max(upper_end, *other_values)
+            near_minimum_values = [
+                float(problem.parameters(minimum.x)[parameter_index]) for minimum in near_minima
+            ]
+            lower_end, upper_end = (
+                min(lower_end, *near_minimum_values),
+                max(upper_end, *near_minimum_values),
+            )
         else:
-            lower_end, upper_end = value - NORMAL_95 * spread, value + NORMAL_95 * spread
-        if name in LOGARITHMIC_PARAMETERS:
-            value, spread = math.exp(value), math.exp(value) * spread
+            lower_end, upper_end = (
+                parameter_value - NORMAL_95 * parameter_std,
+                parameter_value + NORMAL_95 * parameter_std,
+            )
+        if parameter_name in LOGARITHMIC_PARAMETERS:
+            parameter_value, parameter_std = (
+                math.exp(parameter_value),
+                math.exp(parameter_value) * parameter_std,
+            )
             lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
-        intervals[name], std[name] = (lower_end, upper_end), spread
+        intervals[parameter_name], std[parameter_name] = (lower_end, upper_end), parameter_std
     return TolerantEstimate(
-        basis=basis,
+        basis=estimate_basis,
         uniformity=problem.uniformity,
         p_value=p_value,
         plant=plant,
@@ -741,37 +841,40 @@ def _estimate_at_minimum(
 
 
 def _interval_end(
-    problem: UniformBeamProblem, index: int, best_minimum: Minimum, spread: float
+    problem: UniformBeamProblem, parameter_index: int, best_minimum: Minimum, signed_std: float
 ) -> float:
     """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
 
-    Return the edge of the range if chi-square does not rise so far. `index` is the position of the
-    parameter in `PARAMETERS`. `spread` is its standard deviation, negative for the lower end.
+    Return the edge of the range if chi-square does not rise so far. `parameter_index` is the index
+    of the parameter in `PARAMETERS`. `signed_std` is its standard deviation, negative for the lower
+    end.
     """
-    estimate = float(problem.parameters(best_minimum.x)[index])
-    range_edge = math.copysign(math.inf, spread)
-    if PARAMETERS[index] in ("alpha", "lambda"):
-        range_edge = _ORDER_RANGE[0 if spread < 0 else 1]
-    inside_value, inside_root, x = estimate, 0.0, best_minimum.x
-    trial_value = estimate + NORMAL_95 * spread
+    estimated_value = float(problem.parameters(best_minimum.x)[parameter_index])
+    range_edge = math.copysign(math.inf, signed_std)
+    if PARAMETERS[parameter_index] in ("alpha", "lambda"):
+        range_edge = _ORDER_RANGE[0 if signed_std < 0 else 1]
+    inside_value, inside_root, x = estimated_value, 0.0, best_minimum.x
+    trial_value = estimated_value + NORMAL_95 * signed_std
     outside_value: float | None = None
     for _ in range(_MAX_PROFILE_STEPS):
-        trial_value = max(trial_value, range_edge) if spread < 0 else min(trial_value, range_edge)
-        trial_minimum = problem.minimize_with_fixed(index, trial_value, x)
-        root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
-        if abs(root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
+        trial_value = (
+            max(trial_value, range_edge) if signed_std < 0 else min(trial_value, range_edge)
+        )
+        trial_minimum = problem.minimize_with_fixed(parameter_index, trial_value, x)
+        deviance_root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
+        if abs(deviance_root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
             return trial_value
-        if root < NORMAL_95:
-            inside_value, inside_root, x = trial_value, root, trial_minimum.x
+        if deviance_root < NORMAL_95:
+            inside_value, inside_root, x = trial_value, deviance_root, trial_minimum.x
             if trial_value == range_edge:
                 return range_edge
         else:
-            outside_value, outside_root = trial_value, root
+            outside_value, outside_root = trial_value, deviance_root
         if outside_value is None:
-            distance = (inside_value - estimate) * min(
+            value_distance = (inside_value - estimated_value) * min(
                 NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH
             )
-            trial_value = estimate + distance
+            trial_value = estimated_value + value_distance
         else:
             trial_value = inside_value + (outside_value - inside_value) * (
                 NORMAL_95 - inside_root

@@ -60,7 +60,7 @@ SECOND_DAMPING_REASON: Final = (
 
 @dataclass(frozen=True, slots=True)
 class OrderVerdict:
-    """Verdict on one order of the damping.
+    """Verdict on one damping order: whether it is 1, fractional, open or not identifiable.
 
     Attributes
     ----------
@@ -91,10 +91,10 @@ class OrderVerdict:
 
 def order_verdict(
     candidate_set: CandidateSet,
-    profile: LikelihoodProfile,
+    order_profile: LikelihoodProfile,
     visible_numbers: tuple[int, ...],
     *,
-    doubt: str | None,
+    doubt_reason: str | None,
 ) -> OrderVerdict:
     """Return the verdict on one damping order from its profile in the freest structure.
 
@@ -102,22 +102,24 @@ def order_verdict(
     ----------
     candidate_set : CandidateSet
         Candidates of the record.
-    profile : LikelihoodProfile
+    order_profile : LikelihoodProfile
         Profile of the order on the selected beam.
     visible_numbers : tuple of int
         Numbers of the visible modes.
-    doubt : str or None
+    doubt_reason : str or None
         Reason against the structure. None if it is valid.
     """
-    status, reason = _order_status(candidate_set, profile, visible_numbers, doubt=doubt)
-    is_reported = status not in ("not identifiable", "absent")
+    order_status, reason_against = _order_status(
+        candidate_set, order_profile, visible_numbers, doubt_reason=doubt_reason
+    )
+    is_reported = order_status not in ("not identifiable", "absent")
     return OrderVerdict(
-        order=profile.order,
-        status=status,
-        value=profile.estimate if is_reported else None,
-        interval=profile.interval if is_reported else None,
-        reason=reason,
-        profile=profile,
+        order=order_profile.order,
+        status=order_status,
+        value=order_profile.estimate if is_reported else None,
+        interval=order_profile.interval if is_reported else None,
+        reason=reason_against,
+        profile=order_profile,
     )
 
 
@@ -155,41 +157,43 @@ def too_few_modes(structure: Structure, mode_count: int) -> str | None:
     return None
 
 
-def deviance_of_order_one(profile: LikelihoodProfile) -> float:
+def deviance_of_order_one(order_profile: LikelihoodProfile) -> float:
     """Return the deviance of order 1 above the lowest, or infinity outside of the profile.
 
     Parameters
     ----------
-    profile : LikelihoodProfile
+    order_profile : LikelihoodProfile
         Deviance over the values of the order.
     """
-    return float(np.interp(1.0, profile.values, profile.deviance, left=np.inf, right=np.inf))
+    return float(
+        np.interp(1.0, order_profile.values, order_profile.deviance, left=np.inf, right=np.inf)
+    )
 
 
 def _order_status(
     candidate_set: CandidateSet,
-    profile: LikelihoodProfile,
+    order_profile: LikelihoodProfile,
     visible_numbers: tuple[int, ...],
     *,
-    doubt: str | None,
+    doubt_reason: str | None,
 ) -> tuple[Status, str | None]:
-    """Return the status of an order, and the reason against it or None."""
-    freest, order = candidate_set.freest, profile.order
-    reason = not_reported_reason(candidate_set, visible_numbers)
-    if reason is not None:
-        return "not identifiable", reason
-    if not freest.structure.has(order):
+    """Return the status of a damping order, and why it is doubtful or None."""
+    freest_candidate, order_name = candidate_set.freest, order_profile.order
+    reason_against = not_reported_reason(candidate_set, visible_numbers)
+    if reason_against is not None:
+        return "not identifiable", reason_against
+    if not freest_candidate.structure.has(order_name):
         return "absent", "no such damping shows"
-    if not profile.identifiable:
+    if not order_profile.identifiable:
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
-    if doubt is not None:
-        return "open", doubt
-    if order == "lambda" and candidate_set.drag is not None:
+    if doubt_reason is not None:
+        return "open", doubt_reason
+    if order_name == "lambda" and candidate_set.drag is not None:
         return "open", WITH_DRAG_REASON
-    if profile.admits_one:
+    if order_profile.admits_one:
         return "compatible", None
     return (
-        "fractional" if deviance_of_order_one(profile) > EXCLUSION_DEVIANCES[0] else "open"
+        "fractional" if deviance_of_order_one(order_profile) > EXCLUSION_DEVIANCES[0] else "open"
     ), None
 
 
@@ -198,7 +202,7 @@ def _order_status(
 
 @dataclass(frozen=True, slots=True)
 class CandidateRow:
-    """Row of the table of candidate structures.
+    """Row of the table that compares the fitted structures by cost, BIC and AIC.
 
     Attributes
     ----------
@@ -221,7 +225,7 @@ class CandidateRow:
 
 @dataclass(frozen=True, slots=True)
 class Verdict:
-    """Conclusions on one record.
+    """Conclusions on one record: structure, damping orders, findings and advice.
 
     Attributes
     ----------
@@ -276,12 +280,12 @@ class Verdict:
 
     def as_json(self) -> dict[str, object]:
         """Return the verdict as a JSON-ready dict, in which non-finite numbers are None."""
-        document = _json_ready(dataclasses.asdict(self))
-        assert isinstance(document, dict)
-        for order in ("alpha", "lambda"):
-            profile = document[order]["profile"]
+        verdict_document = _json_ready(dataclasses.asdict(self))
+        assert isinstance(verdict_document, dict)
+        for order_document in ("alpha", "lambda"):
+            profile = verdict_document[order_document]["profile"]
             profile["valleys"] = profile.pop("local_minima")  # the key of the document
-        return document
+        return verdict_document
 
 
 def rivals(candidate_set: CandidateSet, max_bic_difference: float) -> tuple[Candidate, ...]:
@@ -294,16 +298,19 @@ def rivals(candidate_set: CandidateSet, max_bic_difference: float) -> tuple[Cand
     max_bic_difference : float
         Limit of the difference of BIC.
     """
-    limit = candidate_set.best.bic + max_bic_difference
-    return tuple(c for c in candidate_set.candidates[1:] if c.bic < limit)
+    bic_limit = candidate_set.best.bic + max_bic_difference
+    return tuple(c for c in candidate_set.candidates[1:] if c.bic < bic_limit)
 
 
-def _json_ready(value: object) -> object:
+def _json_ready(json_value: object) -> object:
     """Convert a value for JSON: tuples to lists, non-finite numbers to None."""
-    if isinstance(value, dict):
-        return {str(key).rstrip("_"): _json_ready(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_json_ready(item) for item in value]
-    if isinstance(value, float) and not math.isfinite(value):
+    if isinstance(json_value, dict):
+        return {
+            str(key).rstrip("_"): _json_ready(nested_value)
+            for key, nested_value in json_value.items()
+        }
+    if isinstance(json_value, list | tuple):
+        return [_json_ready(nested_value) for nested_value in json_value]
+    if isinstance(json_value, float) and not math.isfinite(json_value):
         return None
-    return value
+    return json_value

@@ -53,7 +53,7 @@ class LinearModelError(UserError, ValueError):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Dynamics:
-    """Response from motor angle to coupling torque, with the poles for its realisation.
+    """Response from motor angle to coupling torque, with the poles for its state space.
 
     Attributes
     ----------
@@ -93,7 +93,7 @@ class Dynamics:
     delay_s: float = 0.0
 
     def filtered(self, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        """Return the response with the filters of the torque channel, without the delay.
+        """Return the response in N·m/rad with the filters of the torque channel, without delay.
 
         Parameters
         ----------
@@ -101,17 +101,17 @@ class Dynamics:
             Points in rad/s.
         """
         filtered_response = self.response(s)
-        for constant_s, order in self.filters:
-            x = constant_s * s
+        for time_constant_s, filter_order in self.filters:
+            x = time_constant_s * s
             filtered_response = filtered_response / (
-                1 + x if order == 1 else 1 + _BUTTERWORTH_COEFFICIENT * x + x * x
+                1 + x if filter_order == 1 else 1 + _BUTTERWORTH_COEFFICIENT * x + x * x
             )
         return filtered_response
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class UncertainDynamics:
-    """Dynamics as a function of parameters with estimated values and covariance.
+    """Motor-to-torque dynamics as a function of parameters with estimates and covariance.
 
     Attributes
     ----------
@@ -135,25 +135,25 @@ class UncertainDynamics:
 
     @property
     def nominal(self) -> Dynamics:
-        """Dynamics for the estimated values of the parameters."""
+        """Return the dynamics for the estimated values of the parameters."""
         return self.dynamics_of(self.by_name(self.values))
 
-    def by_name(self, values: NDArray[np.float64]) -> dict[str, float]:
+    def by_name(self, parameter_values: NDArray[np.float64]) -> dict[str, float]:
         """Return parameter values as a dict by name.
 
         Parameters
         ----------
-        values : ndarray, shape (k,)
+        parameter_values : ndarray, shape (k,)
             Values in the order of `names`.
         """
-        return dict(zip(self.names, values.tolist(), strict=True))
+        return dict(zip(self.names, parameter_values.tolist(), strict=True))
 
 
 # Beam
 
 
 def beam_dynamics(plant: Plant) -> Dynamics:
-    """Return the dynamics of a beam with its ends and channels.
+    """Return the motor-to-torque dynamics of a beam with tip mass, clamp and torque channel.
 
     Parameters
     ----------
@@ -165,25 +165,25 @@ def beam_dynamics(plant: Plant) -> Dynamics:
     LinearModelError
         If the beam has too many modes in the band, or their poles are not found.
     """
-    pairs, numbers, real_poles = _beam_poles(plant)
-    hz = np.abs(pairs) / (2 * np.pi)
+    pole_pairs_rad_s, mode_indices, real_poles = _beam_poles(plant)
+    hz = np.abs(pole_pairs_rad_s) / (2 * np.pi)
     in_channel = replace(
         plant, delay_s=0.0, filter_time_constant_s=0.0, second_order_filter_time_constant_s=0.0
     )
-    filters = (
+    torque_filters = (
         (plant.filter_time_constant_s, 1),
         (plant.second_order_filter_time_constant_s, 2),
     )
     return Dynamics(
         response=lambda s: ResponseGrid(s).evaluate(in_channel)[0],
-        pairs=pairs,
-        names=tuple(f"mode_{number}" for number in numbers),
+        pairs=pole_pairs_rad_s,
+        names=tuple(f"mode_{mode_index}" for mode_index in mode_indices),
         in_band=int((hz < BEAM_BAND_HZ[1]).sum()),
         band_hz=BEAM_BAND_HZ,
         real_poles=real_poles,
         tool_inertia_kg_m2=plant.tool_inertia_kg_m2,
         motor_inertia_kg_m2=plant.beam.inertia_kg_m2,
-        filters=tuple(each for each in filters if each[0]),
+        filters=tuple(filter_entry for filter_entry in torque_filters if filter_entry[0]),
         delay_s=plant.delay_s,
     )
 
@@ -200,39 +200,41 @@ def _beam_poles(
             "The model has a tip mass and modes of their own stiffness, which together are not "
             "defined; export the modal model, without --beam."
         )
-    ratio_at_band_end = (2 * np.pi * BEAM_BAND_HZ[1]) ** 2 * plant.beam.density_over_stiffness
-    in_band = int(ratio_at_band_end**0.25 * plant.beam.length_m / np.pi) + 1
-    if in_band > _MAX_BEAM_MODES:
+    quartic_eigenvalue_limit = (
+        2 * np.pi * BEAM_BAND_HZ[1]
+    ) ** 2 * plant.beam.density_over_stiffness
+    mode_count = int(quartic_eigenvalue_limit**0.25 * plant.beam.length_m / np.pi) + 1
+    if mode_count > _MAX_BEAM_MODES:
         raise LinearModelError(
-            f"{plant.beam} has some {in_band} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model of "
-            f"at most {_MAX_BEAM_MODES} is exported; check length and stiffness."
+            f"{plant.beam} has some {mode_count} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model "
+            f"of at most {_MAX_BEAM_MODES} is exported; check length and stiffness."
         )
-    loaded = LoadedBeam(
+    loaded_beam = LoadedBeam(
         plant.beam,
         plant.damping,
         plant.tip_mass_kg,
         plant.root_compliance_rad_per_nm,
         plant.stiffness_offsets,
     )
-    poles = loaded.poles(clamped_free_eigenvalues(in_band + _MODES_BEYOND_BAND + 1))
-    missing = np.flatnonzero(np.isnan(poles[:, 0]))
-    poles = poles[: missing[0] if missing.size else None]
-    upper_poles, band_end_rad_s = poles[:, 0], 2 * np.pi * BEAM_BAND_HZ[1]
-    beyond_band = np.flatnonzero(np.abs(upper_poles) >= band_end_rad_s)
-    if missing.size and not beyond_band.size:
-        raise LinearModelError(f"The poles of {loaded} were not found; check its parameters.")
-    oscillates = upper_poles.imag > 0
-    is_realised = (np.abs(upper_poles) < band_end_rad_s) | (
-        -upper_poles.real < _MAX_OSCILLATING_DAMPING_RATIO * np.abs(upper_poles)
+    poles_rad_s = loaded_beam.poles(clamped_free_eigenvalues(mode_count + _MODES_BEYOND_BAND + 1))
+    missing_modes = np.flatnonzero(np.isnan(poles_rad_s[:, 0]))
+    poles_rad_s = poles_rad_s[: missing_modes[0] if missing_modes.size else None]
+    upper_poles_rad_s, band_end_rad_s = poles_rad_s[:, 0], 2 * np.pi * BEAM_BAND_HZ[1]
+    modes_beyond_band = np.flatnonzero(np.abs(upper_poles_rad_s) >= band_end_rad_s)
+    if missing_modes.size and not modes_beyond_band.size:
+        raise LinearModelError(f"The poles of {loaded_beam} were not found; check its parameters.")
+    is_oscillating = upper_poles_rad_s.imag > 0
+    is_realised = (np.abs(upper_poles_rad_s) < band_end_rad_s) | (
+        -upper_poles_rad_s.real < _MAX_OSCILLATING_DAMPING_RATIO * np.abs(upper_poles_rad_s)
     )
-    if beyond_band.size:
-        is_realised[beyond_band[0] + _MODES_BEYOND_BAND :] = False
-    numbers = np.flatnonzero(oscillates & is_realised)
-    real_poles = poles[~oscillates].real.ravel()
+    if modes_beyond_band.size:
+        is_realised[modes_beyond_band[0] + _MODES_BEYOND_BAND :] = False
+    mode_indices = np.flatnonzero(is_oscillating & is_realised)
+    real_poles_rad_s = poles_rad_s[~is_oscillating].real.ravel()
     return (
-        upper_poles[numbers],
-        numbers + 1,
-        tuple(real_poles[np.abs(real_poles) < band_end_rad_s].tolist()),
+        upper_poles_rad_s[mode_indices],
+        mode_indices + 1,
+        tuple(real_poles_rad_s[np.abs(real_poles_rad_s) < band_end_rad_s].tolist()),
     )
 
 
@@ -240,35 +242,37 @@ def _beam_poles(
 
 
 def modal_dynamics(
-    modal: ModalModel, band_hz: tuple[float, float], numbers: Sequence[int]
+    modal_model: ModalModel, band_hz: tuple[float, float], mode_numbers: Sequence[int]
 ) -> Dynamics:
-    """Return the dynamics of a modal model within the band of its record.
+    """Return the motor-to-torque dynamics of a modal model within the band of its record.
 
     The background is a polynomial in s, which no state space realises: the two powers beyond the
     acceleration are approximated by well-damped pairs of poles above the band.
 
     Parameters
     ----------
-    modal : ModalModel
+    modal_model : ModalModel
         Fitted modal model.
     band_hz : tuple of float
         First and last frequency of the band.
-    numbers : sequence of int
+    mode_numbers : sequence of int
         Mode number of each pole, 0 for a resonance that is not of the beam.
     """
-    modes = np.array(modal.poles_rad_s, dtype=np.complex128)
-    unit_pole = complex(-_RESIDUAL_DAMPING_RATIO, math.sqrt(1 - _RESIDUAL_DAMPING_RATIO**2))
-    residual_poles = 2 * np.pi * band_hz[1] * unit_pole * np.array(_RESIDUAL_FREQUENCY_RATIOS)
+    modal_poles = np.array(modal_model.poles_rad_s, dtype=np.complex128)
+    normalized_pole = complex(-_RESIDUAL_DAMPING_RATIO, math.sqrt(1 - _RESIDUAL_DAMPING_RATIO**2))
+    background_poles = (
+        2 * np.pi * band_hz[1] * normalized_pole * np.array(_RESIDUAL_FREQUENCY_RATIOS)
+    )
     return Dynamics(
-        response=modal.response,
-        pairs=np.concatenate([modes, residual_poles]),
+        response=modal_model.response,
+        pairs=np.concatenate([modal_poles, background_poles]),
         names=(
             *(
-                f"mode_{number}" if number else f"resonance_{index}"
-                for index, number in enumerate(numbers, start=1)
+                f"mode_{mode_number}" if mode_number else f"resonance_{background_index}"
+                for background_index, mode_number in enumerate(mode_numbers, start=1)
             ),
-            *(f"residual_{number}" for number in range(1, residual_poles.size + 1)),
+            *(f"residual_{mode_number}" for mode_number in range(1, background_poles.size + 1)),
         ),
-        in_band=modes.size,
+        in_band=modal_poles.size,
         band_hz=band_hz,
     )

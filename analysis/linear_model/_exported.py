@@ -65,7 +65,7 @@ class ModelOptions:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class PosteriorSamples:
-    """Random samples of the parameters, and the state space of each sample.
+    """Random samples of the fitted model parameters, and the state space of each sample.
 
     Attributes
     ----------
@@ -81,9 +81,9 @@ class PosteriorSamples:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Accuracy:
-    """Error of a realisation, and standard deviation of the response, over a band.
+    """Relative error of an exported state space, and relative uncertainty of the response.
 
-    Both are relative to the exact response in continuous time.
+    Both are relative to the exact response in continuous time, over a frequency band.
 
     Attributes
     ----------
@@ -110,23 +110,23 @@ class Accuracy:
 
     @property
     def error_median(self) -> float:
-        """Median relative error of the realisation over the frequencies."""
+        """Return the median over the frequencies of the relative error of the state space."""
         return float(np.median(self.error))
 
     @property
     def std_max(self) -> float:
-        """Largest relative standard deviation of the response, NaN if it is not known."""
+        """Return the largest relative standard deviation of the response, NaN if unknown."""
         return float(self.std.max())
 
     @property
     def std_median(self) -> float:
-        """Median of the relative standard deviation of the response, NaN if it is not known."""
+        """Return the median relative standard deviation of the response, NaN if unknown."""
         return float(np.median(self.std))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LinearModel:
-    """Exported linear model, with its source, error and uncertainty.
+    """Exported state space of the beam, with the analysis it is from, its error and uncertainty.
 
     Attributes
     ----------
@@ -162,70 +162,87 @@ class LinearModel:
         """Return remarks for users of the model: doubts, and effects that it leaves out."""
         if self.kind == "modal":
             return self.identified.modal_notes
-        status, _ = self.identified.gate
-        doubt = (
+        test_status, _ = self.identified.gate
+        doubt_note = (
             ""
-            if status == PASSED_STATUS
-            else f"whether a uniform beam predicts the modes: {status}"
+            if test_status == PASSED_STATUS
+            else f"whether a uniform beam predicts the modes: {test_status}"
         )
-        return (*filter(None, [doubt]), *self.identified.beam_notes)
+        return (*filter(None, [doubt_note]), *self.identified.beam_notes)
 
     def variables(self) -> dict[str, Any]:
-        """Return the variables of an exported file, by name.
+        """Return the variables that an exported file of the linear model contains, by name.
 
-        Values are strings, numbers, lists of strings or arrays.
+        Their values are strings, numbers, lists of strings or arrays.
         """
-        system, accuracy, posterior = self.system, self.accuracy, self.posterior
-        modal = self.identified.modal
+        state_space, model_accuracy, posterior_samples = self.system, self.accuracy, self.posterior
+        modal_model = self.identified.modal
         modal_names_and_covariance = self.identified.modal_covariance()
         modal_names, modal_covariance = modal_names_and_covariance or ((), np.zeros((0, 0)))
-        status, p_value = self.identified.gate
-        n, (p, m) = system.order, system.d.shape
+        test_status, p_value = self.identified.gate
+        n, (p, m) = state_space.order, state_space.d.shape
         stacked_matrices = {
-            name: np.array([getattr(each, name.lower()) for each in posterior.systems]).reshape(
-                -1, *shape
+            matrix_name: np.array(
+                [
+                    getattr(sample_system, matrix_name.lower())
+                    for sample_system in posterior_samples.systems
+                ]
+            ).reshape(-1, *matrix_shape)
+            for matrix_name, matrix_shape in (
+                ("A", (n, n)),
+                ("B", (n, m)),
+                ("C", (p, n)),
+                ("D", (p, m)),
             )
-            for name, shape in (("A", (n, n)), ("B", (n, m)), ("C", (p, n)), ("D", (p, m)))
         }
         return {
             "format": "rigd linear model",
             "format_version": 1,
             "source": self.identified.source,
             "model": self.kind,
-            "uniform_beam_status": status,
+            "uniform_beam_status": test_status,
             "uniform_beam_p_value": np.nan if p_value is None else p_value,
             "notes": list(self.notes),
             "order": n,
-            "A": system.a,
-            "B": system.b,
-            "C": system.c,
-            "D": system.d,
-            "Ts": system.period_s,
-            "delay_s": system.delay_s,
-            "inputs": list(system.inputs.names),
-            "input_units": list(system.inputs.units),
-            "outputs": list(system.outputs.names),
-            "output_units": list(system.outputs.units),
-            "states": list(system.states.names),
-            "state_units": list(system.states.units),
-            "band_hz": np.array(accuracy.band_hz),
-            "frequency_hz": accuracy.frequency_hz,
-            "response_nm_per_rad": accuracy.response,
-            "error": accuracy.error,
-            "error_max": accuracy.error_max,
-            "error_median": accuracy.error_median,
-            "uncertainty": accuracy.std,
-            "uncertainty_max": accuracy.std_max,
-            "uncertainty_median": accuracy.std_median,
+            "A": state_space.a,
+            "B": state_space.b,
+            "C": state_space.c,
+            "D": state_space.d,
+            "Ts": state_space.period_s,
+            "delay_s": state_space.delay_s,
+            "inputs": list(state_space.inputs.names),
+            "input_units": list(state_space.inputs.units),
+            "outputs": list(state_space.outputs.names),
+            "output_units": list(state_space.outputs.units),
+            "states": list(state_space.states.names),
+            "state_units": list(state_space.states.units),
+            "band_hz": np.array(model_accuracy.band_hz),
+            "frequency_hz": model_accuracy.frequency_hz,
+            "response_nm_per_rad": model_accuracy.response,
+            "error": model_accuracy.error,
+            "error_max": model_accuracy.error_max,
+            "error_median": model_accuracy.error_median,
+            "uncertainty": model_accuracy.std,
+            "uncertainty_max": model_accuracy.std_max,
+            "uncertainty_median": model_accuracy.std_median,
             "parameter_names": list(self.uncertain.names),
             "parameter_values": self.uncertain.values,
             "parameter_covariance": self.uncertain.covariance,
-            "parameter_samples": posterior.parameters,
-            **{f"{name}_samples": values for name, values in stacked_matrices.items()},
-            "delay_samples_s": np.array([each.delay_s for each in posterior.systems]),
-            "poles_rad_s": np.array([] if modal is None else modal.poles_rad_s, complex),
-            "residues_nm_per_s": np.array([] if modal is None else modal.residues, complex),
-            "background": np.array([] if modal is None else modal.background),
+            "parameter_samples": posterior_samples.parameters,
+            **{
+                f"{matrix_name}_samples": value_list
+                for matrix_name, value_list in stacked_matrices.items()
+            },
+            "delay_samples_s": np.array(
+                [sample_system.delay_s for sample_system in posterior_samples.systems]
+            ),
+            "poles_rad_s": np.array(
+                [] if modal_model is None else modal_model.poles_rad_s, complex
+            ),
+            "residues_nm_per_s": np.array(
+                [] if modal_model is None else modal_model.residues, complex
+            ),
+            "background": np.array([] if modal_model is None else modal_model.background),
             "modal_names": list(modal_names),
             "modal_covariance": modal_covariance,
         }
@@ -236,7 +253,9 @@ def linear_model(
     options: ModelOptions,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
-    """Realise an identified model: the beam if it predicts the modes, else the modal model.
+    """Convert an identified model to a state space.
+
+    This is the uniform beam if it predicts the measured modes, otherwise the modal model.
 
     Parameters
     ----------
@@ -253,8 +272,8 @@ def linear_model(
         If the model cannot be realised, or samples are requested without a stated covariance.
     """
     export_beam = options.beam or identified.gate[0] == PASSED_STATUS
-    uncertain = identified.beam() if export_beam else identified.modes()
-    if options.samples and not uncertain.names:
+    uncertain_dynamics = identified.beam() if export_beam else identified.modes()
+    if options.samples and not uncertain_dynamics.names:
         key = "covariance" if export_beam else "modal_model.covariance"
         raise LinearModelError(
             f"{identified.headline_name} has no {key}, as of an older version or of a campaign, "
@@ -262,123 +281,155 @@ def linear_model(
             "samples can be drawn; analyze a session again, or add --samples 0."
         )
     on_step("order")
-    nominal = uncertain.nominal
-    fit = PoleFit(nominal)
-    structure, system = realise_response(fit, options.order, options.given)
+    nominal_dynamics = uncertain_dynamics.nominal
+    fit = PoleFit(nominal_dynamics)
+    pole_structure, state_space = realise_response(fit, options.order, options.given)
     on_step("accuracy")
-    accuracy = _accuracy(uncertain, fit, system)
+    model_accuracy = _accuracy(uncertain_dynamics, fit, state_space)
     on_step("samples")
-    posterior = _draw_posterior(uncertain, fit, structure, options)
+    posterior_samples = _draw_posterior(uncertain_dynamics, fit, pole_structure, options)
     if options.rate_hz is not None:
         rate_hz = options.rate_hz
-        system = system.sampled(rate_hz)
-        sampled_systems = tuple(each.sampled(rate_hz) for each in posterior.systems)
-        posterior = replace(posterior, systems=sampled_systems)
+        state_space = state_space.sampled(rate_hz)
+        sampled_systems = tuple(
+            sample_system.sampled(rate_hz) for sample_system in posterior_samples.systems
+        )
+        posterior_samples = replace(posterior_samples, systems=sampled_systems)
     return LinearModel(
         identified,
         "beam" if export_beam else "modal",
-        uncertain,
+        uncertain_dynamics,
         options,
-        system,
-        structure,
-        accuracy,
-        posterior,
+        state_space,
+        pole_structure,
+        model_accuracy,
+        posterior_samples,
     )
 
 
-def _accuracy(uncertain: UncertainDynamics, fit: PoleFit, system: StateSpace) -> Accuracy:
-    """Return error and uncertainty of a realisation over its band."""
+def _accuracy(
+    uncertain_dynamics: UncertainDynamics, fit: PoleFit, state_space: StateSpace
+) -> Accuracy:
+    """Return the relative error of a state space over its band, and that of the response."""
     low_hz, high_hz = fit.dynamics.band_hz
     pole_and_zero_hz = np.concatenate([fit.dynamics.pairs, fit.zeros]).imag / (2 * np.pi)
-    inner_hz = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
-    frequency_hz = np.sort(np.concatenate([np.geomspace(low_hz, high_hz, _TABLE_POINTS), inner_hz]))
+    hz_in_band = pole_and_zero_hz[(pole_and_zero_hz > low_hz) & (pole_and_zero_hz < high_hz)]
+    frequency_hz = np.sort(
+        np.concatenate([np.geomspace(low_hz, high_hz, _TABLE_POINTS), hz_in_band])
+    )
     s = imaginary_axis(frequency_hz)
     exact_response = fit.dynamics.filtered(s)
     return Accuracy(
         fit.dynamics.band_hz,
         frequency_hz,
         exact_response * np.exp(-fit.dynamics.delay_s * s),
-        np.abs(angle_response(system, s) / exact_response - 1),
-        _relative_std(uncertain, s),
-        float(fit.error(system).max()),
+        np.abs(angle_response(state_space, s) / exact_response - 1),
+        _relative_std(uncertain_dynamics, s),
+        float(fit.error(state_space).max()),
     )
 
 
-def _relative_std(uncertain: UncertainDynamics, s: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return the relative standard deviation of the response with delay (delta method)."""
-    if not uncertain.names:
+def _relative_std(
+    uncertain_dynamics: UncertainDynamics, s: NDArray[np.complex128]
+) -> NDArray[np.float64]:
+    """Return the relative standard deviation of the torque response with delay, shape (len(s),).
+
+    It follows from the covariance of the parameters to first order. NaN without a covariance.
+    """
+    if not uncertain_dynamics.names:
         return np.full(s.size, np.nan)
 
-    def response(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Return the exact response with filters and delay for given parameters."""
-        dynamics = uncertain.dynamics_of(uncertain.by_name(values))
-        return dynamics.filtered(s) * np.exp(-dynamics.delay_s * s)
+    def response(parameter_values: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Return the exact torque response in N·m/rad, with filters and delay, at the points s."""
+        sampled_dynamics = uncertain_dynamics.dynamics_of(
+            uncertain_dynamics.by_name(parameter_values)
+        )
+        return sampled_dynamics.filtered(s) * np.exp(-sampled_dynamics.delay_s * s)
 
-    variances, directions = np.linalg.eigh(uncertain.covariance)
+    variances, eigenvectors = np.linalg.eigh(uncertain_dynamics.covariance)
     total_variance = np.zeros(s.size)
-    for variance, direction in zip(variances, directions.T, strict=True):
+    for variance, eigenvector in zip(variances, eigenvectors.T, strict=True):
         if variance > 0:
-            value_step = np.sqrt(variance) * _STEP_STD * direction
-            above, below = (
-                response(uncertain.values + value_step),
-                response(uncertain.values - value_step),
+            parameter_step = np.sqrt(variance) * _STEP_STD * eigenvector
+            upper_response, lower_response = (
+                response(uncertain_dynamics.values + parameter_step),
+                response(uncertain_dynamics.values - parameter_step),
             )
-            total_variance += np.abs((above - below) / (2 * _STEP_STD)) ** 2
-    std: NDArray[np.float64] = np.sqrt(total_variance) / np.abs(response(uncertain.values))
-    return std
+            total_variance += np.abs((upper_response - lower_response) / (2 * _STEP_STD)) ** 2
+    relative_std: NDArray[np.float64] = np.sqrt(total_variance) / np.abs(
+        response(uncertain_dynamics.values)
+    )
+    return relative_std
 
 
 def _draw_posterior(
-    uncertain: UncertainDynamics, fit: PoleFit, structure: PoleStructure, options: ModelOptions
+    uncertain_dynamics: UncertainDynamics,
+    fit: PoleFit,
+    pole_structure: PoleStructure,
+    options: ModelOptions,
 ) -> PosteriorSamples:
-    """Draw parameters from a normal distribution, and realise each sample with the same states."""
-    count = options.samples
+    """Draw parameters from their normal distribution, and convert each sample to a state space.
+
+    All state spaces have the same states. Raise `LinearModelError` if too few samples allow this.
+    """
+    drawn_count = options.samples
     accepted_values: list[NDArray[np.float64]] = []
-    systems: list[StateSpace] = []
-    generator = np.random.default_rng(_RANDOM_SEED)
-    for _ in range(count * _MAX_DRAWS_PER_SAMPLE):
-        if len(accepted_values) == count:
+    sample_systems: list[StateSpace] = []
+    random_generator = np.random.default_rng(_RANDOM_SEED)
+    for _ in range(drawn_count * _MAX_DRAWS_PER_SAMPLE):
+        if len(accepted_values) == drawn_count:
             break
-        values = generator.multivariate_normal(
-            uncertain.values, uncertain.covariance, method="eigh", check_valid="ignore"
+        drawn_values = random_generator.multivariate_normal(
+            uncertain_dynamics.values,
+            uncertain_dynamics.covariance,
+            method="eigh",
+            check_valid="ignore",
         )
-        dynamics = _dynamics_of_sample(uncertain, values, fit.dynamics, structure)
-        if dynamics is None:
+        sampled_dynamics = _dynamics_of_sample(
+            uncertain_dynamics, drawn_values, fit.dynamics, pole_structure
+        )
+        if sampled_dynamics is None:
             continue
-        sampled_fit = PoleFit(dynamics, near=fit)
-        coefficients, _ = sampled_fit.solve(structure)
-        if sampled_fit.is_stable_on_motor(structure, coefficients):
-            accepted_values.append(values)
-            systems.append(sampled_fit.system(structure, coefficients, options.given))
-    if len(accepted_values) < count:
+        sampled_fit = PoleFit(sampled_dynamics, similar_fit=fit)
+        fit_coefficients, _ = sampled_fit.solve(pole_structure)
+        if sampled_fit.is_stable_on_motor(pole_structure, fit_coefficients):
+            accepted_values.append(drawn_values)
+            sample_systems.append(
+                sampled_fit.system(pole_structure, fit_coefficients, options.given)
+            )
+    if len(accepted_values) < drawn_count:
         raise LinearModelError(
-            f"Only {len(accepted_values)} of {count} samples of the posterior have the states of "
-            "the model: its parameters are too uncertain; record more, or add --samples 0."
+            f"Only {len(accepted_values)} of {drawn_count} samples of the posterior have the "
+            "states of the model: its parameters are too uncertain; record more, or add "
+            "--samples 0."
         )
     return PosteriorSamples(
-        np.array(accepted_values).reshape(count, uncertain.values.size), tuple(systems)
+        np.array(accepted_values).reshape(drawn_count, uncertain_dynamics.values.size),
+        tuple(sample_systems),
     )
 
 
 def _dynamics_of_sample(
-    uncertain: UncertainDynamics,
-    values: NDArray[np.float64],
-    nominal: Dynamics,
-    structure: PoleStructure,
+    uncertain_dynamics: UncertainDynamics,
+    sampled_values: NDArray[np.float64],
+    nominal_dynamics: Dynamics,
+    pole_structure: PoleStructure,
 ) -> Dynamics | None:
-    """Return the dynamics of sampled parameters.
+    """Return the motor-to-torque dynamics of sampled parameters.
 
-    Return None if they are impossible or need other states.
+    Return None if the parameters are impossible or their model needs other states.
     """
-    parameters = uncertain.by_name(values)
-    if not uncertain.is_possible(parameters):
+    parameter_values = uncertain_dynamics.by_name(sampled_values)
+    if not uncertain_dynamics.is_possible(parameter_values):
         return None
     try:
-        dynamics = uncertain.dynamics_of(parameters)
+        sampled_dynamics = uncertain_dynamics.dynamics_of(parameter_values)
     except LinearModelError:
         return None
-    same_modes = dynamics.names[: structure.pairs] == nominal.names[: structure.pairs] and len(
-        dynamics.real_poles
-    ) == len(nominal.real_poles)
-    same_filters = [each[1] for each in dynamics.filters] == [each[1] for each in nominal.filters]
-    return dynamics if same_modes and same_filters else None
+    has_same_poles = sampled_dynamics.names[: pole_structure.pairs] == nominal_dynamics.names[
+        : pole_structure.pairs
+    ] and len(sampled_dynamics.real_poles) == len(nominal_dynamics.real_poles)
+    has_same_filters = [filter_entry[1] for filter_entry in sampled_dynamics.filters] == [
+        filter_entry[1] for filter_entry in nominal_dynamics.filters
+    ]
+    return sampled_dynamics if has_same_poles and has_same_filters else None

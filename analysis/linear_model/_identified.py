@@ -95,41 +95,45 @@ class IdentifiedModel:
 
     @property
     def gate(self) -> tuple[str, float | None]:
-        """Return status and p-value of the uniform-beam test.
+        """Return status and p-value of the test whether a uniform beam predicts the modes.
 
         The p-value is None if it was not tested.
         """
-        validity = self.headline.get("validity")
-        gate = validity.get("uniform_beam") if isinstance(validity, dict) else None
-        if not isinstance(gate, dict):
+        validity_entry = self.headline.get("validity")
+        uniform_beam_entry = (
+            validity_entry.get("uniform_beam") if isinstance(validity_entry, dict) else None
+        )
+        if not isinstance(uniform_beam_entry, dict):
             return "not tested", None
-        return str(gate.get("status", "not tested")), finite_number(gate.get("p_value"))
+        return str(uniform_beam_entry.get("status", "not tested")), finite_number(
+            uniform_beam_entry.get("p_value")
+        )
 
     @property
     def modal(self) -> ModalModel | None:
         """Return the modal model of the analysis. It is None in documents of older versions."""
-        content = self.headline.get("modal_model")
-        if content is None:
+        model_entry = self.headline.get("modal_model")
+        if model_entry is None:
             return None
         try:
-            modal = ModalModel.from_json(content)
+            modal_model = ModalModel.from_json(model_entry)
         except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise self._error("modal_model", "is not a modal model") from error
-        numbers = [*modal.poles_rad_s, *modal.residues, *modal.background]
-        stable = all(pole.real < 0 < pole.imag for pole in modal.poles_rad_s)
-        if len(modal.background) != BACKGROUND_COEFFICIENTS or not (
-            len(modal.poles_rad_s) == len(modal.residues) <= _MAX_MODES
+        model_numbers = [*modal_model.poles_rad_s, *modal_model.residues, *modal_model.background]
+        is_stable = all(pole.real < 0 < pole.imag for pole in modal_model.poles_rad_s)
+        if len(modal_model.background) != BACKGROUND_COEFFICIENTS or not (
+            len(modal_model.poles_rad_s) == len(modal_model.residues) <= _MAX_MODES
         ):
             raise self._error(
                 "modal_model",
                 f"must have up to {_MAX_MODES} poles, a residue for each of them, and "
                 f"{BACKGROUND_COEFFICIENTS} coefficients of the background",
             )
-        if not stable or not all(map(_is_finite, numbers)):
+        if not is_stable or not all(map(_is_finite, model_numbers)):
             raise self._error(
                 "modal_model", "must have poles with negative real and positive imaginary parts"
             )
-        return modal
+        return modal_model
 
     def modal_covariance(self) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
         """Return names and covariance of the modal constants, or None if they are not stated."""
@@ -142,37 +146,45 @@ class IdentifiedModel:
     @property
     def beam_notes(self) -> tuple[str, ...]:
         """Return doubts about the beam parameters, and effects that a linear model leaves out."""
-        parameters = self._beam_part["parameters"]
-        flagged = [name for name, each in parameters.items() if _doubt_about(each)]
-        notes = [f"flagged by the analysis: {', '.join(flagged)}"] if flagged else []
-        notes += [
-            f"{name} is not part of the model: {why}"
-            for name, why in _REASONS_TO_LEAVE_OUT.items()
-            if name in parameters and parameters[name]["value"]
+        parameter_entries = self._beam_part["parameters"]
+        flagged_names = [
+            parameter_name
+            for parameter_name, parameter_entry in parameter_entries.items()
+            if _doubt_about(parameter_entry)
         ]
-        named = self.headline.get("named")
-        notes += [
-            f"not part of the model: {kind} ({sentence.removesuffix('.')})"
-            for _, kind, sentence in findings_without_parameter(named)
+        note_texts = (
+            [f"flagged by the analysis: {', '.join(flagged_names)}"] if flagged_names else []
+        )
+        note_texts += [
+            f"{parameter_name} is not part of the model: {why}"
+            for parameter_name, why in _REASONS_TO_LEAVE_OUT.items()
+            if parameter_name in parameter_entries and parameter_entries[parameter_name]["value"]
         ]
-        return tuple(notes)
+        effect_entries = self.headline.get("named")
+        note_texts += [
+            f"not part of the model: {effect_kind} ({effect_sentence.removesuffix('.')})"
+            for _, effect_kind, effect_sentence in findings_without_parameter(effect_entries)
+        ]
+        return tuple(note_texts)
 
     @property
     def modal_notes(self) -> tuple[str, ...]:
         """Return a note on the doubtful modes of the modal model, if there are any."""
-        listed = self.headline.get("modes")
-        flagged = [
-            str(each.get("mode"))
-            for each in (listed if isinstance(listed, list) else [])
-            if isinstance(each, dict)
-            and each.get("source") == "modal"
-            and any(_doubt_about(each.get(key)) for key in ("frequency_hz", "damping_ratio"))
+        mode_entries = self.headline.get("modes")
+        flagged_modes = [
+            str(mode_entry.get("mode"))
+            for mode_entry in (mode_entries if isinstance(mode_entries, list) else [])
+            if isinstance(mode_entry, dict)
+            and mode_entry.get("source") == "modal"
+            and any(_doubt_about(mode_entry.get(key)) for key in ("frequency_hz", "damping_ratio"))
         ]
-        return (f"flagged by the analysis: mode {', '.join(flagged)}",) if flagged else ()
+        return (
+            (f"flagged by the analysis: mode {', '.join(flagged_modes)}",) if flagged_modes else ()
+        )
 
     @property
     def _beam_part(self) -> Mapping[str, Any]:
-        """Return the part of the headline that contains the parameters of the exported beam.
+        """Return the section of the reported numbers with the parameters of the exported beam.
 
         This is the exactly uniform beam, if its covariance is stated: parameters with a tolerance
         of the geometry reproduce the resonances less exactly than they were measured.
@@ -183,7 +195,7 @@ class IdentifiedModel:
         return self.headline
 
     def beam(self) -> UncertainDynamics:
-        """Return the dynamics of the beam, with its ends and channels, and their uncertainty.
+        """Return the dynamics of the fitted beam, and the covariance of its parameters.
 
         Raises
         ------
@@ -192,7 +204,7 @@ class IdentifiedModel:
         LinearModelError
             If the length or the covariance cannot be used.
         """
-        values = parameter_values(self.headline_name, self._beam_part["parameters"])
+        beam_values = parameter_values(self.headline_name, self._beam_part["parameters"])
         length_m = self.length_m
         if length_m is None:
             raise LinearModelError(
@@ -200,34 +212,37 @@ class IdentifiedModel:
                 "state "
                 f"different ones; {_ANALYZE_AGAIN_ADVICE}."
             )
-        names, covariance = self.beam_covariance() or ((), np.zeros((0, 0)))
-        for name in names:
-            parameter_name = name.removeprefix(_LOGARITHM_PREFIX)
-            if parameter_name not in values or (
-                parameter_name != name and values[parameter_name] <= 0
+        determined_names, covariance = self.beam_covariance() or ((), np.zeros((0, 0)))
+        for key_name in determined_names:
+            parameter_name = key_name.removeprefix(_LOGARITHM_PREFIX)
+            if parameter_name not in beam_values or (
+                parameter_name != key_name and beam_values[parameter_name] <= 0
             ):
-                raise self._error("covariance.names", f"{name!r} has no such parameter")
+                raise self._error("covariance.names", f"{key_name!r} has no such parameter")
 
-        def all_values(parameters: Mapping[str, float]) -> Mapping[str, float]:
-            """Return all parameter values, with logarithms converted."""
-            return values | {
-                name.removeprefix(_LOGARITHM_PREFIX): math.exp(min(value, 300.0))
-                if name.startswith(_LOGARITHM_PREFIX)
-                else value
-                for name, value in parameters.items()
+        def all_values(determined_values: Mapping[str, float]) -> Mapping[str, float]:
+            """Return all beam parameters by name. Given values replace fitted ones.
+
+            A value whose name begins with "ln_" is a logarithm, and is converted.
+            """
+            return beam_values | {
+                key_name.removeprefix(_LOGARITHM_PREFIX): math.exp(min(parameter_value, 300.0))
+                if key_name.startswith(_LOGARITHM_PREFIX)
+                else parameter_value
+                for key_name, parameter_value in determined_values.items()
             }
 
         return UncertainDynamics(
             lambda parameters: beam_dynamics(
                 _plant_of_parameters(all_values(parameters), length_m)
             ),
-            names,
+            determined_names,
             np.array(
                 [
-                    math.log(values[name.removeprefix(_LOGARITHM_PREFIX)])
-                    if name.startswith(_LOGARITHM_PREFIX)
-                    else values[name]
-                    for name in names
+                    math.log(beam_values[key_name.removeprefix(_LOGARITHM_PREFIX)])
+                    if key_name.startswith(_LOGARITHM_PREFIX)
+                    else beam_values[key_name]
+                    for key_name in determined_names
                 ]
             ),
             covariance,
@@ -235,43 +250,56 @@ class IdentifiedModel:
         )
 
     def modes(self) -> UncertainDynamics:
-        """Return the dynamics of the modal model in the band of the analysis, with uncertainty.
+        """Return the dynamics of the modal model, and the covariance of its constants.
+
+        Both hold in the band of the analysis.
 
         Raises
         ------
         LinearModelError
             If there is no modal model, or it or its covariance cannot be used.
         """
-        modal, band_hz = self.modal, self.band_hz
-        if modal is None:
+        modal_fit, band_hz = self.modal, self.band_hz
+        if modal_fit is None:
             raise LinearModelError(
                 f"{self.headline_name} has no modal_model, as of an older version or of a "
                 "campaign; "
                 f"{_ANALYZE_AGAIN_ADVICE}, or export the beam's model with --beam."
             )
-        count = len(modal.poles_rad_s)
-        names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))
-        values = [constant_value(modal, name) for name in names]
-        known_values = [value for value in values if value is not None]
-        if len(known_values) < len(names):
+        mode_count = len(modal_fit.poles_rad_s)
+        constant_names, covariance = self.modal_covariance() or ((), np.zeros((0, 0)))
+        constant_values = [
+            constant_value(modal_fit, constant_name) for constant_name in constant_names
+        ]
+        present_values = [
+            nominal_value for nominal_value in constant_values if nominal_value is not None
+        ]
+        if len(present_values) < len(constant_names):
             raise self._error(
-                "modal_model.names", f"{names[values.index(None)]!r} has no such constant"
+                "modal_model.names",
+                f"{constant_names[constant_values.index(None)]!r} has no such constant",
             )
-        nominal = dict(zip(names, known_values, strict=True))
-        stated_modes = self.headline["modal_model"].get("modes")
-        numbers_are_stated = isinstance(stated_modes, list) and len(stated_modes) == count
-        numbers = stated_modes if numbers_are_stated else list(range(1, count + 1))
+        nominal_constants = dict(zip(constant_names, present_values, strict=True))
+        stated_mode_numbers = self.headline["modal_model"].get("modes")
+        numbers_are_stated = (
+            isinstance(stated_mode_numbers, list) and len(stated_mode_numbers) == mode_count
+        )
+        mode_numbers = stated_mode_numbers if numbers_are_stated else list(range(1, mode_count + 1))
 
-        def modal_model_of(parameters: Mapping[str, float]) -> ModalModel:
-            """Return the modal model with given values of its constants."""
+        def modal_model_of(sampled_constants: Mapping[str, float]) -> ModalModel:
+            """Return the modal model with given values of its modal constants, by name."""
             return with_changed_constants(
-                modal, {name: parameters[name] - nominal[name] for name in parameters}
+                modal_fit,
+                {
+                    changed_name: sampled_constants[changed_name] - nominal_constants[changed_name]
+                    for changed_name in sampled_constants
+                },
             )
 
         return UncertainDynamics(
-            lambda parameters: modal_dynamics(modal_model_of(parameters), band_hz, numbers),
-            names,
-            np.array(known_values),
+            lambda parameters: modal_dynamics(modal_model_of(parameters), band_hz, mode_numbers),
+            constant_names,
+            np.array(present_values),
             covariance,
             lambda parameters: all(
                 pole.real < 0 < pole.imag for pole in modal_model_of(parameters).poles_rad_s
@@ -279,31 +307,40 @@ class IdentifiedModel:
         )
 
     def _covariance(
-        self, key: str, part: object, matrix_key: str
+        self, entry_key: str, headline_entry: object, matrix_key: str
     ) -> tuple[tuple[str, ...], NDArray[np.float64]] | None:
-        """Read names and covariance matrix from a part of the headline, or return None."""
-        names = part.get("names") if isinstance(part, dict) else None
-        matrix = part.get(matrix_key) if isinstance(part, dict) else None
-        if not isinstance(names, list) or not isinstance(matrix, list):
+        """Read parameter names and covariance matrix from an entry of the reported numbers.
+
+        Return None if they are not stated. Raise `LinearModelError` if they cannot be used.
+        """
+        stated_names = headline_entry.get("names") if isinstance(headline_entry, dict) else None
+        stated_matrix = headline_entry.get(matrix_key) if isinstance(headline_entry, dict) else None
+        if not isinstance(stated_names, list) or not isinstance(stated_matrix, list):
             return None
         try:
-            covariance = np.array(matrix, dtype=np.float64).reshape(len(names), len(names))
+            covariance = np.array(stated_matrix, dtype=np.float64).reshape(
+                len(stated_names), len(stated_names)
+            )
         except (TypeError, ValueError, OverflowError) as error:
-            raise self._error(f"{key}.{matrix_key}", "must be a square matrix") from error
-        if len(set(map(str, names))) < len(names):
-            raise self._error(f"{key}.names", "must be different from each other")
-        scale = np.sqrt(np.abs(np.diag(covariance)))
-        scaled_covariance = covariance / np.outer(scale + (scale == 0), scale + (scale == 0))
+            raise self._error(f"{entry_key}.{matrix_key}", "must be a square matrix") from error
+        if len(set(map(str, stated_names))) < len(stated_names):
+            raise self._error(f"{entry_key}.names", "must be different from each other")
+        parameter_stds = np.sqrt(np.abs(np.diag(covariance)))
+        scaled_covariance = covariance / np.outer(
+            parameter_stds + (parameter_stds == 0), parameter_stds + (parameter_stds == 0)
+        )
         if not np.isfinite(covariance).all() or (
-            len(names)
+            len(stated_names)
             and np.linalg.eigvalsh((scaled_covariance + scaled_covariance.T) / 2).min() < -1e-6
         ):
-            raise self._error(f"{key}.{matrix_key}", "must be positive semidefinite")
-        return tuple(map(str, names)), (covariance + covariance.T) / 2
+            raise self._error(f"{entry_key}.{matrix_key}", "must be positive semidefinite")
+        return tuple(map(str, stated_names)), (covariance + covariance.T) / 2
 
-    def _error(self, key: str, what: str) -> LinearModelError:
-        """Return the error that a key of the headline cannot be used."""
-        return LinearModelError(f"{self.headline_name}.{key}: {what}; {_ANALYZE_AGAIN_ADVICE}.")
+    def _error(self, headline_key: str, entry_problem: str) -> LinearModelError:
+        """Return the exception that states why a key of the reported numbers cannot be used."""
+        return LinearModelError(
+            f"{self.headline_name}.{headline_key}: {entry_problem}; {_ANALYZE_AGAIN_ADVICE}."
+        )
 
 
 def identified_in_document(path: Path) -> IdentifiedModel:
@@ -324,37 +361,43 @@ def identified_in_document(path: Path) -> IdentifiedModel:
     document = read_document(path)
     headline_name, headline = select_headline(path, document)
     assert isinstance(document, dict)
-    file = headline.get("file")
-    if file is not None and len(document["headlines"]) > 1:
+    file_name = headline.get("file")
+    if file_name is not None and len(document["headlines"]) > 1:
         raise LinearModelError(
             f"{path} has the results of {len(document['headlines'])} sessions and none of all "
             "together; analyze one of them, or several as a campaign."
         )
 
-    def entries(key: str) -> list[dict[str, Any]]:
+    def entries(list_key: str) -> list[dict[str, Any]]:
         """Return the entries of a list in the document that belong to the analysed file."""
-        stated_list = document.get(key)
-        dicts = (
-            [each for each in stated_list if isinstance(each, dict)]
+        stated_list = document.get(list_key)
+        entry_dicts = (
+            [document_entry for document_entry in stated_list if isinstance(document_entry, dict)]
             if isinstance(stated_list, list)
             else []
         )
-        return [each for each in dicts if file is None or each.get("file") == file]
+        return [
+            document_entry
+            for document_entry in entry_dicts
+            if file_name is None or document_entry.get("file") == file_name
+        ]
 
-    lengths = {finite_number(each.get("beam_length_m")) for each in entries("files")}
-    (length_m,) = lengths if len(lengths) == 1 else (None,)
-    bands = [each.get("band_hz") for each in entries("records")]
+    lengths_m = {
+        finite_number(document_entry.get("beam_length_m")) for document_entry in entries("files")
+    }
+    (length_m,) = lengths_m if len(lengths_m) == 1 else (None,)
+    stated_bands = [document_entry.get("band_hz") for document_entry in entries("records")]
     return IdentifiedModel(
         path.name,
         headline_name,
         headline,
         length_m if length_m and length_m > 0 and is_usable_size(length_m) else None,
-        _band_hz(bands[0] if bands else None),
+        _band_hz(stated_bands[0] if stated_bands else None),
     )
 
 
 def identified_in_session(path: Path) -> IdentifiedModel:
-    """Analyse a session, and return the identified model.
+    """Analyse the record of a session, and return the identified model.
 
     Parameters
     ----------
@@ -372,22 +415,29 @@ def identified_in_session(path: Path) -> IdentifiedModel:
     from analysis.results import finite, whole_record
 
     record = load_record(path)
-    whole = whole_record(record)
-    headline = finite(whole.headline_json())
+    record_analysis = whole_record(record)
+    headline_json = finite(record_analysis.headline_json())
     return IdentifiedModel(
-        path.name, str(path), headline, record.beam.length_m, _band_hz(list(whole.band_hz))
+        path.name,
+        str(path),
+        headline_json,
+        record.beam.length_m,
+        _band_hz(list(record_analysis.band_hz)),
     )
 
 
-def _doubt_about(quantity: object) -> object:
-    """Return why a reported quantity is doubtful, or an empty value if it is not."""
-    return quantity.get("flag") if isinstance(quantity, dict) else None
+def _doubt_about(reported_entry: object) -> object:
+    """Return why a reported number is doubtful, or a false value if it is not."""
+    return reported_entry.get("flag") if isinstance(reported_entry, dict) else None
 
 
-def _band_hz(stated: object) -> tuple[float, float]:
-    """Return a stated band, or the default band if the statement cannot be used."""
-    if isinstance(stated, list) and len(stated) == 2:
-        low_hz, high_hz = map(finite_number, stated)
+def _band_hz(stated_band: object) -> tuple[float, float]:
+    """Return the first and last frequency of a stated band, in hertz.
+
+    Return the default band if the stated one cannot be used.
+    """
+    if isinstance(stated_band, list) and len(stated_band) == 2:
+        low_hz, high_hz = map(finite_number, stated_band)
         if (
             low_hz is not None
             and high_hz is not None
@@ -398,32 +448,38 @@ def _band_hz(stated: object) -> tuple[float, float]:
     return _DEFAULT_BAND_HZ
 
 
-def _is_finite(value: complex) -> bool:
+def _is_finite(complex_number: complex) -> bool:
     """Return whether real and imaginary part of a number are finite."""
-    return math.isfinite(value.real) and math.isfinite(value.imag)
+    return math.isfinite(complex_number.real) and math.isfinite(complex_number.imag)
 
 
-def _is_possible_beam(values: Mapping[str, float]) -> bool:
+def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
     """Return whether sampled parameters describe a physically possible beam."""
-    valid_orders = all(0 <= values[name] < 2 for name in _ORDER_NAMES if name in values)
-    valid_signs = all(
-        value >= 0 or name in _REASONS_TO_LEAVE_OUT or name.startswith(_SIGNED_PREFIXES)
-        for name, value in values.items()
+    has_valid_orders = all(
+        0 <= sampled_values[parameter_name] < 2
+        for parameter_name in _ORDER_NAMES
+        if parameter_name in sampled_values
     )
-    return valid_orders and valid_signs
+    has_valid_signs = all(
+        parameter_value >= 0
+        or parameter_name in _REASONS_TO_LEAVE_OUT
+        or parameter_name.startswith(_SIGNED_PREFIXES)
+        for parameter_name, parameter_value in sampled_values.items()
+    )
+    return has_valid_orders and has_valid_signs
 
 
-def _plant_of_parameters(values: Mapping[str, float], length_m: float) -> Plant:
-    """Return the rig with a beam of given parameters."""
-    density_over_stiffness, stiffness = (
-        values["density_over_stiffness"],
-        values["bending_stiffness_n_m2"],
+def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
+    """Return the rig with a beam of given parameters, by name, and length in metres."""
+    density_over_stiffness, stiffness_n_m2 = (
+        beam_values["density_over_stiffness"],
+        beam_values["bending_stiffness_n_m2"],
     )
     last_offset_mode = max(
         (
-            int(each.removeprefix(_STIFFNESS_OFFSET_PREFIX))
-            for each in values
-            if each.startswith(_STIFFNESS_OFFSET_PREFIX)
+            int(key_name.removeprefix(_STIFFNESS_OFFSET_PREFIX))
+            for key_name in beam_values
+            if key_name.startswith(_STIFFNESS_OFFSET_PREFIX)
         ),
         default=1,
     )
@@ -433,20 +489,20 @@ def _plant_of_parameters(values: Mapping[str, float], length_m: float) -> Plant:
             f"{_ANALYZE_AGAIN_ADVICE}."
         )
     return Plant(
-        beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
+        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
         damping=Damping(
-            zeta=values.get("zeta", 0.0),
-            alpha=values.get("alpha", 1.0),
-            gamma=values.get("gamma", 0.0),
-            lambda_=values.get("lambda", 1.0),
+            zeta=beam_values.get("zeta", 0.0),
+            alpha=beam_values.get("alpha", 1.0),
+            gamma=beam_values.get("gamma", 0.0),
+            lambda_=beam_values.get("lambda", 1.0),
         ),
         stiffness_offsets=tuple(
-            values.get(f"{_STIFFNESS_OFFSET_PREFIX}{mode}", 0.0)
-            for mode in range(2, last_offset_mode + 1)
+            beam_values.get(f"{_STIFFNESS_OFFSET_PREFIX}{mode_number}", 0.0)
+            for mode_number in range(2, last_offset_mode + 1)
         ),
         **{
-            name: values.get(name, 0.0)
-            for name in (
+            parameter_name: beam_values.get(parameter_name, 0.0)
+            for parameter_name in (
                 "delay_s",
                 "tool_inertia_kg_m2",
                 "root_compliance_rad_per_nm",

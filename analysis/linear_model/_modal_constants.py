@@ -19,21 +19,24 @@ _PoleAndResidue = tuple[complex, complex]
 
 @dataclass(frozen=True, slots=True)
 class _ModalConstant:
-    """One real constant of a mode: functions that return its value, and that change it."""
+    """Kind of constant of a mode, such as its damping ratio.
+
+    `value` computes it from pole and residue. `change` returns both after an added change.
+    """
 
     value: Callable[[complex, complex], float]
     change: Callable[[complex, complex, float], _PoleAndResidue]
 
 
 def _damping_ratio(pole: complex) -> float:
-    """Return the damping ratio of a pole."""
+    """Return the damping ratio of a complex pole, negative for an unstable one."""
     return -pole.real / abs(pole)
 
 
-def _with_damping_ratio(pole: complex, ratio: float) -> complex:
+def _with_damping_ratio(pole: complex, damping_ratio: float) -> complex:
     """Return a pole of the same magnitude with another damping ratio."""
-    ratio = min(max(ratio, -1.0), 1.0)
-    return abs(pole) * complex(-ratio, math.sqrt(1 - ratio * ratio))
+    damping_ratio = min(max(damping_ratio, -1.0), 1.0)
+    return abs(pole) * complex(-damping_ratio, math.sqrt(1 - damping_ratio * damping_ratio))
 
 
 _MODAL_CONSTANTS: Final[Mapping[str, _ModalConstant]] = {
@@ -59,49 +62,53 @@ _BACKGROUND_NAME: Final = "background"
 """Beginning of the names of background coefficients, which end in the power of s."""
 
 
-def constant_value(modal: ModalModel, name: str) -> float | None:
+def constant_value(modal: ModalModel, constant_name: str) -> float | None:
     """Return the value of a constant of a modal model, or None if there is no such constant.
 
     Parameters
     ----------
     modal : ModalModel
         Fitted modal model.
-    name : str
+    constant_name : str
         Name of the constant, such as ``ln_frequency_1`` or ``background_0``.
     """
-    kind, number = _split_name(name)
-    if kind == _BACKGROUND_NAME and 0 <= number < len(modal.background):
-        return modal.background[number]
-    if kind in _MODAL_CONSTANTS and 1 <= number <= len(modal.poles_rad_s):
-        pole, residue = modal.poles_rad_s[number - 1], modal.residues[number - 1]
-        return _MODAL_CONSTANTS[kind].value(pole, residue)
+    name_prefix, name_number = _split_name(constant_name)
+    if name_prefix == _BACKGROUND_NAME and 0 <= name_number < len(modal.background):
+        return modal.background[name_number]
+    if name_prefix in _MODAL_CONSTANTS and 1 <= name_number <= len(modal.poles_rad_s):
+        pole, residue = modal.poles_rad_s[name_number - 1], modal.residues[name_number - 1]
+        return _MODAL_CONSTANTS[name_prefix].value(pole, residue)
     return None
 
 
-def with_changed_constants(modal: ModalModel, by: Mapping[str, float]) -> ModalModel:
+def with_changed_constants(modal: ModalModel, constant_changes: Mapping[str, float]) -> ModalModel:
     """Return a modal model with some of its constants changed.
 
     Parameters
     ----------
     modal : ModalModel
         Fitted modal model.
-    by : mapping of str to float
+    constant_changes : mapping of str to float
         Change of each constant, by name.
     """
-    modes = list(zip(modal.poles_rad_s, modal.residues, strict=True))
-    background = list(modal.background)
-    for name, amount in by.items():
-        kind, number = _split_name(name)
-        if kind == _BACKGROUND_NAME:
-            background[number] += amount
+    poles_and_residues = list(zip(modal.poles_rad_s, modal.residues, strict=True))
+    background_terms = list(modal.background)
+    for constant_name, added_amount in constant_changes.items():
+        name_prefix, name_number = _split_name(constant_name)
+        if name_prefix == _BACKGROUND_NAME:
+            background_terms[name_number] += added_amount
         else:
-            modes[number - 1] = _MODAL_CONSTANTS[kind].change(*modes[number - 1], amount)
+            poles_and_residues[name_number - 1] = _MODAL_CONSTANTS[name_prefix].change(
+                *poles_and_residues[name_number - 1], added_amount
+            )
     return ModalModel(
-        tuple(pole for pole, _ in modes), tuple(residue for _, residue in modes), tuple(background)
+        tuple(pole for pole, _ in poles_and_residues),
+        tuple(residue for _, residue in poles_and_residues),
+        tuple(background_terms),
     )
 
 
-def _split_name(name: str) -> tuple[str, int]:
-    """Split the name of a constant into its beginning and its number, -1 without a number."""
-    kind, _, number = name.rpartition("_")
-    return kind, int(number) if number.isdecimal() else -1
+def _split_name(constant_name: str) -> tuple[str, int]:
+    """Split a name such as "ln_frequency_2" into "ln_frequency" and 2, or -1 without number."""
+    name_prefix, _, number_text = constant_name.rpartition("_")
+    return name_prefix, int(number_text) if number_text.isdecimal() else -1

@@ -34,7 +34,7 @@ _MAX_INTEGRATORS: Final = 2
 def realise_response(
     fit: PoleFit, order: int | None, input_kind: InputKind
 ) -> tuple[PoleStructure, StateSpace]:
-    """Realise a response by a state space with a given number of states, or the fewest.
+    """Approximate a response by a state space with a given number of states, or the fewest.
 
     Parameters
     ----------
@@ -53,41 +53,45 @@ def realise_response(
     """
     dynamics = fit.dynamics
     if order is not None:
-        fixed_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
-        most_states = fixed_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
-        no_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
+        least_states = len(dynamics.real_poles) + sum(each for _, each in dynamics.filters)
+        most_states = least_states + 2 * len(dynamics.pairs) + _MAX_REAL_POLES
+        zero_real_poles = dict.fromkeys(range(len(dynamics.pairs) + 1), 0)
         realisation = _best_realisation(
-            fit, order - fixed_states, input_kind, no_real_poles, np.inf
+            fit, order - least_states, input_kind, zero_real_poles, np.inf
         )
         if realisation is not None:
             return realisation
         raise LinearModelError(
             f"A stable model with {order} states was not found: the model may have "
-            f"{fixed_states} to {most_states} states, 2 for each of the {dynamics.in_band} modes "
+            f"{least_states} to {most_states} states, 2 for each of the {dynamics.in_band} modes "
             "in its band; state another number, or --order auto."
         )
     least_real_poles = {
-        pairs: bisect_left(
-            range(_MAX_REAL_POLES + 1), True, key=partial(_real_poles_suffice, fit, pairs)
+        pair_count: bisect_left(
+            range(_MAX_REAL_POLES + 1), True, key=partial(_real_poles_suffice, fit, pair_count)
         )
-        for pairs in range(dynamics.in_band, len(dynamics.pairs) + 1)
+        for pair_count in range(dynamics.in_band, len(dynamics.pairs) + 1)
     }
     least_real_poles = {
-        pairs: real_poles
-        for pairs, real_poles in least_real_poles.items()
-        if real_poles <= _MAX_REAL_POLES
+        pair_count: real_pole_count
+        for pair_count, real_pole_count in least_real_poles.items()
+        if real_pole_count <= _MAX_REAL_POLES
     }
-    first_states = min(
-        (2 * pairs + real_poles for pairs, real_poles in least_real_poles.items()), default=0
+    smallest_state_count = min(
+        (
+            2 * pair_count + real_pole_count
+            for pair_count, real_pole_count in least_real_poles.items()
+        ),
+        default=0,
     )
-    last_states = (
-        max((2 * pairs for pairs in least_real_poles), default=-1)
+    largest_state_count = (
+        max((2 * pair_count for pair_count in least_real_poles), default=-1)
         + _MAX_REAL_POLES
         + _MAX_INTEGRATORS
     )
-    for states in range(first_states, last_states + 1):
+    for state_count in range(smallest_state_count, largest_state_count + 1):
         realisation = _best_realisation(
-            fit, states, input_kind, least_real_poles, MAX_RELATIVE_ERROR
+            fit, state_count, input_kind, least_real_poles, MAX_RELATIVE_ERROR
         )
         if realisation is not None:
             return realisation
@@ -98,66 +102,80 @@ def realise_response(
     )
 
 
-def _real_poles_suffice(fit: PoleFit, pairs: int, real_poles: int) -> bool:
-    """Return whether a number of real poles suffices for the accuracy, with both integrators."""
-    structures = _structures_with_real_poles(pairs, real_poles, _MAX_INTEGRATORS)
-    return any(fit.solve(structure)[1] <= MAX_RELATIVE_ERROR for structure in structures)
+def _real_poles_suffice(fit: PoleFit, pair_count: int, real_pole_count: int) -> bool:
+    """Return whether a number of real poles suffices for `MAX_RELATIVE_ERROR` of the response.
+
+    The fits have given numbers of conjugate pole pairs, and both integrators.
+    """
+    pole_structures = _structures_with_real_poles(pair_count, real_pole_count, _MAX_INTEGRATORS)
+    return any(
+        fit.solve(pole_structure)[1] <= MAX_RELATIVE_ERROR for pole_structure in pole_structures
+    )
 
 
 def _structures_with_states(
-    pairs: int, states: int, input_kind: InputKind
+    pair_count: int, state_count: int, input_kind: InputKind
 ) -> Iterator[PoleStructure]:
-    """Yield the structures with a number of pairs and a total number of states.
+    """Yield the pole structures with a number of conjugate pairs and a total number of states.
 
-    `states` does not count the states that all structures have.
+    `state_count` does not count the states that all structures have.
     """
     if input_kind == "angle":  # which has the velocity and the acceleration as inputs
-        yield from _structures_with_real_poles(pairs, states - 2 * pairs, _MAX_INTEGRATORS)
+        yield from _structures_with_real_poles(
+            pair_count, state_count - 2 * pair_count, _MAX_INTEGRATORS
+        )
         return
-    for integrators in range(_MAX_INTEGRATORS + 1):
-        yield from _structures_with_real_poles(pairs, states - 2 * pairs - integrators, integrators)
+    for integrator_count in range(_MAX_INTEGRATORS + 1):
+        yield from _structures_with_real_poles(
+            pair_count, state_count - 2 * pair_count - integrator_count, integrator_count
+        )
 
 
 def _structures_with_real_poles(
-    pairs: int, real_poles: int, integrators: int
+    pair_count: int, real_pole_count: int, integrator_count: int
 ) -> Iterator[PoleStructure]:
-    """Yield the structures with a number of pairs, of added real poles and of integrators."""
-    if not 0 <= real_poles <= _MAX_REAL_POLES:
+    """Yield the pole structures with numbers of conjugate pairs, real poles and integrators.
+
+    They differ in the range over which the added real poles are spread.
+    """
+    if not 0 <= real_pole_count <= _MAX_REAL_POLES:
         return
-    for first_pole, last_pole in _REAL_POLE_RANGES_RAD_S[: None if real_poles else 1]:
-        poles = (
-            np.geomspace(first_pole, last_pole, real_poles)
-            if real_poles > 1
-            else np.full(real_poles, (first_pole * last_pole) ** 0.5)
+    for first_rad_s, last_rad_s in _REAL_POLE_RANGES_RAD_S[: None if real_pole_count else 1]:
+        poles_rad_s = (
+            np.geomspace(first_rad_s, last_rad_s, real_pole_count)
+            if real_pole_count > 1
+            else np.full(real_pole_count, (first_rad_s * last_rad_s) ** 0.5)
         )
-        yield PoleStructure(pairs, tuple((-poles).tolist()), integrators)
+        yield PoleStructure(pair_count, tuple((-poles_rad_s).tolist()), integrator_count)
 
 
 def _best_realisation(
     fit: PoleFit,
-    states: int,
+    state_count: int,
     input_kind: InputKind,
     least_real_poles: Mapping[int, int],
-    tolerance: float,
+    error_tolerance: float,
 ) -> tuple[PoleStructure, StateSpace] | None:
-    """Return the most accurate stable realisation within a tolerance, or None if there is none.
+    """Return the most accurate stable state space within a tolerance, or None if there is none.
 
     `least_real_poles` gives the admissible numbers of pairs and, for each, the smallest number of
     real poles.
     """
     accurate_fits: list[tuple[float, int, PoleStructure, NDArray[np.float64]]] = []
-    for structure in (
-        each
-        for pairs, real_poles in least_real_poles.items()
-        for each in _structures_with_states(pairs, states, input_kind)
-        if len(each.added_real_poles_rad_s) >= real_poles
+    for pole_structure in (
+        accurate_fit
+        for pair_count, least_real_pole_count in least_real_poles.items()
+        for accurate_fit in _structures_with_states(pair_count, state_count, input_kind)
+        if len(accurate_fit.added_real_poles_rad_s) >= least_real_pole_count
     ):
-        coefficients, error = fit.solve(structure)
-        if error <= tolerance:
-            accurate_fits.append((error, len(accurate_fits), structure, coefficients))
-    for _, _, structure, coefficients in sorted(accurate_fits, key=lambda each: each[:2]):
-        system = fit.system(structure, coefficients, input_kind)
-        accurate = tolerance == np.inf or fit.error(system).max() <= tolerance
-        if accurate and fit.is_stable_on_motor(structure, coefficients):
-            return structure, system
+        fit_coefficients, fit_error = fit.solve(pole_structure)
+        if fit_error <= error_tolerance:
+            accurate_fits.append((fit_error, len(accurate_fits), pole_structure, fit_coefficients))
+    for _, _, pole_structure, fit_coefficients in sorted(
+        accurate_fits, key=lambda accurate_fit: accurate_fit[:2]
+    ):
+        state_space = fit.system(pole_structure, fit_coefficients, input_kind)
+        is_accurate = error_tolerance == np.inf or fit.error(state_space).max() <= error_tolerance
+        if is_accurate and fit.is_stable_on_motor(pole_structure, fit_coefficients):
+            return pole_structure, state_space
     return None

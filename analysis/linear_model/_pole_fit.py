@@ -79,7 +79,7 @@ _MAX_GROWTH_PER_S: Final = 1e-2
 
 @dataclass(frozen=True, slots=True)
 class PoleStructure:
-    """Numbers and real poles that define the states of a realisation, without its coefficients.
+    """Numbers and real poles that define the states of a state space, without coefficients.
 
     Attributes
     ----------
@@ -107,13 +107,13 @@ class PoleFit:
         Fit of almost the same dynamics, from whose zeros the search for zeros starts.
     """
 
-    def __init__(self, dynamics: Dynamics, near: PoleFit | None = None) -> None:
+    def __init__(self, dynamics: Dynamics, similar_fit: PoleFit | None = None) -> None:
         self.dynamics = dynamics
         low_hz, high_hz = dynamics.band_hz
-        start_zeros = self._response_minima() if near is None else near.zeros
+        start_zeros = self._response_minima() if similar_fit is None else similar_fit.zeros
         self.zeros: NDArray[np.complex128] = self._find_zeros(start_zeros)
         wide_band_hz = (low_hz / _BAND_MARGIN_FACTOR, high_hz * _BAND_MARGIN_FACTOR)
-        band = self._dense_frequencies(wide_band_hz, _FIT_POINTS)
+        frequencies_in_band_hz = self._dense_frequencies(wide_band_hz, _FIT_POINTS)
         tail_hz = np.concatenate(
             [
                 np.geomspace(low_hz / _TAIL_FACTORS[0], wide_band_hz[0], _TAIL_POINTS),
@@ -122,237 +122,272 @@ class PoleFit:
         )
         if dynamics.motor_inertia_kg_m2 is None:  # a modal model is meant for its band alone
             tail_hz = tail_hz[:0]
-        frequency_hz = np.concatenate([band, tail_hz])
+        frequency_hz = np.concatenate([frequencies_in_band_hz, tail_hz])
         is_usable = self._is_apart_from_poles_and_zeros(frequency_hz)
         self._s = imaginary_axis(frequency_hz[is_usable])
-        self._in_band = (np.arange(frequency_hz.size) < band.size)[is_usable]
-        weight = np.where(self._in_band, 1.0, _TAIL_WEIGHT)
+        self._in_band = (np.arange(frequency_hz.size) < frequencies_in_band_hz.size)[is_usable]
+        point_weight = np.where(self._in_band, 1.0, _TAIL_WEIGHT)
         per_acceleration = dynamics.response(self._s) / self._s**2
-        self._scale = weight / np.abs(per_acceleration)
+        self._scale = point_weight / np.abs(per_acceleration)
         self._target = (per_acceleration - dynamics.tool_inertia_kg_m2) * self._scale
-        self._pair_basis = [self._pair_basis_functions(pole) for pole in dynamics.pairs]
+        self._pair_basis = [self._pair_basis_functions(upper_pole) for upper_pole in dynamics.pairs]
 
     @cached_property
     def check_points_s(self) -> NDArray[np.complex128]:
-        """Return the points s in rad/s at which the error of a realisation is checked."""
-        frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINTS)
-        return imaginary_axis(frequency_hz[self._is_apart_from_poles_and_zeros(frequency_hz)])
+        """Return the points s in rad/s at which the error of a fitted state space is checked."""
+        check_frequency_hz = self._dense_frequencies(self.dynamics.band_hz, _CHECK_POINTS)
+        return imaginary_axis(
+            check_frequency_hz[self._is_apart_from_poles_and_zeros(check_frequency_hz)]
+        )
 
     @cached_property
     def exact(self) -> NDArray[np.complex128]:
         """Return the exact response at `check_points_s`, without delay, in N·m/rad."""
         return self.dynamics.filtered(self.check_points_s)
 
-    def real_poles(self, structure: PoleStructure) -> tuple[float, ...]:
-        """Return all real poles of a realisation, in rad/s.
+    def real_poles(self, pole_structure: PoleStructure) -> tuple[float, ...]:
+        """Return all real poles of a state space with a given structure, in rad/s.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
         """
-        return (*self.dynamics.real_poles, *structure.added_real_poles_rad_s)
+        return (*self.dynamics.real_poles, *pole_structure.added_real_poles_rad_s)
 
-    def solve(self, structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
+    def solve(self, pole_structure: PoleStructure) -> tuple[NDArray[np.float64], float]:
         """Fit the coefficients of a pole structure to the response.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
 
         Returns
         -------
-        coefficients : ndarray
+        fit_coefficients : ndarray
             Residues, then D, and V and K if the structure has these integrators.
         error : float
             Largest relative error in the band, at the points of the fit.
         """
-        real_poles = self.real_poles(structure)
-        direct_terms = 1 + structure.integrators
-        basis = np.concatenate(
+        real_poles = self.real_poles(pole_structure)
+        direct_term_count = 1 + pole_structure.integrators
+        basis_functions = np.concatenate(
             [
-                *self._pair_basis[: structure.pairs],
-                [1 / (self._s - pole) for pole in real_poles] or np.empty((0, self._s.size)),
-                [self._s**-power for power in range(direct_terms)],
+                *self._pair_basis[: pole_structure.pairs],
+                [1 / (self._s - real_pole) for real_pole in real_poles]
+                or np.empty((0, self._s.size)),
+                [self._s**-power_of_s for power_of_s in range(direct_term_count)],
             ]
         )
-        basis = basis * self._scale
-        bounded_count = direct_terms if self.dynamics.motor_inertia_kg_m2 is not None else 0
-        coefficients = _least_squares(basis, self._target, bounded_count)
-        residual = coefficients @ basis - self._target
-        return coefficients, float(np.abs(residual[self._in_band]).max())
+        basis_functions = basis_functions * self._scale
+        bounded_count = direct_term_count if self.dynamics.motor_inertia_kg_m2 is not None else 0
+        fit_coefficients = _least_squares(basis_functions, self._target, bounded_count)
+        weighted_residual = fit_coefficients @ basis_functions - self._target
+        return fit_coefficients, float(np.abs(weighted_residual[self._in_band]).max())
 
     def system(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
+        self,
+        pole_structure: PoleStructure,
+        fit_coefficients: NDArray[np.float64],
+        input_kind: InputKind,
     ) -> StateSpace:
         """Return the state space of a fit, with tool inertia, filters and delay.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
-        coefficients : ndarray
+        fit_coefficients : ndarray
             Coefficients that `solve` returned.
         input_kind : str
             Input: "acceleration", or "angle" for angle, velocity and acceleration.
         """
-        system = self._system_without_filters(structure, coefficients, input_kind)
-        for constant_s, order in self.dynamics.filters:
-            system = with_filter(system, constant_s, order)
-        return replace(system, delay_s=self.dynamics.delay_s)
+        state_space = self._system_without_filters(pole_structure, fit_coefficients, input_kind)
+        for time_constant_s, filter_order in self.dynamics.filters:
+            state_space = with_filter(state_space, time_constant_s, filter_order)
+        return replace(state_space, delay_s=self.dynamics.delay_s)
 
-    def error(self, system: StateSpace) -> NDArray[np.float64]:
+    def error(self, state_space: StateSpace) -> NDArray[np.float64]:
         """Return the relative error of a state space at each point of `check_points_s`.
 
         Parameters
         ----------
-        system : StateSpace
+        state_space : StateSpace
             Realisation of the response in continuous time.
         """
-        return np.abs(angle_response(system, self.check_points_s) / self.exact - 1)
+        return np.abs(angle_response(state_space, self.check_points_s) / self.exact - 1)
 
     def is_stable_on_motor(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64]
+        self, pole_structure: PoleStructure, fit_coefficients: NDArray[np.float64]
     ) -> bool:
         """Return whether a frictionless motor with the beam's inertia is stable with the model.
 
         Parameters
         ----------
-        structure : PoleStructure
+        pole_structure : PoleStructure
             States of the realisation.
-        coefficients : ndarray
+        fit_coefficients : ndarray
             Coefficients that `solve` returned.
         """
-        inertia = self.dynamics.motor_inertia_kg_m2
-        if inertia is None:
+        motor_inertia_kg_m2 = self.dynamics.motor_inertia_kg_m2
+        if motor_inertia_kg_m2 is None:
             return True
-        system = self._system_without_filters(structure, coefficients, "acceleration")
-        coupled = system.a - system.b @ system.c / (inertia + system.d.item())
-        return bool(np.linalg.eigvals(coupled).real.max(initial=0.0) <= _MAX_GROWTH_PER_S)
+        state_space = self._system_without_filters(pole_structure, fit_coefficients, "acceleration")
+        coupled_state_matrix = state_space.a - state_space.b @ state_space.c / (
+            motor_inertia_kg_m2 + state_space.d.item()
+        )
+        return bool(
+            np.linalg.eigvals(coupled_state_matrix).real.max(initial=0.0) <= _MAX_GROWTH_PER_S
+        )
 
     def _system_without_filters(
-        self, structure: PoleStructure, coefficients: NDArray[np.float64], input_kind: InputKind
+        self,
+        pole_structure: PoleStructure,
+        fit_coefficients: NDArray[np.float64],
+        input_kind: InputKind,
     ) -> StateSpace:
         """Return the state space of a fit with tool inertia, without filters and delay."""
-        upper_poles, real_poles = self.dynamics.pairs[: structure.pairs], self.real_poles(structure)
-        poles = 2 * upper_poles.size + len(real_poles)
-        a = np.zeros((poles, poles))
+        upper_poles, real_poles = (
+            self.dynamics.pairs[: pole_structure.pairs],
+            self.real_poles(pole_structure),
+        )
+        pole_count = 2 * upper_poles.size + len(real_poles)
+        a = np.zeros((pole_count, pole_count))
         pair_rows = np.arange(0, 2 * upper_poles.size, 2)
         a[pair_rows, pair_rows] = a[pair_rows + 1, pair_rows + 1] = upper_poles.real
         a[pair_rows, pair_rows + 1] = upper_poles.imag
         a[pair_rows + 1, pair_rows] = -upper_poles.imag
-        real_rows = np.arange(2 * upper_poles.size, poles)
+        real_rows = np.arange(2 * upper_poles.size, pole_count)
         a[real_rows, real_rows] = real_poles
-        b = np.ones((poles, 1))
+        b = np.ones((pole_count, 1))
         b[pair_rows + 1] = 0.0
-        c = coefficients[None, :poles]
-        inertia, viscosity, stiffness = np.append(coefficients[poles:], np.zeros(2))[:3].tolist()
-        inertia += self.dynamics.tool_inertia_kg_m2
-        names = [
-            f"{name}_{suffix}"
-            for name in self.dynamics.names[: upper_poles.size]
-            for suffix in "ab"
+        c = fit_coefficients[None, :pole_count]
+        inertia_coefficient, viscosity_coefficient, stiffness_coefficient = np.append(
+            fit_coefficients[pole_count:], np.zeros(2)
+        )[:3].tolist()
+        inertia_coefficient += self.dynamics.tool_inertia_kg_m2
+        state_names = [
+            f"{mode_name}_{state_suffix}"
+            for mode_name in self.dynamics.names[: upper_poles.size]
+            for state_suffix in "ab"
         ]
-        names += [f"relaxation_{number}" for number in range(1, len(real_poles) + 1)]
+        state_names += [
+            f"relaxation_{pole_number}" for pole_number in range(1, len(real_poles) + 1)
+        ]
         if input_kind == "angle":
             # s² / (s - p) = s + p + p² / (s - p)
-            stiffness += (c @ a @ b).item()
-            viscosity += (c @ b).item()
+            stiffness_coefficient += (c @ a @ b).item()
+            viscosity_coefficient += (c @ b).item()
             return StateSpace(
                 a,
                 np.pad(b, ((0, 0), (0, 2))),
                 c @ a @ a,
-                np.array([[stiffness, viscosity, inertia]]),
+                np.array([[stiffness_coefficient, viscosity_coefficient, inertia_coefficient]]),
                 _INPUT_SIGNALS,
                 _OUTPUT_SIGNAL,
-                SignalNames(tuple(names), ("rad.s",) * poles),
+                SignalNames(tuple(state_names), ("rad.s",) * pole_count),
             )
         # Velocity v and angle q are integrals of the input u: v' = u, q' = v.
-        k = structure.integrators
+        k = pole_structure.integrators
         a = np.pad(a, (0, k))
         if k == 2:
-            a[poles + 1, poles] = 1.0
+            a[pole_count + 1, pole_count] = 1.0
         b = np.append(b, np.eye(k, 1), axis=0)
         return StateSpace(
             a,
             b,
-            np.append(c, np.array([[viscosity, stiffness]])[:, :k], axis=1),
-            np.array([[inertia]]),
+            np.append(c, np.array([[viscosity_coefficient, stiffness_coefficient]])[:, :k], axis=1),
+            np.array([[inertia_coefficient]]),
             SignalNames(_INPUT_SIGNALS.names[2:], _INPUT_SIGNALS.units[2:]),
             _OUTPUT_SIGNAL,
             SignalNames(
-                (*names, *("motor_velocity", "motor_angle")[:k]),
-                (*("rad/s",) * poles, *("rad/s", "rad")[:k]),
+                (*state_names, *("motor_velocity", "motor_angle")[:k]),
+                (*("rad/s",) * pole_count, *("rad/s", "rad")[:k]),
             ),
         )
 
-    def _pair_basis_functions(self, pole: complex) -> NDArray[np.complex128]:
-        """Return both basis functions of a conjugate pair at the fit points, shape (2, points)."""
-        shifted = self._s - pole.real
-        return np.array([shifted, np.full_like(shifted, -pole.imag)]) / (
-            shifted * shifted + pole.imag**2
+    def _pair_basis_functions(self, upper_pole: complex) -> NDArray[np.complex128]:
+        """Return the responses of the two states of a conjugate pole pair, shape (2, points).
+
+        They are the basis functions of the fit.
+        """
+        shifted_s = self._s - upper_pole.real
+        return np.array([shifted_s, np.full_like(shifted_s, -upper_pole.imag)]) / (
+            shifted_s * shifted_s + upper_pole.imag**2
         )
 
     # Points
 
     def _poles_and_zeros(self) -> NDArray[np.complex128]:
-        """Return the poles and zeros of the response, in rad/s."""
+        """Return the complex poles and zeros of the response to be fitted, in rad/s."""
         return np.concatenate([self.dynamics.pairs, self.zeros])
 
-    def _dense_frequencies(self, band_hz: tuple[float, float], points: tuple[int, int]) -> Real:
+    def _dense_frequencies(
+        self, band_hz: tuple[float, float], point_counts: tuple[int, int]
+    ) -> Real:
         """Return frequencies of a band in hertz.
 
         They are dense within three half widths of poles and zeros.
         """
-        poles_and_zeros = self._poles_and_zeros()
-        half_width = np.maximum(np.abs(poles_and_zeros.real), 1e-4 * np.abs(poles_and_zeros))
-        offsets = np.linspace(-3, 3, points[1])
-        near_hz = (poles_and_zeros.imag[:, None] + half_width[:, None] * offsets).ravel() / (
-            2 * np.pi
+        poles_and_zeros_rad_s = self._poles_and_zeros()
+        half_width_rad_s = np.maximum(
+            np.abs(poles_and_zeros_rad_s.real), 1e-4 * np.abs(poles_and_zeros_rad_s)
         )
-        frequencies_hz = np.concatenate([np.geomspace(*band_hz, points[0]), near_hz])
+        relative_offsets = np.linspace(-3, 3, point_counts[1])
+        near_hz = (
+            poles_and_zeros_rad_s.imag[:, None] + half_width_rad_s[:, None] * relative_offsets
+        ).ravel() / (2 * np.pi)
+        frequencies_hz = np.concatenate([np.geomspace(*band_hz, point_counts[0]), near_hz])
         return np.sort(
             frequencies_hz[(frequencies_hz >= band_hz[0]) & (frequencies_hz <= band_hz[1])]
         )
 
     def _is_apart_from_poles_and_zeros(self, frequency_hz: Real) -> NDArray[np.bool_]:
-        """Return which frequencies are far enough from poles and zeros for a relative error."""
-        omega = 2 * np.pi * frequency_hz
-        distance = np.abs(1j * omega[:, None] - self._poles_and_zeros()).min(axis=1, initial=np.inf)
-        is_apart: NDArray[np.bool_] = distance > _MIN_RELATIVE_DISTANCE * omega
+        """Return which frequencies are far enough from poles and zeros to compare the response.
+
+        At a zero the relative error has no meaning.
+        """
+        omega_rad_s = 2 * np.pi * frequency_hz
+        distance_rad_s = np.abs(1j * omega_rad_s[:, None] - self._poles_and_zeros()).min(
+            axis=1, initial=np.inf
+        )
+        is_apart: NDArray[np.bool_] = distance_rad_s > _MIN_RELATIVE_DISTANCE * omega_rad_s
         return is_apart
 
     def _response_minima(self) -> NDArray[np.complex128]:
         """Return the points s = j omega of local minima of the response per acceleration."""
         low_hz, high_hz = self.dynamics.band_hz
         s = imaginary_axis(np.geomspace(low_hz / 2, high_hz * 2, _SCAN_POINTS))
-        magnitude = np.abs(self.dynamics.response(s) / s**2)
+        response_magnitude = np.abs(self.dynamics.response(s) / s**2)
         minimum_indices = (
-            np.flatnonzero((magnitude[1:-1] < magnitude[:-2]) & (magnitude[1:-1] < magnitude[2:]))
+            np.flatnonzero(
+                (response_magnitude[1:-1] < response_magnitude[:-2])
+                & (response_magnitude[1:-1] < response_magnitude[2:])
+            )
             + 1
         )
         return s[minimum_indices]
 
-    def _find_zeros(self, starts: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    def _find_zeros(self, start_points: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the zeros of the response that Newton's method finds near the start points."""
-        s, response = starts.copy(), self.dynamics.response
+        s, response_of = start_points.copy(), self.dynamics.response
         if not s.size:
             return s
         for _ in range(_MAX_NEWTON_ITERATIONS):
-            step = 1e-6 * np.abs(s)
-            response_above, response_below = response(np.concatenate([s + step, s - step])).reshape(
-                2, -1
-            )
-            change = (
-                step
+            newton_step = 1e-6 * np.abs(s)
+            response_above, response_below = response_of(
+                np.concatenate([s + newton_step, s - newton_step])
+            ).reshape(2, -1)
+            relative_change = (
+                newton_step
                 * (response_above + response_below)
                 / np.where(response_above == response_below, 1.0, response_above - response_below)
             )
-            s = s - change
-            has_left = np.abs(s / starts - 1) > _MAX_RELATIVE_ZERO_CHANGE
-            s[has_left] = starts[has_left]
-            if (np.abs(change)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
+            s = s - relative_change
+            has_left = np.abs(s / start_points - 1) > _MAX_RELATIVE_ZERO_CHANGE
+            s[has_left] = start_points[has_left]
+            if (np.abs(relative_change)[~has_left] < 1e-9 * np.abs(s)[~has_left]).all():
                 break
         return s
 
@@ -368,39 +403,43 @@ def imaginary_axis(frequency_hz: Real) -> NDArray[np.complex128]:
     return np.asarray(2j * np.pi * frequency_hz, dtype=np.complex128)
 
 
-def angle_response(system: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
+def angle_response(state_space: StateSpace, s: NDArray[np.complex128]) -> NDArray[np.complex128]:
     """Return the response of a state space to the motor angle, without its delay, in N·m/rad.
 
     Parameters
     ----------
-    system : StateSpace
+    state_space : StateSpace
         System in continuous time, whose inputs are the acceleration, or angle, velocity and
         acceleration.
     s : ndarray of complex
         Points in rad/s.
     """
-    motion = np.array([np.ones_like(s), s, s * s])[-system.d.shape[1] :]
-    response: NDArray[np.complex128] = np.einsum("km,mk->k", system.response(s)[:, 0], motion)
-    return response
+    motion_per_angle = np.array([np.ones_like(s), s, s * s])[-state_space.d.shape[1] :]
+    torque_response: NDArray[np.complex128] = np.einsum(
+        "km,mk->k", state_space.response(s)[:, 0], motion_per_angle
+    )
+    return torque_response
 
 
 def _least_squares(
-    columns: NDArray[np.complex128], target: NDArray[np.complex128], bounded_count: int
+    basis_functions: NDArray[np.complex128],
+    target_response: NDArray[np.complex128],
+    bounded_count: int,
 ) -> NDArray[np.float64]:
     """Return the real coefficients of a least-squares fit. The last ones are not negative."""
-    matrix = np.concatenate([columns.real, columns.imag], axis=1).T
-    target_parts = np.concatenate([target.real, target.imag])
-    scale = np.linalg.norm(matrix, axis=0)
-    matrix = matrix / scale
-    used_columns = np.arange(scale.size)
-    first_bounded = scale.size - bounded_count
+    real_matrix = np.concatenate([basis_functions.real, basis_functions.imag], axis=1).T
+    real_target = np.concatenate([target_response.real, target_response.imag])
+    column_norms = np.linalg.norm(real_matrix, axis=0)
+    real_matrix = real_matrix / column_norms
+    used_columns = np.arange(column_norms.size)
+    first_bounded_index = column_norms.size - bounded_count
     while True:
-        solution = np.zeros(scale.size)
-        solution[used_columns] = np.linalg.lstsq(
-            matrix[:, used_columns], target_parts, rcond=_SINGULAR_VALUE_LIMIT
+        scaled_solution = np.zeros(column_norms.size)
+        scaled_solution[used_columns] = np.linalg.lstsq(
+            real_matrix[:, used_columns], real_target, rcond=_SINGULAR_VALUE_LIMIT
         )[0]
-        bounded_values = solution[first_bounded:]
+        bounded_values = scaled_solution[first_bounded_index:]
         if not (bounded_values < 0).any():
-            coefficients: NDArray[np.float64] = solution / scale
+            coefficients: NDArray[np.float64] = scaled_solution / column_norms
             return coefficients
-        used_columns = used_columns[used_columns != first_bounded + np.argmin(bounded_values)]
+        used_columns = used_columns[used_columns != first_bounded_index + np.argmin(bounded_values)]

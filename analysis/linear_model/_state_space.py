@@ -30,7 +30,7 @@ class SignalNames:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class StateSpace:
-    """Matrices of a linear system, and the delay of its outputs.
+    """Linear system in state space: its matrices, signal names and delay of the output.
 
     Attributes
     ----------
@@ -68,12 +68,16 @@ class StateSpace:
         s : ndarray of complex
             Points in rad/s, none of them a pole.
         """
-        response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
+        frequency_response = np.empty((s.size, *self.d.shape), dtype=np.complex128)
         for first_point in range(0, s.size, _POINTS_PER_BLOCK):
-            block = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
-            resolvent = np.linalg.solve(block * np.eye(self.order) - self.a, self.b[None] + 0j)
-            response[first_point : first_point + _POINTS_PER_BLOCK] = self.c @ resolvent + self.d
-        return response
+            point_range = s[first_point : first_point + _POINTS_PER_BLOCK, None, None]
+            resolvent = np.linalg.solve(
+                point_range * np.eye(self.order) - self.a, self.b[None] + 0j
+            )
+            frequency_response[first_point : first_point + _POINTS_PER_BLOCK] = (
+                self.c @ resolvent + self.d
+            )
+        return frequency_response
 
     def sampled(self, rate_hz: float) -> StateSpace:
         """Convert the system to a sampling rate, exactly for inputs held between the samples.
@@ -91,45 +95,54 @@ class StateSpace:
         return replace(self, a=a, b=b, c=c, d=d, period_s=float(period_s))
 
 
-def with_filter(system: StateSpace, time_constant_s: float, order: int) -> StateSpace:
+def with_filter(state_space: StateSpace, time_constant_s: float, order: int) -> StateSpace:
     """Return the system with a low-pass filter (order 1, or Butterworth of order 2) at its output.
 
     Parameters
     ----------
-    system : StateSpace
+    state_space : StateSpace
         System in continuous time with one output.
     time_constant_s : float
         Reciprocal of the corner frequency, in s/rad.
     order : int
         Order of the filter: 1 or 2.
     """
-    n, m = system.b.shape
-    omega = 1.0 / time_constant_s
+    n, m = state_space.b.shape
+    cutoff_rad_s = 1.0 / time_constant_s
     a = np.zeros((n + order, n + order))
     b = np.zeros((n + order, m))
-    a[:n, :n], b[:n] = system.a, system.b
+    a[:n, :n], b[:n] = state_space.a, state_space.b
     first_state, last_state = n, n + order - 1
     # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-    a[last_state, :n], b[last_state] = omega * system.c[0], omega * system.d[0]
-    a[last_state, first_state] = -omega
+    a[last_state, :n], b[last_state] = (
+        cutoff_rad_s * state_space.c[0],
+        cutoff_rad_s * state_space.d[0],
+    )
+    a[last_state, first_state] = -cutoff_rad_s
     if order == 2:
-        a[first_state, last_state] = omega
-        a[last_state, last_state] = -np.sqrt(2) * omega
-    unit = system.outputs.units[0]
-    names = ("filter_output", "filter_slope")[:order]
+        a[first_state, last_state] = cutoff_rad_s
+        a[last_state, last_state] = -np.sqrt(2) * cutoff_rad_s
+    output_unit = state_space.outputs.units[0]
+    state_names = ("filter_output", "filter_slope")[:order]
     return replace(
-        system,
+        state_space,
         a=a,
         b=b,
         c=np.eye(1, n + order, n),
-        d=np.zeros_like(system.d),
-        states=concatenate_names((system.states, SignalNames(names, (unit,) * order))),
+        d=np.zeros_like(state_space.d),
+        states=concatenate_names(
+            (state_space.states, SignalNames(state_names, (output_unit,) * order))
+        ),
     )
 
 
-def concatenate_names(vectors: Sequence[SignalNames]) -> SignalNames:
+def concatenate_names(signal_vectors: Sequence[SignalNames]) -> SignalNames:
     """Return the names and units of several vectors one after the other."""
     return SignalNames(
-        tuple(name for each in vectors for name in each.names),
-        tuple(unit for each in vectors for unit in each.units),
+        tuple(
+            signal_name for signal_vector in signal_vectors for signal_name in signal_vector.names
+        ),
+        tuple(
+            signal_unit for signal_vector in signal_vectors for signal_unit in signal_vector.units
+        ),
     )

@@ -42,7 +42,12 @@ def test_a_finding_on_a_flagged_parameter_is_no_fact():
         for kind, name in (("delay", "delay_s"), ("tool inertia", "tool_inertia_kg_m2"))
     )
     first, second = _mark_doubtful_findings(
-        (late, tool), (), None, None, {"delay_s": "type VII fits as well"}, explained=True
+        (late, tool),
+        (),
+        None,
+        None,
+        {"delay_s": "type VII fits as well"},
+        only_harmonics_remain=True,
     )
     assert first.sentence == "Not established, because type VII fits as well: it is there."
     assert (first.interval, second) == (None, tool)

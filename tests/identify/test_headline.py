@@ -41,7 +41,9 @@ def test_the_first_flag_stays():
 @pytest.mark.fit
 @pytest.mark.parametrize(("doubt", "status"), [(None, "fractional"), ("it rains", "open")])
 def test_a_doubt_leaves_an_order_open(candidates, doubt, status):
-    found = order_verdict(candidates(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt=doubt)
+    found = order_verdict(
+        candidates(Fitted("VI", 0.0, -71.0)), ALPHA, (1, 2, 3), doubt_reason=doubt
+    )
     assert (found.status, found.reason) == (status, doubt)
 
 

@@ -38,7 +38,7 @@ def test_two_values_that_explain_a_record_equally_are_both_named(without_delay):
         "lambda", "VII", (0.5, 0.657, 0.9, 1.235, 1.4), (9.0, 0.0, 8.0, 0.8, 9.0), 0.657,
         (0.657, 1.235), (0.58, 1.3), False, False, 0.0,
     )  # fmt: skip
-    verdict = order_verdict(without_delay, found, (1,), doubt=None)
+    verdict = order_verdict(without_delay, found, (1,), doubt_reason=None)
     assert (verdict.status, verdict.value, verdict.interval) == ("not identifiable", None, None)
     said = order_sentence(verdict)
     assert "0.657 and 1.235 fit the record equally well" in said
