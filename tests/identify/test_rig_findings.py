@@ -200,7 +200,7 @@ def test_a_drifting_zero_is_no_hum():
     assert verdict.adequate
 
 
-def temporal_change_findings(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
+def changing_record(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, back=False):
     """Chirp, of a beam that changes by so much from beginning to end: its modes step by step."""
     dt, modes = 1 / (finer * RATE_HZ), 6
     t = np.arange(round(seconds / dt)) * dt
@@ -262,7 +262,7 @@ def temporal_change_findings(stiffness=0.0, damping=0.0, seconds=20.0, finer=8, 
 
 
 def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candidates_of):
-    uniform = candidates_of(temporal_change_findings(damping=0.2))
+    uniform = candidates_of(changing_record(damping=0.2))
     with_change, (change,) = find_temporal_changes(uniform)
     assert change.what == "damping"
     saved = uniform.bic - with_change.bic
@@ -284,7 +284,7 @@ def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candid
 )
 def test_what_drifts_in_one_sweep_is_no_fact(what, change):
     """Time and frequency vary together there."""
-    selection = select(temporal_change_findings(**{what: change}))
+    selection = select(changing_record(**{what: change}))
     found = selection.verdict.findings
     assert all(each.interval is None for each in found)
     assert bool(found) == bool(change)
@@ -295,7 +295,7 @@ def test_what_drifts_in_one_sweep_is_no_fact(what, change):
 )
 def test_what_drifts_while_the_motor_sweeps_there_and_back_is_named(what, change):
     """A mode rings for seconds: it does not follow at once what its frequency and decay become."""
-    selection = select(temporal_change_findings(**{what: change}, seconds=40.0, back=True))
+    selection = select(changing_record(**{what: change}, seconds=40.0, back=True))
     verdict, numbers = selection.verdict, selection.headline.parameters
     found = {finding.kind: finding for finding in verdict.findings}
     assert found.keys() == ({f"drifting {what}"} if change else set())
