@@ -76,9 +76,9 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
-        fault = _reset_reported_fault(sdo, name, patience_s) if _in_fault(sdo) else None
-        _confirm_ready(sdo, name, patience_s, fault, f"rigd reset --profile {rig.name}")
-    return fault
+        fault_text = _reset_reported_fault(sdo, name, patience_s) if _in_fault(sdo) else None
+        _confirm_ready(sdo, name, patience_s, fault_text, f"rigd reset --profile {rig.name}")
+    return fault_text
 
 
 def command_off(sdo: SdoAccess) -> None:
@@ -101,18 +101,18 @@ def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     end_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
     wait_for(lambda: _read_state(sdo) in end_states, settings.enable_timeout_s)
     statusword = sdo.read(objects.STATUSWORD)
-    state = drive_state(statusword)
-    if state is DriveState.SWITCH_ON_DISABLED:
+    present_state = drive_state(statusword)
+    if present_state is DriveState.SWITCH_ON_DISABLED:
         return
     if statusword & FAULT_BIT:
         raise DeviceError(
             f"{name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd reset "
             f"--profile {rig.name}"
         )
-    remedy = "switch it off and on" if state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
+    remedy = "switch it off and on" if present_state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
     raise DeviceError(
         f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
-        f'"{state.value}" (statusword 0x{statusword:04X}); {remedy}.'
+        f'"{present_state.value}" (statusword 0x{statusword:04X}); {remedy}.'
     )
 
 
@@ -125,17 +125,19 @@ def describe_remaining_torque(sdo: SdoAccess) -> str:
         statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
         return ""
-    state = drive_state(statusword)
-    if state in TORQUE_FREE_STATES:
+    present_state = drive_state(statusword)
+    if present_state in TORQUE_FREE_STATES:
         return ""
-    return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
+    return (
+        f' It is in "{present_state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
+    )
 
 
 def wait_for(condition: Callable[[], bool], patience_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
-    deadline = time.monotonic() + patience_s
+    deadline_s = time.monotonic() + patience_s
     while not condition():
-        if time.monotonic() > deadline:
+        if time.monotonic() > deadline_s:
             return condition()
         time.sleep(_STATE_POLL_S)
     return True
@@ -174,9 +176,10 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
-            cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            failure_cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
             raise DeviceError(
-                f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
+                f"{failure_cause} It has not shown that it is off: keep clear of the beam, and "
+                "press the "
                 "wired stop (STO) if anything moves."
             ) from None
         if drive_state(statusword) in TORQUE_FREE_STATES:
@@ -191,7 +194,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
 
 def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
     """Reset the drive's fault and return its description; raise if the fault persists."""
-    fault = _describe_fault(sdo)
+    fault_text = _describe_fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
         sdo.write(objects.CONTROLWORD, 0, controlword)
     is_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
@@ -201,11 +204,11 @@ def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
             f"{name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
             f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
         )
-    return fault
+    return fault_text
 
 
 def _confirm_ready(
-    sdo: SdoAccess, name: str, patience_s: float, fault: str | None, command: str
+    sdo: SdoAccess, name: str, patience_s: float, fault_text: str | None, command: str
 ) -> None:
     """Check that the drive can get ready to switch on (without torque), and disable it again.
 
@@ -222,7 +225,7 @@ def _confirm_ready(
     is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     if is_ready and is_disabled:
         return
-    progress_text = f"its fault is reset ({fault})" if fault else "it is not in fault"
+    progress_text = f"its fault is reset ({fault_text})" if fault_text else "it is not in fault"
     state = drive_state(statusword)
     if is_ready:
         raise DeviceError(
@@ -256,8 +259,8 @@ def _read_state(sdo: SdoAccess) -> DriveState:
 def _describe_fault(sdo: SdoAccess) -> str:
     """Return a description of the cause of the drive's fault."""
     try:
-        code = sdo.read(objects.ERROR_CODE)
+        error_code = sdo.read(objects.ERROR_CODE)
     except SdoRefusal:
-        code = 0
-    code = code or sdo.last_emergency()
-    return describe_error(code) if code else "the drive names no cause"
+        error_code = 0
+    error_code = error_code or sdo.last_emergency()
+    return describe_error(error_code) if error_code else "the drive names no cause"
