@@ -180,7 +180,10 @@ class _SuitabilityCheck:
         if not supported_rates or profile_rate in supported_rates:
             yield SuitabilityFinding("bit rates", found, wanted_text, Grade.FITS)
             return
-        sentence = f"The drive has no bit rate of {wanted_text} (can.bitrate_bit_s); choose one of {found}."
+        sentence = (
+            f"The drive has no bit rate of {wanted_text} (can.bitrate_bit_s); "
+            f"choose one of {found}."
+        )
         yield SuitabilityFinding("bit rates", found, wanted_text, Grade.REFUSED, sentence)
 
     def _torque_mode_finding(self) -> SuitabilityFinding:
