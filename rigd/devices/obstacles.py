@@ -228,8 +228,7 @@ def check_obstacles(
             if effect_value:
                 raise ObstacleError(
                     f"simulation.{effect_name} and an obstacle cannot be simulated together; leave "
-                    "one of "
-                    "them out."
+                    "one of them out."
                 )
 
 

@@ -470,7 +470,10 @@ class SimulatedPlant:
             self.sensed_shear_n = self._sensed_shears[0]
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
-        """Set by how much a jump of the motor's torque at a tick changes the outputs, halved."""
+        """Set the gains from a jump of the motor's torque at a tick to the outputs at this tick.
+
+        The gains contain the factor 0.5, since half of the jump counts at the tick.
+        """
         self._torque_jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
         self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
         self._sensed_torque_jump_gain = self._torque_jump_gain if self._jump_is_sensed else 0.0

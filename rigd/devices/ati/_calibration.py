@@ -120,17 +120,15 @@ class Calibration:
                 if not isfinite(matrix_entry):
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
-                        f"{matrix_entry}, "
-                        "which is not a number. Choose another calibration."
+                        f"{matrix_entry}, which is not a number. Choose another calibration."
                     )
                 if abs(matrix_entry) * full_scale_unit > _LARGEST_ENTRY:
                     raise ValueError(
                         f"the entry {axis}, gauge {gauge} of its calibration matrix is "
-                        f"{matrix_entry:.4g} "
-                        f"({abs(matrix_entry) * full_scale_unit:.2g} {unit_name} for a gauge at "
-                        "full scale), "
-                        f"more than any sensor has ({_LARGEST_ENTRY:g} {unit_name}): its memory is "
-                        "damaged. Choose another calibration, or have the sensor repaired."
+                        f"{matrix_entry:.4g} ({abs(matrix_entry) * full_scale_unit:.2g} "
+                        f"{unit_name} for a gauge at full scale), more than any sensor has "
+                        f"({_LARGEST_ENTRY:g} {unit_name}): its memory is damaged. Choose another "
+                        "calibration, or have the sensor repaired."
                     )
             if not any(row):
                 raise ValueError(
@@ -141,9 +139,8 @@ class Calibration:
                 raise ValueError(
                     f"no entry of the row {axis} of its calibration matrix is beyond "
                     f"{max(map(abs, row)):.2g} (less than {_SMALLEST_ENTRY:g} {unit_name} for a "
-                    "gauge "
-                    "at full scale): its memory is damaged. Choose another calibration, or have "
-                    "the sensor repaired."
+                    "gauge at full scale): its memory is damaged. Choose another calibration, or "
+                    "have the sensor repaired."
                 )
         scaled_matrix = np.array(self.matrix)
         scaled_matrix /= np.abs(scaled_matrix).max(axis=1, keepdims=True)

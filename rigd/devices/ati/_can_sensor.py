@@ -396,10 +396,8 @@ class AtiCanSensor:
             if len(reply_data) != REPLY_LENGTHS[reply_opcode]:
                 raise DeviceError(
                     f"{self._name}: asked for {requested_item}, it sent {len(reply_data)} bytes "
-                    "instead "
-                    f"of {REPLY_LENGTHS[reply_opcode]}. Check that the box is a NETCANOEM and that "
-                    "no "
-                    "other device uses its identifiers."
+                    f"instead of {REPLY_LENGTHS[reply_opcode]}. Check that the box is a NETCANOEM "
+                    "and that no other device uses its identifiers."
                 )
         return b"".join(reply_frames)
 
@@ -420,8 +418,8 @@ class AtiCanSensor:
         if not same_serial_number(profile_number, reported_number):
             raise DeviceError(
                 f"{self._name}: its serial number is {reported_number or 'empty'}, where the "
-                "profile asks "
-                f"for {profile_number} (ati_can.serial_number). Check which sensor is on the rig."
+                f"profile asks for {profile_number} (ati_can.serial_number). Check which sensor is "
+                "on the rig."
             )
         return reported_number
 
@@ -440,8 +438,7 @@ class AtiCanSensor:
         if selected_index != calibration_index:
             raise DeviceError(
                 f"{self._name}: asked for calibration {calibration_index}, it selected "
-                f"{selected_index}. Choose "
-                "one that it has (ati_can.calibration)."
+                f"{selected_index}. Choose one that it has (ati_can.calibration)."
             )
         # The status shows whether the selected calibration is valid.
         status_word = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]

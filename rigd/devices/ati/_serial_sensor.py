@@ -286,8 +286,7 @@ class AtiSerialSensor:
         late_ms = 1e3 * missing_records / self._settings.stream_hz
         return (
             f"{self._name}: records that did not arrive since it was connected: {missing_records}; "
-            "or the "
-            f"wrench is late by {late_ms:.2g} ms."
+            f"or the wrench is late by {late_ms:.2g} ms."
         )
 
     def _describe_cause(self) -> str:

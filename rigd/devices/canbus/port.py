@@ -386,8 +386,7 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
     except Exception as error:
         raise DeviceError(
             f"CAN bus {bus_name}: it cannot be opened ({_error_text(error)}); check can.interface "
-            "and "
-            "can.channel."
+            "and can.channel."
         ) from None
     return PythonCanPort(bus, bus_name)
 
@@ -397,8 +396,7 @@ def _open_socketcan(settings: CanBus) -> socket.socket:
     interface_name = settings.channel
     remedy = (
         f"bring it up with: ip link set {interface_name} up type can bitrate "
-        f"{settings.bitrate_bit_s}; "
-        "or start the simulated rig: rigd simulate --profile PROFILE"
+        f"{settings.bitrate_bit_s}; or start the simulated rig: rigd simulate --profile PROFILE"
     )
     if not hasattr(socket, "AF_CAN"):
         raise DeviceError(f"CAN bus {interface_name}: this system has no CAN sockets; {remedy}.")

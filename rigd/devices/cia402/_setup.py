@@ -202,8 +202,8 @@ def _check_identity(
             reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
                 f"{name}: it is another drive: {value_source} is 0x{required_number:08X}, it says "
-                f"{reported_text}. "
-                "Check cia402.node_id, or write into the profile what is really there."
+                f"{reported_text}. Check cia402.node_id, or write into the profile what is really "
+                "there."
             )
     mode_bits = identity["supported_modes"]
     if not (isinstance(mode_bits, int) and mode_bits & objects.SUPPORTS_CYCLIC_TORQUE):
@@ -322,15 +322,15 @@ class _DriveConfiguration:
         if abs(reported_nm - profile_nm) > _RATED_TORQUE_TOLERANCE * profile_nm:
             raise DeviceError(
                 f"{self._name}: its rated torque (object 6076 = {torque_counts}) is "
-                f"{reported_nm:.4g} N·m "
-                f"at the output shaft, motor.rated_torque_nm says {profile_nm:.4g} N·m; every "
-                "torque would be wrong by that ratio. Correct the profile or the drive."
+                f"{reported_nm:.4g} N·m at the output shaft, motor.rated_torque_nm says "
+                f"{profile_nm:.4g} N·m; every torque would be wrong by that ratio. Correct the "
+                "profile or the drive."
             )
 
     def check_gear_and_encoder(self, identity: dict[str, object], rig: RigParameters) -> None:
         """Raise if the drive's gear ratio or encoder step differs from the profile's by over 2 %.
 
-        Only values that the drive states are compared. Both are added to `identity`.
+        Only values that the drive states are compared. Both values are added to `identity`.
 
         Raises
         ------
@@ -345,9 +345,8 @@ class _DriveConfiguration:
         if drive_gear is not None and not _is_ratio_equal(drive_gear, profile_gear):
             raise DeviceError(
                 f"{self._name}: its gear (object 6091) is {drive_gear:.5g} turns of the motor in "
-                "one of "
-                f"the output shaft, cia402.gear_ratio says {profile_gear:.5g}. Correct the profile "
-                "or the drive."
+                f"one of the output shaft, cia402.gear_ratio says {profile_gear:.5g}. Correct the "
+                "profile or the drive."
             )
         # Position units per revolution of the output shaft: encoder increments, unless the drive
         # has a feed constant that defines other units.
@@ -357,12 +356,14 @@ class _DriveConfiguration:
             else increments_per_turn * (drive_gear or profile_gear)
         )
         turn_units = [
-            turn_count for turn_count in (feed_units, output_increments) if turn_count is not None
+            units_per_turn
+            for units_per_turn in (feed_units, output_increments)
+            if units_per_turn is not None
         ]
         identity["encoder_step_rad"] = tau / turn_units[0] if turn_units else None
         step_rad = rig.encoder.resolution_rad
         if not turn_units or any(
-            _is_ratio_equal(tau / turn_count, step_rad) for turn_count in turn_units
+            _is_ratio_equal(tau / units_per_turn, step_rad) for units_per_turn in turn_units
         ):
             return
         gear_objects = (

@@ -179,8 +179,7 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             failure_cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
             raise DeviceError(
                 f"{failure_cause} It has not shown that it is off: keep clear of the beam, and "
-                "press the "
-                "wired stop (STO) if anything moves."
+                "press the wired stop (STO) if anything moves."
             ) from None
         if drive_state(statusword) in TORQUE_FREE_STATES:
             return

@@ -160,8 +160,7 @@ class _SuitabilityCheck:
                 continue
             sentence = (
                 f"The file is of another drive than the profile's: cia402.{key} is "
-                f"0x{wanted_text:08X}, "
-                f"the file says {value_text}."
+                f"0x{wanted_text:08X}, the file says {value_text}."
             )
             yield SuitabilityFinding(
                 object_text, found_text, f"0x{wanted_text:08X}", Grade.REFUSED, sentence
@@ -203,8 +202,7 @@ class _SuitabilityCheck:
                 return SuitabilityFinding(object_text, value_text, wanted_text, Grade.FITS)
             sentence = (
                 f"No cyclic synchronous torque mode: {object_address} = {value_text} lacks bit 9; "
-                "this "
-                "drive or its firmware cannot be used."
+                "this drive or its firmware cannot be used."
             )
             return SuitabilityFinding(object_text, value_text, wanted_text, Grade.REFUSED, sentence)
         return SuitabilityFinding(

@@ -64,8 +64,7 @@ def operation_left_error(name: str, statusword: int) -> DeviceError:
         return DeviceError(f"{name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}.")
     return DeviceError(
         f"{name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply and "
-        "its "
-        f"own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
+        f"its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 

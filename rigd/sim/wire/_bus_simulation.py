@@ -524,8 +524,7 @@ class BusSimulation:
         ):
             raise FaultError(
                 f"Fault '{fault}': byte={fault_values['byte']} has no effect; a CAN frame has at "
-                "most "
-                f"the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
+                f"most the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
             )
 
         if fault.kind in DISTURBANCE_KINDS:

@@ -269,7 +269,7 @@ class DriveNode:
                 frame_handler(data)
 
     def tick(self, now_s: float) -> None:
-        """Advance the drive to a simulated time: watchdogs, heartbeat, ramps, event-driven PDOs.
+        """Advance the simulated drive in time: watchdogs, heartbeat, ramps, event-driven PDOs.
 
         Parameters
         ----------
@@ -502,8 +502,8 @@ class DriveNode:
         for heartbeat_monitor in self._heartbeat_monitors:
             if not heartbeat_monitor.check(now_s):
                 continue
-            error_option, nmt_state = self._entries.abort_option.value, self._state_machine.state
-            if error_option == 1 and nmt_state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
+            error_option, pds_state = self._entries.abort_option.value, self._state_machine.state
+            if error_option == 1 and pds_state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
                 self._state_machine.fail()
             elif error_option == 3:
                 self._state_machine.quick_stop()
@@ -513,11 +513,11 @@ class DriveNode:
             self._report(
                 _HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([heartbeat_monitor.node_id])
             )
-            reaction_text = self._entries.communication_error.value
-            if reaction_text == 2:
+            communication_option = self._entries.communication_error.value
+            if communication_option == 2:
                 self._end_connection()
                 self._enter_nmt(Nmt.STOPPED)
-            elif reaction_text == 0 and self._nmt is Nmt.OPERATIONAL:
+            elif communication_option == 0 and self._nmt is Nmt.OPERATIONAL:
                 self._end_connection()
                 self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
@@ -628,12 +628,12 @@ class DriveNode:
             self._refresh_torque()
         elif previous_state is PdsState.FAULT:
             self._entries.error_code.value = 0
-            remaining_code = (
+            remaining_codes = (
                 {_HEARTBEAT_LOST_CODE}
                 if any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors)
                 else set()
             )
-            self._emergencies.clear(*(self._emergencies.active.keys() - remaining_code))
+            self._emergencies.clear(*(self._emergencies.active.keys() - remaining_codes))
 
     def _refresh_torque(self) -> None:
         """Pass the torque that follows from the dictionary to the plant, if it has changed."""

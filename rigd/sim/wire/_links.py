@@ -245,8 +245,7 @@ class VirtualCan:
             can_socket.close()
             raise DeviceError(
                 f"CAN bus {interface_name}: it cannot be opened ({error.strerror}); bring it up "
-                "with: "
-                f"ip link set {interface_name} up"
+                f"with: ip link set {interface_name} up"
             ) from None
         return can_socket
 
@@ -322,9 +321,8 @@ def is_virtual(interface_name: str) -> bool:
         return True
     raise DeviceError(
         f"CAN bus {interface_name}: this is not a virtual bus here, and a simulated drive must not "
-        "answer "
-        "together with real ones; simulate with a copy of the profile that has another name and "
-        "another can.channel."
+        "answer together with real ones; simulate with a copy of the profile that has another "
+        "name and another can.channel."
     )
 
 

@@ -589,10 +589,10 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
         for key, eds_entry in eds.entries.items()
         if key[0] >= _FIRST_INDEX
     }
-    for sub, count_description in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
+    for sub, identity_number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
         description = descriptions.get((_IDENTITY_INDEX, sub))
         if description is not None and not description.default:
-            descriptions[_IDENTITY_INDEX, sub] = replace(description, default=count_description)
+            descriptions[_IDENTITY_INDEX, sub] = replace(description, default=identity_number)
     highest_subs: dict[int, int] = {}
     for index, sub in descriptions:
         highest_subs[index] = max(sub, highest_subs.get(index, 0))

@@ -563,7 +563,10 @@ class _SimulatorProcess:
         return "" if self._serial_line is None else self._serial_line.port
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the reply to a request on the control socket: inject a fault or renew the noise."""
+        """Return the reply to a request on the control socket.
+
+        A request injects a fault, reads the simulator's status, or renews the noise.
+        """
         if "inject" in request:
             try:
                 injected_fault = parse_fault(str(request["inject"]))
