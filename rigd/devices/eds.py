@@ -322,14 +322,16 @@ def _keys_with_values(keys: Mapping[str, str]) -> dict[str, str]:
     return {key: value_text for key, value_text in keys.items() if value_text}
 
 
-def _compact_sub_indices(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
+def _compact_sub_indices(
+    section_title: str, sections: Sections
+) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the sub-indices that an object declares together, with their keys."""
-    shared_keys = dict(sections.get(title, {}))
+    shared_keys = dict(sections.get(section_title, {}))
     sub_count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
     if not 0 < sub_count < 255:
         return
     names_by_sub, values_by_sub = (
-        sections.get(title + section_suffix, {}) for section_suffix in ("name", "value")
+        sections.get(section_title + section_suffix, {}) for section_suffix in ("name", "value")
     )
     yield (
         0,
@@ -412,15 +414,15 @@ def _parse_value(text: str, data_type: int, node_id: int) -> int | bytes | None:
     return _to_signed(integer_value + node_id if placeholder_count else integer_value, data_type)
 
 
-def _to_signed(number: int | None, data_type: int) -> int | None:
+def _to_signed(integer_value: int | None, data_type: int) -> int | None:
     """Convert a positive number that encodes a negative one (two's complement) of a data type."""
     if (
-        number is not None
+        integer_value is not None
         and data_type in _SIGNED_TYPES
-        and number >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
+        and integer_value >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
     ):
-        return number - (1 << _TYPE_LENGTHS_BIT[data_type])
-    return number
+        return integer_value - (1 << _TYPE_LENGTHS_BIT[data_type])
+    return integer_value
 
 
 def _identity_number(

@@ -83,9 +83,9 @@ _LATEST_TIME_S = 1e6
 """Largest time in seconds at which an obstacle or impact can begin or end."""
 
 
-def _is_time_allowed(value: float) -> bool:
+def _is_time_allowed(time_s: float) -> bool:
     """Return whether a value in seconds is allowed as a time."""
-    return 0 <= value <= _LATEST_TIME_S
+    return 0 <= time_s <= _LATEST_TIME_S
 
 
 _OBSTACLE_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {

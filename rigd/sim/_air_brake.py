@@ -174,9 +174,9 @@ class AirBrake:
         force_n_per_m *= self._per_square
         return float(self._moment_m2.dot(force_n_per_m)), float(self._force_m.dot(force_n_per_m))
 
-    def write_held_force(self, out: Real) -> None:
-        """Write the force per metre that acts over the coming period to `out`, in N/m."""
-        self._weights[self._newest].dot(self._forces, out)
+    def write_held_force(self, force_output: Real) -> None:
+        """Write the drag force per metre that acts over the coming period to an array, in N/m."""
+        self._weights[self._newest].dot(self._forces, force_output)
 
 
 def _real_part_rows(gains: Complex) -> Real:

@@ -189,7 +189,7 @@ class AttachedObstacles:
         switch_s: float,
         angle_instant_s: float,
         torque_instant_s: float,
-        friction: Real,
+        friction_effect: Real,
     ) -> "SubstepMatrices":
         """Compute the matrices for the substeps of a period, for a free or a locked motor.
 
@@ -227,7 +227,7 @@ class AttachedObstacles:
         free_matrix = np.column_stack(
             [displacement_by_state.reshape(-1, n), displacement_by_torque.reshape(-1, 2)]
         )
-        free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction])
+        free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect])
 
         # State j substeps after a force of 1 N that acted for one substep.
         decayed_states = np.empty((substep_count, n, body_count))
@@ -279,7 +279,7 @@ class AttachedObstacles:
         )
 
     def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
-        """Return whether the beam cannot have touched any obstacle, nor been hit, in a period.
+        """Return whether contact of the beam with any obstacle or impact is excluded in a period.
 
         Parameters
         ----------
@@ -442,7 +442,7 @@ class AttachedObstacles:
                 obstacle.start_m = obstacle.end_m
             j += 1
 
-    def adopt_states(self, state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
+    def adopt_states(self, old_state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
         """Adopt the states of the previous obstacles, and return the plant's new state.
 
         The previous obstacles are the first of these obstacles.
@@ -462,9 +462,9 @@ class AttachedObstacles:
         states_per_body = self._b.size
         old_states_per_body = 0 if old_obstacles is None else old_obstacles._b.size
         old_body_count = 0 if old_obstacles is None else old_obstacles._positions_m.size
-        n = state.size - old_states_per_body * old_body_count
+        n = old_state.size - old_states_per_body * old_body_count
         new_state = np.zeros(n + states_per_body * self._positions_m.size)
-        new_state[:n] = state[:n]
+        new_state[:n] = old_state[:n]
         if old_obstacles is not None:
             modal_states = min(self._oscillating_states, old_obstacles._oscillating_states)
             real_states = min(
@@ -473,7 +473,7 @@ class AttachedObstacles:
             )
             for body_index in range(old_body_count):
                 new = new_state[n + body_index * states_per_body :]
-                old = state[n + body_index * old_states_per_body :]
+                old = old_state[n + body_index * old_states_per_body :]
                 new[:modal_states] = old[:modal_states]
                 new[self._oscillating_states : self._oscillating_states + real_states] = old[
                     old_obstacles._oscillating_states : old_obstacles._oscillating_states

@@ -61,19 +61,19 @@ read_gauges_rest = Struct(">hhh").unpack
 """Unpack gauges 1, 3, 5 from the second reply to a poll."""
 
 
-def identifier(base: int, opcode: int) -> int:
+def identifier(base_id: int, opcode: int) -> int:
     """Return the CAN identifier of the box's messages with an opcode: 16 times base plus opcode."""
-    return base << 4 | opcode
+    return base_id << 4 | opcode
 
 
-def request(base: int, opcode: int, *arguments: int) -> bytes:
+def request(base_id: int, opcode: int, *arguments: int) -> bytes:
     """Return the raw CAN frame of a request."""
-    return pack_frame(identifier(base, opcode), bytes(arguments))
+    return pack_frame(identifier(base_id, opcode), bytes(arguments))
 
 
-def matrix_row(replies: bytes) -> tuple[float, ...]:
+def matrix_row(reply_bytes: bytes) -> tuple[float, ...]:
     """Unpack the six entries of a calibration matrix row from three concatenated replies."""
-    return unpack(">6f", replies)
+    return unpack(">6f", reply_bytes)
 
 
 def serial_number(reply: bytes) -> str:

@@ -87,9 +87,12 @@ def crc16(data: bytes) -> int:
     return crc
 
 
-def frame(function: int, content: bytes) -> bytes:
-    """Return the bytes of a Modbus request to the sensor, with address and checksum."""
-    address_and_content = bytes((ADDRESS, function)) + content
+def frame(function_code: int, request_content: bytes) -> bytes:
+    """Return the bytes of a Modbus request to the sensor, from function code and content.
+
+    Address and checksum are added.
+    """
+    address_and_content = bytes((ADDRESS, function_code)) + request_content
     return address_and_content + crc16(address_and_content).to_bytes(2, "little")
 
 
@@ -101,17 +104,17 @@ LOCK = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
 """Request that locks the sensor's memory."""
 
 
-def read_registers(first: int, count: int) -> bytes:
-    """Return the request that reads `count` registers, at most `MAX_REGISTERS`."""
-    return frame(_READ_FUNCTION, pack(">HH", first, count))
+def read_registers(first_register: int, register_count: int) -> bytes:
+    """Return the request that reads `register_count` registers, at most `MAX_REGISTERS`."""
+    return frame(_READ_FUNCTION, pack(">HH", first_register, register_count))
 
 
-def write_registers(first: int, register_values: Sequence[int]) -> bytes:
+def write_registers(first_register: int, register_values: Sequence[int]) -> bytes:
     """Return the request that writes consecutive registers."""
     packed_values = pack(f">{len(register_values)}H", *register_values)
     return frame(
         _WRITE_FUNCTION,
-        pack(">HHB", first, len(register_values), len(packed_values)) + packed_values,
+        pack(">HHB", first_register, len(register_values), len(packed_values)) + packed_values,
     )
 
 
@@ -172,9 +175,9 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
     return reply_data[1:] if function_code == _READ_FUNCTION else reply_data
 
 
-def unpack_registers(content: bytes) -> tuple[int, ...]:
+def unpack_registers(reply_data: bytes) -> tuple[int, ...]:
     """Unpack the register values from the content of a reply."""
-    return unpack(f">{len(content) // 2}H", content)
+    return unpack(f">{len(reply_data) // 2}H", reply_data)
 
 
 # Record stream

@@ -368,11 +368,13 @@ class SerialSetup:
             "ati_serial.baud."
         )
 
-    def _read_register_values(self, first: int, count: int, action_text: str) -> tuple[int, ...]:
-        """Read `count` registers from `first` on, with several Modbus requests if necessary."""
+    def _read_register_values(
+        self, first_register: int, register_count: int, action_text: str
+    ) -> tuple[int, ...]:
+        """Read consecutive registers, with several Modbus requests if necessary."""
         register_values: tuple[int, ...] = ()
-        while len(register_values) < count:
-            chunk_size = min(modbus.MAX_REGISTERS, count - len(register_values))
-            request = modbus.read_registers(first + len(register_values), chunk_size)
+        while len(register_values) < register_count:
+            chunk_size = min(modbus.MAX_REGISTERS, register_count - len(register_values))
+            request = modbus.read_registers(first_register + len(register_values), chunk_size)
             register_values += modbus.unpack_registers(self._request_content(request, action_text))
         return register_values

@@ -163,7 +163,7 @@ class BusLoad:
     """Total number of frames per second."""
 
 
-def frame_bits(length: int) -> int:
+def frame_bits(data_length: int) -> int:
     """Return the number of bits of a CAN frame with an 11-bit identifier, without stuff bits.
 
     Parameters
@@ -171,16 +171,16 @@ def frame_bits(length: int) -> int:
     length
         Number of data bytes, 0 to 8.
     """
-    return FRAME_BITS + 8 * length
+    return FRAME_BITS + 8 * data_length
 
 
-def worst_frame_bits(length: int) -> int:
-    """Return the largest number of bits of a CAN frame with `length` data bytes, with stuff bits.
+def worst_frame_bits(data_length: int) -> int:
+    """Return the largest number of bits of a CAN frame with `data_length` bytes, with stuff bits.
 
     After five equal bits a bit of the opposite value is inserted, which counts as the first of the
     next five. So at most one bit is inserted per four bits, after the first bit.
     """
-    return frame_bits(length) + (_STUFFABLE_BITS + 8 * length - 1) // 4
+    return frame_bits(data_length) + (_STUFFABLE_BITS + 8 * data_length - 1) // 4
 
 
 def load_of_frames(cyclic_frames: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
@@ -194,7 +194,7 @@ def load_of_frames(cyclic_frames: tuple[CyclicFrame, ...], bitrate_bit_s: float)
 
 
 def bus_load(rig: RigParameters) -> BusLoad:
-    """Return the load of the CAN bus while a session runs.
+    """Return the load of the CAN bus while a session runs, as a fraction of its bit rate.
 
     Parameters
     ----------

@@ -108,7 +108,7 @@ class ReplyPairing:
         )
 
     def register_request(self) -> None:
-        """Count a new request, directly before it is sent.
+        """Count a new request to the device, directly before the request is sent.
 
         Call it after all received frames are delivered.
         """
@@ -127,7 +127,7 @@ class ReplyPairing:
         return 0 < self.outstanding <= self._inbox.replies
 
     def process_replies(self) -> bool:
-        """Count the received replies; return whether they include that to this tick's request.
+        """Count the received replies; return whether that to this tick's request is among them.
 
         If replies to earlier requests were outstanding, too, the result is False: a faulty line may
         deliver a delayed reply after later replies. The next tick is then the first valid one.
@@ -296,8 +296,8 @@ class CanExchange:
             elif can_id & ERROR_FLAG:
                 self._register_error(can_id & ERROR_MASK, raw[8:16])
 
-    def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
-        """Deliver frames until `ready` returns True or the deadline passes; return whether it did.
+    def wait_until(self, is_ready: Callable[[], bool], deadline_ns: int) -> bool:
+        """Deliver frames until `is_ready` returns True, or the deadline passes.
 
         Parameters
         ----------
@@ -313,7 +313,7 @@ class CanExchange:
         """
         wait_failures = 0
         self.drain()
-        while not ready():
+        while not is_ready():
             remaining_ns = deadline_ns - time.monotonic_ns()
             if remaining_ns <= 0:
                 return False

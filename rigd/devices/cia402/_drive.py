@@ -167,7 +167,7 @@ class Cia402Drive:
         return self._capabilities
 
     def statement(self) -> dict[str, str]:
-        """Return the drive's own safeguards as metadata of a session file.
+        """Return texts on the drive's own safeguards, such as its watchdog, as session metadata.
 
         Returns
         -------

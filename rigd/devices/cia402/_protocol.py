@@ -281,9 +281,9 @@ _ERROR_MEANINGS: Final = (
 """Meanings of error codes: mask, masked value, meaning; the most specific masks come first."""
 
 
-def describe_error(code: int) -> str:
+def describe_error(error_code: int) -> str:
     """Describe a 16-bit CiA 402 error code in words, followed by the code."""
     for code_mask, code_value, meaning in _ERROR_MEANINGS:
-        if code & code_mask == code_value:
-            return f"{meaning} (error code 0x{code:04X})"
-    return f"error code 0x{code:04X}"
+        if error_code & code_mask == code_value:
+            return f"{meaning} (error code 0x{error_code:04X})"
+    return f"error code 0x{error_code:04X}"

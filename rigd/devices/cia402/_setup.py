@@ -106,7 +106,7 @@ class DriveCapabilities:
         return tuple(function_names)
 
 
-def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
+def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCapabilities:
     """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     Parameters
@@ -132,7 +132,7 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
     settings = rig.cia402
     assert settings is not None
     required_objects = required_values(rig)
-    with SdoAccess(port, settings.node_id, name) as sdo:
+    with SdoAccess(port, settings.node_id, drive_name) as sdo:
         # First, before the identity is known: a killed session may have left the motor turning.
         command_off(sdo)
         sdo.enter_pre_operational()
@@ -140,11 +140,11 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
         identity = _read_identity(sdo)
         try:
             eds_identity = sdo.load_eds(settings.eds) if settings.eds else (0, 0)
-            _check_identity(identity, settings, name, eds_identity)
+            _check_identity(identity, settings, drive_name, eds_identity)
         except DeviceError as error:
             raise DeviceError(f"{error}{describe_remaining_torque(sdo)}") from None
-        wait_until_disabled(sdo, rig, name)
-        configuration = _DriveConfiguration(sdo, settings, name, required_objects)
+        wait_until_disabled(sdo, rig, drive_name)
+        configuration = _DriveConfiguration(sdo, settings, drive_name, required_objects)
         configuration.assign()
         configuration.check_rated_torque(identity, rig)
         configuration.check_gear_and_encoder(identity, rig)
@@ -184,7 +184,10 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
 
 
 def _check_identity(
-    identity: dict[str, object], settings: ServoDrive, name: str, eds_identity: tuple[int, int]
+    identity: dict[str, object],
+    settings: ServoDrive,
+    drive_name: str,
+    eds_identity: tuple[int, int],
 ) -> None:
     """Raise if the drive's identity differs from that of the profile or of its EDS file.
 
@@ -201,14 +204,14 @@ def _check_identity(
         if required_number and reported_number != required_number:
             reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {value_source} is 0x{required_number:08X}, it says "
-                f"{reported_text}. Check cia402.node_id, or write into the profile what is really "
-                "there."
+                f"{drive_name}: it is another drive: {value_source} is 0x{required_number:08X}, it "
+                f"says {reported_text}. Check cia402.node_id, or write into the profile what is "
+                "really there."
             )
     mode_bits = identity["supported_modes"]
     if not (isinstance(mode_bits, int) and mode_bits & objects.SUPPORTS_CYCLIC_TORQUE):
         raise DeviceError(
-            f"{name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
+            f"{drive_name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
             f"{show_value(mode_bits)}, bit 9 is not set); this drive or its firmware cannot be "
             "used."
         )
@@ -407,7 +410,7 @@ class _DriveConfiguration:
         self._clear_object(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Set the drive's speed limit, which bounds the effect of a constant torque."""
+        """Write the profile's limit of the motor speed, in rpm, to the drive, if there is one."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
@@ -632,9 +635,9 @@ class _DriveConfiguration:
         )
 
 
-def _is_ratio_equal(stated: float, required: float) -> bool:
-    """Return whether a ratio that the drive states agrees with the profile's within 2 %."""
-    return abs(stated - required) <= _SCALE_TOLERANCE * required
+def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
+    """Return whether two values, of the drive and of the profile, agree within 2 %."""
+    return abs(drive_value - profile_value) <= _SCALE_TOLERANCE * profile_value
 
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:

@@ -40,7 +40,7 @@ _PRESS_STO_ADVICE = (
 """Advice in messages about a drive that is not known to be off."""
 
 
-def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
+def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | None:
     """Switch the drive off, reset its fault, and check that it can get ready to switch on.
 
     The motor has no torque at any time. The drive is left pre-operational and disabled. Its
@@ -69,15 +69,15 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     """
     settings = rig.cia402
     assert settings is not None
-    with SdoAccess(port, settings.node_id, name) as sdo:
-        _confirm_off(sdo, name)
+    with SdoAccess(port, settings.node_id, drive_name) as sdo:
+        _confirm_off(sdo, drive_name)
         sdo.enter_pre_operational()
         with suppress(SdoRefusal):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
-        fault_text = _reset_reported_fault(sdo, name, patience_s) if _in_fault(sdo) else None
-        _confirm_ready(sdo, name, patience_s, fault_text, f"rigd reset --profile {rig.name}")
+        fault_text = _reset_reported_fault(sdo, drive_name, patience_s) if _in_fault(sdo) else None
+        _confirm_ready(sdo, drive_name, patience_s, fault_text, f"rigd reset --profile {rig.name}")
     return fault_text
 
 
@@ -88,7 +88,7 @@ def command_off(sdo: SdoAccess) -> None:
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
-def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
+def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, drive_name: str) -> None:
     """Wait until a drive that was commanded off is disabled, or raise.
 
     Raises
@@ -106,12 +106,12 @@ def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
         return
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd reset "
-            f"--profile {rig.name}"
+            f"{drive_name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd "
+            f"reset --profile {rig.name}"
         )
     remedy = "switch it off and on" if present_state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
     raise DeviceError(
-        f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
+        f'{drive_name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
         f'"{present_state.value}" (statusword 0x{statusword:04X}); {remedy}.'
     )
 
@@ -133,17 +133,17 @@ def describe_remaining_torque(sdo: SdoAccess) -> str:
     )
 
 
-def wait_for(condition: Callable[[], bool], patience_s: float) -> bool:
+def wait_for(is_fulfilled: Callable[[], bool], patience_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
     deadline_s = time.monotonic() + patience_s
-    while not condition():
+    while not is_fulfilled():
         if time.monotonic() > deadline_s:
-            return condition()
+            return is_fulfilled()
         time.sleep(_STATE_POLL_S)
     return True
 
 
-def _confirm_off(sdo: SdoAccess, name: str) -> None:
+def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     """Command the drive off, from any state, until its statusword confirms it.
 
     Raises
@@ -176,7 +176,9 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
-            failure_cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            failure_cause = (
+                str(error) if isinstance(error, DeviceError) else f"{drive_name}: {error!r}."
+            )
             raise DeviceError(
                 f"{failure_cause} It has not shown that it is off: keep clear of the beam, and "
                 "press the wired stop (STO) if anything moves."
@@ -184,14 +186,14 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
         if drive_state(statusword) in TORQUE_FREE_STATES:
             return
     raise DeviceError(
-        f"{name}: it was commanded to switch off and has not done so within "
+        f"{drive_name}: it was commanded to switch off and has not done so within "
         f'{_SWITCH_OFF_TIMEOUT_S:g} s: it is in "{drive_state(statusword).value}" (statusword '
         f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch over the heartbeat (object 1016) was "
         "left as it was."
     )
 
 
-def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
+def _reset_reported_fault(sdo: SdoAccess, drive_name: str, patience_s: float) -> str:
     """Reset the drive's fault and return its description; raise if the fault persists."""
     fault_text = _describe_fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
@@ -200,7 +202,7 @@ def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
     if not is_reset:
         raise DeviceError(
-            f"{name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
+            f"{drive_name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
             f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
         )
     return fault_text
@@ -238,7 +240,8 @@ def _confirm_ready(
         )
     supply_text = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
+        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that "
+        "command "
         f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '
         f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
         f"{command}"

@@ -33,7 +33,7 @@ _CHECK_BUS_ADVICE: Final = "check the bus cable, its termination, and what else 
 # Why a drive has left operation
 
 
-def operation_left_error(name: str, statusword: int) -> DeviceError:
+def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
     """Return the error for a drive that has left operation enabled without a command.
 
     Parameters
@@ -55,16 +55,18 @@ def operation_left_error(name: str, statusword: int) -> DeviceError:
             ", and its bit 4 says that the supply is there, which indicates such a command"
         )
         sto_error = wired_stop_dropped(
-            name,
+            drive_name,
             f", or the motor's supply failed, or {_OTHER_SENDER}: {transition_text}"
             f"{supply_hint if is_supplied else ''}",
         )
         return DeviceError(f"{sto_error} If nobody pressed it, {_CHECK_BUS_ADVICE}.")
     if present_state in (DriveState.READY, DriveState.SWITCHED_ON):
-        return DeviceError(f"{name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}.")
+        return DeviceError(
+            f"{drive_name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}."
+        )
     return DeviceError(
-        f"{name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply and "
-        f"its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
+        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply "
+        f"and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 

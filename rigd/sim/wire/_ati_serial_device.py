@@ -261,26 +261,26 @@ class AtiSerialDevice:
         reply_frame = bytes((_ADDRESS, function_code)) + reply_content
         self._write(reply_frame + _checksum(reply_frame).to_bytes(2, "little"))
 
-    def _read_holding(self, body: bytes) -> bytes | int:
+    def _read_holding(self, request_content: bytes) -> bytes | int:
         """Return the reply content to a request for holding registers, or an exception code."""
         self._holding_registers[_STATUS_REGISTER] = self.status_bits & 0xFFFF
-        return _answer_with_registers(self._holding_registers, body)
+        return _answer_with_registers(self._holding_registers, request_content)
 
-    def _read_input(self, body: bytes) -> bytes | int:
+    def _read_input(self, request_content: bytes) -> bytes | int:
         """Return the reply content to a request for input registers, or an exception code."""
         input_registers = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS_REGISTER))
-        first_register, _ = _unpack_register_range(body)
+        first_register, _ = _unpack_register_range(request_content)
         if first_register < _POLLED_GAUGES:
             newest_wrenches = self._newest_wrenches()[-1:] or [self._sensor.measure()]
             input_registers.update(
                 enumerate(self._read_gauges(newest_wrenches)[0].astype(np.uint16).tolist())
             )
-        return _answer_with_registers(input_registers, body)
+        return _answer_with_registers(input_registers, request_content)
 
-    def _write_registers(self, body: bytes) -> bytes | int:
+    def _write_registers(self, request_content: bytes) -> bytes | int:
         """Write registers; return the content of the answer, or an exception code."""
-        first_register, register_count = _unpack_register_range(body[:4])
-        register_bytes = body[5:]
+        first_register, register_count = _unpack_register_range(request_content[:4])
+        register_bytes = request_content[5:]
         if (
             not 1 <= register_count <= _MOST_REGISTERS_WRITTEN
             or len(register_bytes) != 2 * register_count
@@ -312,11 +312,11 @@ class AtiSerialDevice:
             first=first_register,
             values=list(written_values.values()),
         )
-        return body[:4]
+        return request_content[:4]
 
-    def _start_stream(self, body: bytes) -> bytes | int:
+    def _start_stream(self, request_content: bytes) -> bytes | int:
         """Start the stream of records; return the content of the answer."""
-        if body[0] != _START_STREAM_PARAMETER:
+        if request_content[0] != _START_STREAM_PARAMETER:
             return b"\x00"
         self.streaming = True
         self._bytes_while_streaming = 0
@@ -325,11 +325,11 @@ class AtiSerialDevice:
             self._log("sensor", "gains and offsets not loaded", gauges=self._unset_gauges)
         return b"\x01"
 
-    def _set_lock(self, body: bytes) -> bytes | int:
+    def _set_lock(self, request_content: bytes) -> bytes | int:
         """Lock or unlock the sensor's storage; return the content of the answer."""
-        if body[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
+        if request_content[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
             return b"\x00"
-        self._unlocked = body[0] == _UNLOCK_PARAMETER
+        self._unlocked = request_content[0] == _UNLOCK_PARAMETER
         self._log("sensor", "storage unlocked" if self._unlocked else "storage locked")
         return b"\x01"
 
@@ -377,16 +377,20 @@ def _holding_registers_at_power_up(
     return holding_registers
 
 
-def _answer_with_registers(registers: dict[int, int], body: bytes) -> bytes | int:
+def _answer_with_registers(
+    registers_by_address: dict[int, int], request_content: bytes
+) -> bytes | int:
     """Return the content of the reply to a Modbus read request, or an exception code."""
-    first_register, register_count = _unpack_register_range(body)
+    first_register, register_count = _unpack_register_range(request_content)
     if not 1 <= register_count <= _MOST_REGISTERS_READ:
         return _ILLEGAL_VALUE
     addresses = range(first_register, first_register + register_count)
-    if not all(map(registers.__contains__, addresses)):
+    if not all(map(registers_by_address.__contains__, addresses)):
         return _ILLEGAL_ADDRESS
     return pack_struct(
-        f">B{register_count}H", 2 * register_count, *map(registers.__getitem__, addresses)
+        f">B{register_count}H",
+        2 * register_count,
+        *map(registers_by_address.__getitem__, addresses),
     )
 
 

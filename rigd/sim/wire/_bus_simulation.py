@@ -189,7 +189,7 @@ class SimulatedNode(Protocol):
 
 
 class SerialDevice(Protocol):
-    """Device at the end of a simulated serial line."""
+    """Simulated device, such as a sensor, at the end of a simulated serial line."""
 
     frozen: bool
     """Whether the device neither sends nor receives."""
@@ -333,9 +333,9 @@ class BusSimulation:
         """Return the function by which a sensor writes to the serial line."""
         return self._write_serial
 
-    def add_node(self, name: str, node: SimulatedNode) -> None:
+    def add_node(self, node_name: str, simulated_node: SimulatedNode) -> None:
         """Connect a node to the simulated CAN bus."""
-        self._nodes[name] = node
+        self._nodes[node_name] = simulated_node
 
     def add_serial_device(self, device: SerialDevice) -> None:
         """Connect the simulated sensor to the simulated serial line."""
@@ -488,7 +488,7 @@ class BusSimulation:
             serial_line.send(SERIAL, data)
 
     def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
-        """Pass bytes of the simulated sensor that the line has not dropped to the host."""
+        """Pass bytes of the simulated sensor to the host, unless the line has dropped them."""
         self._write_to_host(data)
 
     # Faults.
@@ -635,19 +635,19 @@ class BusSimulation:
         setattr(override.device, override.attribute, restored_value)
         self._log("simulator", "fault over", fault=str(override.fault))
 
-    def _end_faults(self, kind: str | None) -> None:
+    def _end_faults(self, fault_kind: str | None) -> None:
         """End all faults of a kind, or all faults if it is None."""
         for faulty_line in self._lines.values():
-            for ended_kind in faulty_line.end(kind):
+            for ended_kind in faulty_line.end(fault_kind):
                 self._log("simulator", "fault over", fault=ended_kind)
-        for override in [s for s in self._overrides if kind in (None, s.fault.kind)]:
+        for override in [s for s in self._overrides if fault_kind in (None, s.fault.kind)]:
             self._end_override(override)
-        if kind in (None, "obstacle"):
+        if fault_kind in (None, "obstacle"):
             active_obstacles, self._obstacles = self._obstacles, []
             for fault, obstacle in active_obstacles:
                 self._simulated_rig.remove_obstacle(obstacle)
                 self._log("simulator", "fault over", fault=str(fault))
-        if kind in (None, "cut"):
+        if fault_kind in (None, "cut"):
             cut_lines, self._cut_lines = self._cut_lines, {}
             for device_name, fault in cut_lines.items():
                 self._reconnect(device_name)

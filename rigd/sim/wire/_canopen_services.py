@@ -61,7 +61,7 @@ class Emergencies:
         self.active.clear()
         self._history.clear()
 
-    def report(self, code: int, register: int, vendor: bytes = b"") -> bool:
+    def report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> bool:
         """Register an error and send its emergency message, unless the error is active already.
 
         Parameters
@@ -78,12 +78,12 @@ class Emergencies:
         bool
             Whether the error was not active before.
         """
-        if code in self.active:
+        if error_code in self.active:
             return False
-        self.active[code] = register | _GENERIC_ERROR_BIT
-        self._history.insert(0, code)
+        self.active[error_code] = register_bits | _GENERIC_ERROR_BIT
+        self._history.insert(0, error_code)
         del self._history[_HISTORY_LENGTH:]
-        self._transmit(code, vendor)
+        self._transmit(error_code, vendor_bytes)
         return True
 
     def clear(self, *codes: int) -> None:
@@ -94,10 +94,10 @@ class Emergencies:
         if cleared_codes:
             self._transmit(0, b"")
 
-    def _transmit(self, code: int, vendor: bytes) -> None:
-        """Send an emergency message, unless object 1014 disables it."""
+    def _transmit(self, error_code: int, vendor_bytes: bytes) -> None:
+        """Send an emergency message of the node, unless object 1014 disables such messages."""
         if not self._cob_id.value & COB_ID_DISABLED:
-            message_bytes = _EMERGENCY_LAYOUT.pack(code, self._register(), vendor[:5])
+            message_bytes = _EMERGENCY_LAYOUT.pack(error_code, self._register(), vendor_bytes[:5])
             self._send(self._cob_id.value & 0x7FF, message_bytes)
 
     def _register(self) -> int:
@@ -117,12 +117,15 @@ class Emergencies:
 
         return read
 
-    def _check_cob_id(self, value: int) -> None:
+    def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if object 1014 may not be set to a value now."""
         present_value = self._cob_id.value
-        if value & 0x7FFF_F800 or not is_free_id(value & 0x7FF):
+        if new_cob_id & 0x7FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if not (present_value | value) & COB_ID_DISABLED and (present_value ^ value) & 0x7FF:
+        if (
+            not (present_value | new_cob_id) & COB_ID_DISABLED
+            and (present_value ^ new_cob_id) & 0x7FF
+        ):
             raise Abort(AbortCode.STATE)
 
 
@@ -193,13 +196,13 @@ class HeartbeatMonitor:
         return self.lost
 
 
-def _monitored_node(value: int) -> int:
+def _monitored_node(monitor_value: int) -> int:
     """Return the number of the monitored node in a value of object 1016; 0 for none."""
-    return value >> 16 & 0x7F if value & 0xFFFF else 0
+    return monitor_value >> 16 & 0x7F if monitor_value & 0xFFFF else 0
 
 
 def add_heartbeat_monitors(
-    objects: ObjectDictionary, count: int, on_restart: Callable[[], None]
+    objects: ObjectDictionary, monitor_count: int, on_restart: Callable[[], None]
 ) -> list[HeartbeatMonitor]:
     """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
@@ -212,7 +215,7 @@ def add_heartbeat_monitors(
     on_restart
         Function that is called after an entry was set, which restarts its monitoring.
     """
-    monitor_entries = {sub: Entry("I") for sub in range(1, count + 1)}
+    monitor_entries = {sub: Entry("I") for sub in range(1, monitor_count + 1)}
     monitors = [HeartbeatMonitor(monitor_entry) for monitor_entry in monitor_entries.values()]
 
     def check(monitor_entry: Entry, value: int) -> None:
@@ -357,7 +360,7 @@ class Pdo:
         self.compile()
         self._changed()
 
-    def _mapped_entry(self, value: int) -> Entry:
+    def _mapped_entry(self, mapping_value: int) -> Entry:
         """Return the entry of the dictionary that a mapping entry names.
 
         Raises
@@ -365,39 +368,46 @@ class Pdo:
         Abort
             If the object does not exist, cannot be mapped into this PDO, or has another length.
         """
-        mapped_entry = self._objects.find(value >> 16, value >> 8 & 0xFF)
-        if self.direction not in mapped_entry.mapping or mapped_entry.bits != value & 0xFF:
+        mapped_entry = self._objects.find(mapping_value >> 16, mapping_value >> 8 & 0xFF)
+        if self.direction not in mapped_entry.mapping or mapped_entry.bits != mapping_value & 0xFF:
             raise Abort(AbortCode.NOT_MAPPABLE)
         return mapped_entry
 
-    def _check_cob_id(self, value: int) -> None:
+    def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if the PDO's COB-ID may not be set to a value now."""
         was_enabled = not self._cob_id.value & COB_ID_DISABLED
-        if value & 0x3FFF_F800 or not is_free_id(value & 0x7FF):
+        if new_cob_id & 0x3FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if was_enabled and not value & COB_ID_DISABLED and (value ^ self._cob_id.value) & 0x7FF:
+        if (
+            was_enabled
+            and not new_cob_id & COB_ID_DISABLED
+            and (new_cob_id ^ self._cob_id.value) & 0x7FF
+        ):
             raise Abort(AbortCode.STATE)
 
-    def _check_inhibit(self, value: int) -> None:  # noqa: ARG002
+    def _check_inhibit(self, new_time: int) -> None:  # noqa: ARG002
         """Raise `Abort` if the PDO's inhibit time may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
 
-    def _check_slot(self, value: int) -> None:
+    def _check_slot(self, new_entry: int) -> None:
         """Raise `Abort` if a mapping entry of the PDO may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED or self._count.value:
             raise Abort(AbortCode.STATE)
-        if value:
-            self._mapped_entry(value)
+        if new_entry:
+            self._mapped_entry(new_entry)
 
-    def _check_count(self, value: int) -> None:
+    def _check_count(self, new_count: int) -> None:
         """Raise `Abort` if the number of mapped objects may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
-        if value > len(self._slots):
+        if new_count > len(self._slots):
             raise Abort(AbortCode.PDO_LENGTH)
         if (
-            sum(self._mapped_entry(mapping_slot.value).bits for mapping_slot in self._slots[:value])
+            sum(
+                self._mapped_entry(mapping_slot.value).bits
+                for mapping_slot in self._slots[:new_count]
+            )
             > _MOST_PDO_BITS
         ):
             raise Abort(AbortCode.PDO_LENGTH)
@@ -455,7 +465,7 @@ class TransmitPdo(Pdo):
         ]
 
     def reset_exchange(self) -> None:
-        """Reset the state as on entering operational: the next event sends the PDO."""
+        """Reset what was sent, as on entering operational, so that the next event sends the PDO."""
         self._syncs = 0
         self._last: bytes | None = None
         self._sent_s = -math.inf
@@ -508,7 +518,7 @@ class TransmitPdo(Pdo):
         return pdo_data
 
 
-def _check_transmission_type(value: int) -> None:
+def _check_transmission_type(new_type: int) -> None:
     """Raise `Abort` if a value is not a supported transmission type of a PDO."""
-    if value > _LAST_SYNC_TYPE and value not in _EVENT_TYPES:
+    if new_type > _LAST_SYNC_TYPE and new_type not in _EVENT_TYPES:
         raise Abort(AbortCode.VALUE)

@@ -292,12 +292,12 @@ class DriveNode:
                 if tpdo_data is not None:
                     self._transmit(pdo.can_id, tpdo_data)
 
-    def emergency(self, code: int, register: int, vendor: bytes) -> None:
+    def emergency(self, error_code: int, register_bits: int, vendor_bytes: bytes) -> None:
         """Bring the simulated drive to fault, and report an error by an emergency message.
 
         The message contains error code, bits of the error register and vendor's bytes.
         """
-        self._fail(code, register, vendor)
+        self._fail(error_code, register_bits, vendor_bytes)
 
     def reset(self) -> None:
         """Restart the drive as by its own watchdog, with the values at power-on."""
@@ -364,16 +364,16 @@ class DriveNode:
             self._end_connection()
             self._boot(_LAST_COMMUNICATION_INDEX)
 
-    def _enter_nmt(self, state: Nmt) -> None:
+    def _enter_nmt(self, new_state: Nmt) -> None:
         """Change the NMT state, and discard pending transfers and PDOs."""
-        if state is self._nmt:
+        if new_state is self._nmt:
             return
-        self._nmt = state
+        self._nmt = new_state
         self._sync_alive = False
         self._sdo.reset()
         for pdo in (*self._receive_pdos, *self._transmit_pdos):
             pdo.reset_exchange()
-        self._log("nmt", state=state.name.lower().replace("_", "-"))
+        self._log("nmt", state=new_state.name.lower().replace("_", "-"))
 
     def _end_connection(self) -> None:
         """Leave operation enabled before the NMT state changes, as the abort option says."""
@@ -565,15 +565,15 @@ class DriveNode:
         self._log("fault reset", accepted=is_allowed)
         return is_allowed
 
-    def _fail(self, code: int, register: int, vendor: bytes = b"") -> None:
+    def _fail(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> None:
         """Bring the simulated drive to fault, and report an error code by an emergency message."""
         self._state_machine.fail()
-        self._report(code, register, vendor)
+        self._report(error_code, register_bits, vendor_bytes)
 
-    def _report(self, code: int, register: int, vendor: bytes = b"") -> None:
+    def _report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> None:
         """Report an error by an emergency message, unless it is active already."""
-        if self._emergencies.report(code, register, vendor):
-            self._entries.error_code.value = code
+        if self._emergencies.report(error_code, register_bits, vendor_bytes):
+            self._entries.error_code.value = error_code
 
     def _clear(self, *codes: int) -> None:
         """Clear active errors whose cause has ended; errors of a fault remain until its reset."""

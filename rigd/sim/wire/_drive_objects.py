@@ -193,11 +193,11 @@ class PdsStateMachine:
         ):
             self._enter(PdsState.OPERATION_ENABLED)
 
-    def _enter(self, state: PdsState) -> None:
+    def _enter(self, new_state: PdsState) -> None:
         """Change to a state of the power drive system, and report the change."""
-        previous_state, self.state = self.state, state
+        previous_state, self.state = self.state, new_state
         self._ramp_since_s = None
-        if previous_state is not state:
+        if previous_state is not new_state:
             self._on_state_change(previous_state)
 
 
@@ -419,14 +419,14 @@ def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
         )
 
 
-def _check_sync_id(value: int) -> None:
+def _check_sync_id(sync_id: int) -> None:
     """Raise `Abort` if an identifier cannot be used for SYNC."""
     # Bit 30 would make the drive the producer of SYNC, bit 29 would mean an identifier of 29 bits.
-    if value > 0x7FF or not is_free_id(value):
+    if sync_id > 0x7FF or not is_free_id(sync_id):
         raise Abort(AbortCode.VALUE)
 
 
-def _check_quick_stop(value: int) -> None:
+def _check_quick_stop(stop_option: int) -> None:
     """Raise `Abort` if a quick stop option is not supported."""
-    if value not in _QUICK_STOP_OPTIONS:
+    if stop_option not in _QUICK_STOP_OPTIONS:
         raise Abort(AbortCode.VALUE)

@@ -287,9 +287,9 @@ def _format_value(key: str, value: Value) -> str:
     return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
 
 
-def _error_message(spec: str, what: str) -> str:
+def _error_message(spec: str, reason: str) -> str:
     """Return the message for a wrong text of a fault: the text and what is wrong."""
-    return f"Fault '{spec}': {what}."
+    return f"Fault '{spec}': {reason}."
 
 
 # Faults on a line
@@ -352,9 +352,9 @@ class FaultyLine:
         """Let a fault act on this line from now on."""
         self._active_faults.append(_ActiveFault(fault))
 
-    def end(self, kind: str | None) -> list[str]:
-        """End the line's faults of a kind, or all if `kind` is None; return the ended kinds."""
-        ended_faults = [fault for fault in self._active_faults if kind in (None, fault.kind)]
+    def end(self, fault_kind: str | None) -> list[str]:
+        """End the line's faults of a kind, or all for None; return the kinds of the ended faults."""
+        ended_faults = [fault for fault in self._active_faults if fault_kind in (None, fault.kind)]
         self._active_faults = [fault for fault in self._active_faults if fault not in ended_faults]
         return [fault.kind for fault in ended_faults]
 
@@ -453,11 +453,11 @@ class EventLog:
             detail_text = "  ".join(f"{key} {event_value}" for key, event_value in values.items())
             self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {detail_text}".rstrip())
 
-    def print_line(self, line: str) -> None:
+    def print_line(self, text_line: str) -> None:
         """Print a line for the operator, unless quiet; ignore a closed terminal."""
         if not self._quiet:
             with suppress(OSError, ValueError):
-                sys.stdout.write(f"{line}\n")
+                sys.stdout.write(f"{text_line}\n")
                 sys.stdout.flush()
 
     def flush(self) -> None:
@@ -483,12 +483,12 @@ class EventLog:
         self._flushed_s = time.monotonic()
         self._run_on_file(lambda file: file.flush())
 
-    def _run_on_file(self, action: Callable[[TextIO], object]) -> None:
+    def _run_on_file(self, file_action: Callable[[TextIO], object]) -> None:
         """Run an action on the file; if the disk is full, close the log and continue."""
         if self._file is None:
             return
         try:
-            action(self._file)
+            file_action(self._file)
         except OSError as error:
             self.close()
             self.print_line(f"The log cannot be written any more ({error.strerror}).")

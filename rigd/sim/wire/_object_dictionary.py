@@ -178,11 +178,15 @@ class Entry:
         self._low = type_minimum if low is None else low
         self._high = type_maximum if high is None else high
 
-    def accepts_length(self, size: int) -> bool:
-        """Return whether a value of `size` bytes can be written to the entry."""
+    def accepts_length(self, byte_count: int) -> bool:
+        """Return whether a value of `byte_count` bytes can be written to the entry."""
         if self.kind != "s":
-            return 8 * size == self.bits
-        return size == len(self.text) if self.has_fixed_length else size <= _MOST_TEXT_BYTES
+            return 8 * byte_count == self.bits
+        return (
+            byte_count == len(self.text)
+            if self.has_fixed_length
+            else byte_count <= _MOST_TEXT_BYTES
+        )
 
     @property
     def most_bytes(self) -> int:
@@ -195,7 +199,7 @@ class Entry:
         """Return the present value of an integer entry."""
         return self.value if self.read_value is None else self.read_value()
 
-    def store_integer(self, value: int) -> None:
+    def store_integer(self, received_integer: int) -> None:
         """Store a received integer; the caller then has to call `after_write`.
 
         Raises
@@ -203,11 +207,11 @@ class Entry:
         Abort
             If the value is outside the range, or not allowed now.
         """
-        if not self._low <= value <= self._high:
+        if not self._low <= received_integer <= self._high:
             raise Abort(AbortCode.VALUE)
         if self.check is not None:
-            self.check(value)
-        self.value = value
+            self.check(received_integer)
+        self.value = received_integer
 
     def reset(self) -> None:
         """Restore the entry's value at power-on."""
@@ -236,10 +240,10 @@ class Entry:
         return stored_integer
 
 
-def _type_range(kind: str) -> tuple[int, int]:
+def _type_range(type_letter: str) -> tuple[int, int]:
     """Return the smallest and the largest value of a type."""
-    length_bit = 0 if kind == "s" else 8 * _INTEGER_LAYOUTS[kind].size
-    if kind == "s" or kind.isupper():
+    length_bit = 0 if type_letter == "s" else 8 * _INTEGER_LAYOUTS[type_letter].size
+    if type_letter == "s" or type_letter.isupper():
         return 0, (1 << length_bit) - 1
     return -(1 << (length_bit - 1)), (1 << (length_bit - 1)) - 1
 
@@ -513,7 +517,7 @@ class SdoServer:
             self.reset()
 
     def _write(self, data: bytes) -> None:
-        """Write a complete value to the dictionary, and report the write."""
+        """Write a completely received value to the object dictionary, and report the write."""
         self._after_write(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
 
@@ -608,52 +612,60 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
     return DeviceFile(path.name, descriptions)
 
 
-def _to_description(entry: EdsEntry) -> Description:
+def _to_description(eds_entry: EdsEntry) -> Description:
     """Convert the entry of an EDS file to a description for a simulated node."""
-    sdo_access = _SDO_ACCESS.get(entry.access, entry.access)
-    type_letter = _TYPE_LETTERS.get(entry.data_type)
+    sdo_access = _SDO_ACCESS.get(eds_entry.access, eds_entry.access)
+    type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
     if type_letter is None:
-        size_bytes = _TIME_TYPE_LENGTHS.get(entry.data_type) or (entry.bits or 0) // 8
+        size_bytes = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
         return Description(
             "s",
             sdo_access,
             "",
-            text=_default_bytes(entry, size_bytes),
+            text=_default_bytes(eds_entry, size_bytes),
             has_fixed_length=size_bytes > 0,
         )
-    is_boolean = entry.data_type == _BOOLEAN_TYPE
+    is_boolean = eds_entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
-    is_mappable = entry.mappable and not is_boolean
-    pdo_directions = _PDO_DIRECTIONS.get(entry.access, "rt") if is_mappable else ""
-    lower_limit, upper_limit = entry.low, 1 if is_boolean else entry.high
+    is_mappable = eds_entry.mappable and not is_boolean
+    pdo_directions = _PDO_DIRECTIONS.get(eds_entry.access, "rt") if is_mappable else ""
+    lower_limit, upper_limit = eds_entry.low, 1 if is_boolean else eds_entry.high
     if (
         lower_limit is not None and upper_limit is not None and lower_limit >= upper_limit
     ):  # written by tools without limits
         lower_limit = upper_limit = None
     if (
-        entry.index == _HEARTBEAT_CONSUMER_INDEX
+        eds_entry.index == _HEARTBEAT_CONSUMER_INDEX
         and upper_limit is not None
         and upper_limit < _NODE_ID_UNIT
     ):
         lower_limit = upper_limit = (
             None  # some files limit only the time in the lower half, without the node
         )
-    default_value = None if entry.default is None else _to_type_range(entry.default, type_letter)
+    default_value = (
+        None if eds_entry.default is None else _to_type_range(eds_entry.default, type_letter)
+    )
     return Description(
         type_letter, sdo_access, pdo_directions, default_value, lower_limit, upper_limit
     )
 
 
-def _to_type_range(value: int, kind: str) -> int:
+def _to_type_range(file_value: int, type_letter: str) -> int:
     """Convert a value to the range of its type; files may state negative values as unsigned."""
-    length_bit = 8 * calcsize("<" + kind)
-    value &= (1 << length_bit) - 1
-    return value - (1 << length_bit) if kind.islower() and value >> (length_bit - 1) else value
+    length_bit = 8 * calcsize("<" + type_letter)
+    file_value &= (1 << length_bit) - 1
+    return (
+        file_value - (1 << length_bit)
+        if type_letter.islower() and file_value >> (length_bit - 1)
+        else file_value
+    )
 
 
-def _default_bytes(entry: EdsEntry, size: int) -> bytes:
-    """Return the default of an entry as `size` bytes or, if that is 0, as its own bytes."""
-    default_bytes = entry.content
-    if entry.default is not None and size:
-        default_bytes = (entry.default & (1 << 8 * size) - 1).to_bytes(size, "little")
-    return default_bytes[:size].ljust(size, b"\0") if size else default_bytes
+def _default_bytes(eds_entry: EdsEntry, byte_count: int) -> bytes:
+    """Return the default of an entry as `byte_count` bytes or, if that is 0, as its own bytes."""
+    default_bytes = eds_entry.content
+    if eds_entry.default is not None and byte_count:
+        default_bytes = (eds_entry.default & (1 << 8 * byte_count) - 1).to_bytes(
+            byte_count, "little"
+        )
+    return default_bytes[:byte_count].ljust(byte_count, b"\0") if byte_count else default_bytes
