@@ -215,7 +215,7 @@ class SimulatedPlant:
                     force_input,
                     locked_model.sensor_torque,
                     *sample_instants_s,
-                    friction=friction_effect[:n],
+                    friction_effect=friction_effect[:n],
                 )
                 for coupled_model, force_input in (
                     (free_model, free_input),

@@ -240,8 +240,7 @@ def _confirm_ready(
         )
     supply_text = "is there" if statusword & VOLTAGE_ENABLED else "is not there"
     raise DeviceError(
-        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that "
-        "command "
+        f"{name}: {progress_text}, and it is disabled, but it does not get ready: on that command "
         f'it stays in "{state.value}" (statusword 0x{statusword:04X}, bit 4: the motor supply '
         f"{supply_text}). STO is open or the motor supply is off; release or switch it on, then: "
         f"{command}"

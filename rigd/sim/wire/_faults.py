@@ -353,7 +353,7 @@ class FaultyLine:
         self._active_faults.append(_ActiveFault(fault))
 
     def end(self, fault_kind: str | None) -> list[str]:
-        """End the line's faults of a kind, or all for None; return the kinds of the ended faults."""
+        """End the line's faults of a kind (None: of all kinds); return the ended faults' kinds."""
         ended_faults = [fault for fault in self._active_faults if fault_kind in (None, fault.kind)]
         self._active_faults = [fault for fault in self._active_faults if fault not in ended_faults]
         return [fault.kind for fault in ended_faults]
