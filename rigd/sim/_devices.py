@@ -198,7 +198,7 @@ class SimulatedRig:
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _start_preparation(self) -> None:
-        """Start computing the plant with all disturbances in another process.
+        """Start computing the plant with all obstacles and impacts in another process.
 
         A thread would block the interpreter.
         """

@@ -375,16 +375,18 @@ def _transfer_skipping_late_replies(
     raise AssertionError
 
 
-def _discard_late_replies(client: SdoClient) -> None:
+def _discard_late_replies(sdo_client: SdoClient) -> None:
     """Discard late SDO replies until none arrives for a while."""
-    patience_s = min(_LATE_REPLY_SILENCE_S, client.RESPONSE_TIMEOUT)
+    patience_s = min(_LATE_REPLY_SILENCE_S, sdo_client.RESPONSE_TIMEOUT)
     with suppress(queue.Empty):
         while True:
-            client.responses.get(timeout=patience_s)
+            sdo_client.responses.get(timeout=patience_s)
 
 
-def _load_integer_types(own: ObjectDictionary, eds_path: str, node_id: int) -> tuple[int, int]:
-    """Copy integer data types from a drive's EDS file into the object dictionary `own`.
+def _load_integer_types(
+    dictionary: ObjectDictionary, eds_path: str, node_id: int
+) -> tuple[int, int]:
+    """Copy integer data types from a drive's EDS file into the object dictionary `dictionary`.
 
     Returned are the vendor and product code of the EDS file.
     """
@@ -394,8 +396,8 @@ def _load_integer_types(own: ObjectDictionary, eds_path: str, node_id: int) -> t
         raise DeviceError(
             f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
-    for address in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        eds_entry, own_entry = drive_eds.get(*address), own.get_variable(*address)
+    for address in [(v.index, v.subindex) for o in dictionary.values() for v in _variables(o)]:
+        eds_entry, own_entry = drive_eds.get(*address), dictionary.get_variable(*address)
         if (
             eds_entry is not None
             and own_entry is not None

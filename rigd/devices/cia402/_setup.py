@@ -218,7 +218,7 @@ def _check_identity(
 
 
 class _DriveConfiguration:
-    """Configuration of one disabled drive, which collects the objects that the drive lacks.
+    """Set-up of one disabled drive by SDO, which collects the objects that the drive lacks.
 
     Parameters
     ----------

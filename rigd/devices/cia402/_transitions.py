@@ -117,12 +117,12 @@ class TorqueFollowingCheck:
         self._previous_per_mille = 0.0
         self._deviating_ticks = 0
 
-    def command(self, per_mille: int) -> None:
+    def command(self, torque_per_mille: int) -> None:
         """Register the commanded torque of this tick, in 1/1000 of the rated torque."""
-        self._commanded_per_mille = per_mille
+        self._commanded_per_mille = torque_per_mille
         previous_per_mille = self._previous_per_mille = self._last_per_mille
         self._last_per_mille = previous_per_mille + self._step_fraction * (
-            per_mille - previous_per_mille
+            torque_per_mille - previous_per_mille
         )
 
     def compare(self, actual_per_mille: int) -> None:

@@ -165,10 +165,10 @@ class AtiCanNode:
             request_handler[1](data)
 
     def tick(self, now_s: float) -> None:
-        """Do nothing: the box only answers requests."""
+        """Do nothing: the NETCANOEM box only answers requests."""
 
     def reset(self) -> None:
-        """Restart the box, by its watchdog or on request."""
+        """Restart the NETCANOEM box, by its watchdog or on request."""
         self._active_calibration = 0
         self._was_reset = True
         self._log("sensor", "reset")

@@ -126,7 +126,7 @@ class LockStep:
 
     @property
     def due_ns(self) -> int:
-        """Time in nanoseconds at which the next period elapses without a SYNC."""
+        """Time in ns (``time.monotonic_ns``) at which the next period elapses without a SYNC."""
         return round(self._waiting_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
