@@ -46,7 +46,10 @@ class ActuationTarget(Enum):
 
     @property
     def allows_virtual_clock(self) -> bool:
-        """Whether the target can also run under the virtual clock."""
+        """Whether a session on this target can run under the virtual clock instead of real time.
+
+        It can on a rig simulated in this process, and on ``rigd simulate`` in lock-step.
+        """
         return self in (ActuationTarget.SIMULATED, ActuationTarget.LOCK_STEP)
 
 
@@ -79,10 +82,10 @@ def actuation_target(rig: RigParameters) -> ActuationTarget:
     """Return what would move if the devices of a rig were opened now."""
     if rig.devices.drive == "sim":
         return ActuationTarget.SIMULATED
-    simulator = find_simulator(rig.name)
-    if simulator is None:
+    running_simulator = find_simulator(rig.name)
+    if running_simulator is None:
         return ActuationTarget.HARDWARE
-    return ActuationTarget.LOCK_STEP if simulator.lock_step else ActuationTarget.SIMULATOR
+    return ActuationTarget.LOCK_STEP if running_simulator.lock_step else ActuationTarget.SIMULATOR
 
 
 def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> str:
@@ -111,25 +114,28 @@ def simulated_differently(rig: RigParameters) -> list[str]:
 
     The list is empty if no simulator runs.
     """
-    simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
-    return [] if simulator is None else differences(rig, simulator)
+    running_simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
+    return [] if running_simulator is None else differences(rig, running_simulator)
 
 
 def bus_conflicts(rig: RigParameters) -> list[str]:
-    """Return the reasons why the devices of a rig cannot use one CAN bus; nothing is sent."""
+    """Return the reasons why the devices of a rig cannot use one CAN bus, as sentences.
+
+    The list is empty if they can. Nothing is sent on the bus.
+    """
     if rig.can is None:
         return []
     from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
 
-    reasons = check_identifiers(rig)
-    load = bus_load(rig).worst
-    if load > MAX_LOAD:
-        reasons.append(
-            f"The frames of a tick take up to {100 * load:.0f} % of the CAN bus at "
+    conflict_reasons = check_identifiers(rig)
+    worst_load = bus_load(rig).worst
+    if worst_load > MAX_LOAD:
+        conflict_reasons.append(
+            f"The frames of a tick take up to {100 * worst_load:.0f} % of the CAN bus at "
             f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
             "can.bitrate_bit_s or a lower rig.rate_hz."
         )
-    return reasons
+    return conflict_reasons
 
 
 def simulator() -> ModuleType:
@@ -156,18 +162,19 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
         else would move now than was confirmed.
     """
     check_selection(rig.devices)
-    unknown = describe_unknown_values(rig)
-    if unknown:
-        raise DeviceError(unknown)
-    module, name = _OPENERS[rig.devices]
+    unknown_text = describe_unknown_values(rig)
+    if unknown_text:
+        raise DeviceError(unknown_text)
+    module_name, opener_name = _OPENERS[rig.devices]
     opener = cast(
-        "Callable[[RigParameters], Devices]", getattr(importlib.import_module(module), name)
+        "Callable[[RigParameters], Devices]",
+        getattr(importlib.import_module(module_name), opener_name),
     )
     devices = opener(rig)
     if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
-        reasons = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
+        present_target = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
-            f"{target.value.capitalize()} was to move, and now it would be {reasons}: rigd "
+            f"{target.value.capitalize()} was to move, and now it would be {present_target}: rigd "
             "simulate was started or ended in between. Nothing was sent; start again."
         )
     return devices

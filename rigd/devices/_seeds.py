@@ -25,5 +25,7 @@ def session_seed(series_seed: int, session_number: int) -> int:
     """
     if session_number == 1:
         return series_seed
-    digest = hashlib.blake2b(f"{series_seed} {session_number}".encode(), digest_size=8).digest()
-    return int.from_bytes(digest, "big") >> (64 - _SEED_BITS)
+    seed_digest = hashlib.blake2b(
+        f"{series_seed} {session_number}".encode(), digest_size=8
+    ).digest()
+    return int.from_bytes(seed_digest, "big") >> (64 - _SEED_BITS)

@@ -61,9 +61,9 @@ def unknown_values(rig: "RigParameters") -> tuple[str, ...]:
     """
 
     def is_unknown(key: str) -> bool:
-        section, _, name = key.partition(".")
-        parameters = getattr(rig, section)
-        return parameters is not None and isnan(getattr(parameters, name))
+        section, _, key_name = key.partition(".")
+        section_parameters = getattr(rig, section)
+        return section_parameters is not None and isnan(getattr(section_parameters, key_name))
 
     return tuple(key for key in MAY_BE_UNKNOWN if is_unknown(key))
 

@@ -35,19 +35,21 @@ def open_wired_rig(rig: RigParameters) -> Devices:
     refusals = bus_conflicts(rig)
     if refusals:
         raise DeviceError("\n".join(refusals))
-    simulator = find_simulator(rig.name)
-    if simulator is not None:
-        _refuse_ambiguity(rig, simulator)
-        if simulator.lock_step:
+    running_simulator = find_simulator(rig.name)
+    if running_simulator is not None:
+        _refuse_ambiguity(rig, running_simulator)
+        if running_simulator.lock_step:
             assert rig.acquisition is not None
             long_deadline = replace(rig.acquisition, deadline_us=_LOCK_STEP_DEADLINE_US)
             rig = replace(rig, acquisition=long_deadline)
-    link = CanLink(bus, simulator)
+    can_link = CanLink(bus, running_simulator)
     return Devices(
-        drive=Cia402Drive(rig, link),
-        sensor=_make_sensor(rig, link, simulator),
-        simulated=simulator is not None,
-        renew_noise=None if simulator is None else partial(_restart_simulator_noise, simulator),
+        drive=Cia402Drive(rig, can_link),
+        sensor=_make_sensor(rig, can_link, running_simulator),
+        simulated=running_simulator is not None,
+        renew_noise=None
+        if running_simulator is None
+        else partial(_restart_simulator_noise, running_simulator),
     )
 
 
@@ -57,16 +59,16 @@ def _restart_simulator_noise(simulator: SimulatorAddress, seed: int | None) -> i
 
 
 def _make_sensor(
-    rig: RigParameters, link: CanLink, simulator: SimulatorAddress | None
+    rig: RigParameters, can_link: CanLink, simulator: SimulatorAddress | None
 ) -> WrenchSensor:
-    """Create the sensor's driver, on the serial line or on the CAN bus."""
+    """Create the driver of the force-torque sensor, on the serial line or on the CAN bus."""
     if rig.devices.sensor == "ati_serial":
         from rigd.devices.ati import AtiSerialSensor
 
         return AtiSerialSensor(rig, simulator)
     from rigd.devices.ati import AtiCanSensor
 
-    return AtiCanSensor(rig, link)
+    return AtiCanSensor(rig, can_link)
 
 
 def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:

@@ -43,7 +43,7 @@ def wired_stop_dropped(device: str, explanation: str = "") -> DeviceError:
 
 @dataclass(frozen=True, slots=True)
 class LineHealth:
-    """Health of a device's line since it was connected; None means that a value is unknown.
+    """Errors and load of a device's communication line since it was connected; None: unknown.
 
     Attributes
     ----------
@@ -124,7 +124,10 @@ class Drive(Protocol):
         """
 
     def health(self) -> LineHealth:
-        """Return the health of the drive's line; fast enough for an occasional call in the loop."""
+        """Return errors and load of the drive's communication line.
+
+        The method is fast enough for an occasional call in the control loop.
+        """
 
     def disable(self) -> None:
         """Zero the torque and disable the drive; works in every state and never raises."""
@@ -135,7 +138,7 @@ class Drive(Protocol):
 
 @runtime_checkable
 class StatedDrive(Protocol):
-    """Drive whose own safeguards are stated in the session file."""
+    """Drive that describes its own safeguards, such as its watchdog, for the session file."""
 
     def statement(self) -> dict[str, str]:
         """Return the drive's safeguards as metadata of a session file, known after `connect`."""
@@ -172,7 +175,10 @@ class WrenchSensor(Protocol):
         """Return the requested wrench in N and N·m, or the last one if no new one has arrived."""
 
     def health(self) -> LineHealth:
-        """Return the health of line and sensor; fast enough for an occasional call in the loop."""
+        """Return errors of the sensor's communication line, and the sensor's status word.
+
+        The method is fast enough for an occasional call in the control loop.
+        """
 
     def close(self) -> None:
         """Release the sensor's line."""

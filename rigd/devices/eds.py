@@ -166,34 +166,36 @@ def read_eds(path: Path, node_id: int = 1) -> Eds:
         If the file does not exist, is too large, or is not an EDS.
     """
     sections = _parse_sections(_read_text(path), path)
-    device = sections.get("deviceinfo", {})
-    entries = {
+    device_keys = sections.get("deviceinfo", {})
+    eds_entries = {
         (e.index, e.sub): e
         for e in _parse_entries(_correct_sections(sections, path), sections, node_id)
     }
-    if not entries:
+    if not eds_entries:
         raise EdsError(f"{path}: is not an EDS file: it describes no object of a drive.")
     return Eds(
         path=path,
         node_id=node_id,
-        vendor_name=_printable_line(device.get("vendorname", "")),
-        vendor_id=_identity_number(entries, 1, device.get("vendornumber", "")),
-        product_name=_printable_line(device.get("productname", "")),
-        product_code=_identity_number(entries, 2, device.get("productnumber", "")),
-        revision=_identity_number(entries, 3, device.get("revisionnumber", "")),
+        vendor_name=_printable_line(device_keys.get("vendorname", "")),
+        vendor_id=_identity_number(eds_entries, 1, device_keys.get("vendornumber", "")),
+        product_name=_printable_line(device_keys.get("productname", "")),
+        product_code=_identity_number(eds_entries, 2, device_keys.get("productnumber", "")),
+        revision=_identity_number(eds_entries, 3, device_keys.get("revisionnumber", "")),
         bit_rates_bit_s=tuple(
-            1000 * rate for rate in _BIT_RATES_KBIT_S if _is_set(device.get(f"baudrate_{rate}", ""))
+            1000 * rate_kbit_s
+            for rate_kbit_s in _BIT_RATES_KBIT_S
+            if _is_set(device_keys.get(f"baudrate_{rate_kbit_s}", ""))
         ),
         commissioned_node_id=_commissioned_node_id(sections),
-        entries=entries,
+        entries=eds_entries,
     )
 
 
 def _commissioned_node_id(sections: Sections) -> int:
-    """Return the node number that a DCF file configures, or 0."""
+    """Return the node number that a DCF file configures for the drive, or 0 if it has none."""
     # The first spelling is CiA 306's.
-    for title in ("devicecomissioning", "devicecommissioning"):
-        node_id = _parse_integer_or_zero(sections.get(title, {}).get("nodeid", ""))
+    for section_title in ("devicecomissioning", "devicecommissioning"):
+        node_id = _parse_integer_or_zero(sections.get(section_title, {}).get("nodeid", ""))
         if 1 <= node_id <= 127:
             return node_id
     return 0
@@ -208,33 +210,33 @@ def _read_text(path: Path) -> str:
             raise EdsError(f"{path}: is a folder; name the EDS file in it.")
         if not stat.S_ISREG(file_status.st_mode):
             raise EdsError(f"{path}: is not an ordinary file; name the drive's EDS file.")
-        with path.open("rb") as file:
-            data = file.read(MAX_BYTES + 1)
+        with path.open("rb") as eds_file:
+            file_bytes = eds_file.read(MAX_BYTES + 1)
     except EdsError:  # a ValueError too
         raise
     except OSError as error:
         raise EdsError(f"{path}: cannot be read ({error.strerror}).") from error
     except ValueError as error:  # a NUL in the name
         raise EdsError(f"{str(path)!r}: cannot be read ({error}).") from error
-    if len(data) > MAX_BYTES:
+    if len(file_bytes) > MAX_BYTES:
         raise EdsError(
             f"{path}: has more than {MAX_BYTES / 1e6:g} MB, which no EDS file of a drive has."
         )
-    if data.startswith((b"\xff\xfe", b"\xfe\xff")):
-        text = data.decode("utf-16", errors="replace")
+    if file_bytes.startswith((b"\xff\xfe", b"\xfe\xff")):
+        decoded_text = file_bytes.decode("utf-16", errors="replace")
     else:
         try:
-            text = data.decode("utf-8-sig")
+            decoded_text = file_bytes.decode("utf-8-sig")
         except UnicodeDecodeError:
-            text = data.decode("cp1252", errors="replace")
-    if "\0" in text:
+            decoded_text = file_bytes.decode("cp1252", errors="replace")
+    if "\0" in decoded_text:
         raise EdsError(f"{path}: is not an EDS file: it is not text.")
-    if text.lstrip().startswith("<"):
+    if decoded_text.lstrip().startswith("<"):
         raise EdsError(
             f"{path}: is XML (an XDD file, or ESI of EtherCAT), not an EDS file; "
             "ask the vendor for the drive's EDS of CANopen."
         )
-    return text
+    return decoded_text
 
 
 def _parse_sections(text: str, path: Path) -> Sections:
@@ -243,22 +245,26 @@ def _parse_sections(text: str, path: Path) -> Sections:
     If a section or key occurs twice, the first occurrence is used.
     """
     sections: Sections = {}
-    keys: dict[str, str] = {}
-    for line in map(str.strip, text.splitlines()):
-        if not line or line[0] in ";#":
+    section_keys: dict[str, str] = {}
+    for text_line in map(str.strip, text.splitlines()):
+        if not text_line or text_line[0] in ";#":
             continue
-        if line[0] == "[":
-            title, bracket, _ = line[1:].partition("]")
+        if text_line[0] == "[":
+            section_title, closing_bracket, _ = text_line[1:].partition("]")
             # Without a closing bracket it is no section title; the next keys belong to no section.
-            keys = sections.setdefault(title.strip().lower(), {}) if bracket else {}
+            section_keys = (
+                sections.setdefault(section_title.strip().lower(), {}) if closing_bracket else {}
+            )
             if len(sections) > MAX_ENTRIES:
                 raise _too_many_entries_error(path)
             continue
-        key, equals, value = line.partition("=")
-        if equals:
+        key, equals_sign, value_text = text_line.partition("=")
+        if equals_sign:
             # As in canopen, a comment may follow the value after white space.
-            unquoted = _QUOTED_VALUE.sub(r"\2", re.split(r"\s;", value, maxsplit=1)[0].strip())
-            keys.setdefault(key.strip().lower(), unquoted.strip())
+            unquoted_text = _QUOTED_VALUE.sub(
+                r"\2", re.split(r"\s;", value_text, maxsplit=1)[0].strip()
+            )
+            section_keys.setdefault(key.strip().lower(), unquoted_text.strip())
     return sections
 
 
@@ -275,86 +281,101 @@ def _correct_sections(sections: Sections, path: Path) -> dict[tuple[int, int], M
     Sub-indices that an array declares together (``CompactSubObj``) are included. A sub-index
     without name, type or access right gets those of the whole object.
     """
-    members: dict[int, dict[int, dict[str, str]]] = {}
-    for title, keys in sections.items():
-        if match := _SUB_INDEX_TITLE.fullmatch(title):
-            members.setdefault(int(match[1], 16), {}).setdefault(int(match[2], 16), keys)
-        elif _OBJECT_TITLE.fullmatch(title):
-            members.setdefault(int(title, 16), {})
-    corrected: dict[tuple[int, int], Mapping[str, str]] = {}
-    for index, sub_sections in sorted(members.items()):
-        title = f"{index:04x}"
-        keys = _keys_with_values(sections.get(title, {}))
-        for sub, compact_keys in _compact_sub_indices(title, sections):
+    objects_by_index: dict[int, dict[int, dict[str, str]]] = {}
+    for section_title, section_keys in sections.items():
+        if title_match := _SUB_INDEX_TITLE.fullmatch(section_title):
+            objects_by_index.setdefault(int(title_match[1], 16), {}).setdefault(
+                int(title_match[2], 16), section_keys
+            )
+        elif _OBJECT_TITLE.fullmatch(section_title):
+            objects_by_index.setdefault(int(section_title, 16), {})
+    corrected_keys: dict[tuple[int, int], Mapping[str, str]] = {}
+    for index, sub_sections in sorted(objects_by_index.items()):
+        section_title = f"{index:04x}"
+        section_keys = _keys_with_values(sections.get(section_title, {}))
+        for sub, compact_keys in _compact_sub_indices(section_title, sections):
             sub_sections.setdefault(sub, compact_keys)
         # Sub-indices are kept even if the object's type is missing or wrong.
-        kind = _parse_integer_or_zero(keys.get("objecttype", ""))
-        if not sub_sections and kind in (_ARRAY_OBJECT, _RECORD_OBJECT) and "datatype" not in keys:
+        object_kind = _parse_integer_or_zero(section_keys.get("objecttype", ""))
+        if (
+            not sub_sections
+            and object_kind in (_ARRAY_OBJECT, _RECORD_OBJECT)
+            and "datatype" not in section_keys
+        ):
             continue  # the file describes no sub-index of the object
-        name = keys.get("parametername") or title.upper()
-        shared_keys = {"parametername": name}
+        parameter_name = section_keys.get("parametername") or section_title.upper()
+        shared_keys = {"parametername": parameter_name}
         if not sub_sections:
-            corrected[index, 0] = shared_keys | keys
-        shared_keys |= {key: keys[key] for key in ("datatype", "accesstype") if key in keys}
+            corrected_keys[index, 0] = shared_keys | section_keys
+        shared_keys |= {
+            key: section_keys[key] for key in ("datatype", "accesstype") if key in section_keys
+        }
         for sub in sorted(sub_sections):
-            corrected[index, sub] = shared_keys | _keys_with_values(sub_sections[sub])
-        if len(corrected) > MAX_ENTRIES:
+            corrected_keys[index, sub] = shared_keys | _keys_with_values(sub_sections[sub])
+        if len(corrected_keys) > MAX_ENTRIES:
             raise _too_many_entries_error(path)
-    return corrected
+    return corrected_keys
 
 
 def _keys_with_values(keys: Mapping[str, str]) -> dict[str, str]:
     """Return the keys of a section that have a value."""
-    return {key: value for key, value in keys.items() if value}
+    return {key: value_text for key, value_text in keys.items() if value_text}
 
 
-def _compact_sub_indices(title: str, sections: Sections) -> Iterator[tuple[int, dict[str, str]]]:
+def _compact_sub_indices(
+    section_title: str, sections: Sections
+) -> Iterator[tuple[int, dict[str, str]]]:
     """Yield the sub-indices that an object declares together, with their keys."""
-    shared_keys = dict(sections.get(title, {}))
-    count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
-    if not 0 < count < 255:
+    shared_keys = dict(sections.get(section_title, {}))
+    sub_count = _parse_integer_or_zero(shared_keys.pop("compactsubobj", ""))
+    if not 0 < sub_count < 255:
         return
-    names, values = (sections.get(title + suffix, {}) for suffix in ("name", "value"))
+    names_by_sub, values_by_sub = (
+        sections.get(section_title + section_suffix, {}) for section_suffix in ("name", "value")
+    )
     yield (
         0,
         {
             "parametername": "Number of entries",
             "datatype": "0x0005",
             "accesstype": "ro",
-            "defaultvalue": str(count),
+            "defaultvalue": str(sub_count),
         },
     )
-    for sub in range(1, count + 1):
+    for sub in range(1, sub_count + 1):
         own_keys = {
-            "parametername": names.get(str(sub), ""),
-            "parametervalue": values.get(str(sub), ""),
+            "parametername": names_by_sub.get(str(sub), ""),
+            "parametervalue": values_by_sub.get(str(sub), ""),
         }
-        yield sub, shared_keys | {key: value for key, value in own_keys.items() if value}
+        yield (
+            sub,
+            shared_keys | {key: value_text for key, value_text in own_keys.items() if value_text},
+        )
 
 
 def _parse_entries(
     corrected: Mapping[tuple[int, int], Mapping[str, str]], sections: Sections, node_id: int
 ) -> Iterator[EdsEntry]:
     """Yield the entries that corrected sections describe."""
-    for (index, sub), keys in corrected.items():
-        data_type = _data_type(keys, sections)
-        value: int | bytes | None = None
+    for (index, sub), section_keys in corrected.items():
+        data_type = _data_type(section_keys, sections)
+        entry_value: int | bytes | None = None
         # A valid value that a DCF sets takes precedence over the default.
         for key in ("parametervalue", "defaultvalue"):
-            if value is None and key in keys:
-                value = _parse_value(keys[key], data_type, node_id)
-        access = keys.get("accesstype", "").lower()
+            if entry_value is None and key in section_keys:
+                entry_value = _parse_value(section_keys[key], data_type, node_id)
+        access_right = section_keys.get("accesstype", "").lower()
         yield EdsEntry(
             index=index,
             sub=sub,
-            name=_printable_line(keys["parametername"]),
+            name=_printable_line(section_keys["parametername"]),
             data_type=data_type,
-            access=access if access in _ACCESS_RIGHTS else "rw",
-            mappable=_is_set(keys.get("pdomapping", "")),
-            default=value if isinstance(value, int) else None,
-            low=_to_signed(_parse_integer(keys.get("lowlimit", "")), data_type),
-            high=_to_signed(_parse_integer(keys.get("highlimit", "")), data_type),
-            content=value if isinstance(value, bytes) else b"",
+            access=access_right if access_right in _ACCESS_RIGHTS else "rw",
+            mappable=_is_set(section_keys.get("pdomapping", "")),
+            default=entry_value if isinstance(entry_value, int) else None,
+            low=_to_signed(_parse_integer(section_keys.get("lowlimit", "")), data_type),
+            high=_to_signed(_parse_integer(section_keys.get("highlimit", "")), data_type),
+            content=entry_value if isinstance(entry_value, bytes) else b"",
         )
 
 
@@ -372,7 +393,10 @@ def _data_type(keys: Mapping[str, str], sections: Sections) -> int:
 
 
 def _parse_value(text: str, data_type: int, node_id: int) -> int | bytes | None:
-    """Return a default value as integer, or as the drive's bytes; None if it is invalid."""
+    """Return a default value of an EDS file, or None if it is invalid.
+
+    Integers are returned as int, other types as the bytes that the drive would send.
+    """
     try:
         if data_type in _TEXT_TYPES:
             return text.encode("utf-8", errors="replace")
@@ -384,30 +408,34 @@ def _parse_value(text: str, data_type: int, node_id: int) -> int | bytes | None:
         return None
     # A CAN identifier may be written as $NODEID+0x180.
     number_text, placeholder_count = _NODE_ID_PLACEHOLDER.subn("", text.replace(" ", ""))
-    number = 0 if placeholder_count and not number_text else _parse_integer(number_text)
-    if number is None:
+    integer_value = 0 if placeholder_count and not number_text else _parse_integer(number_text)
+    if integer_value is None:
         return None
-    return _to_signed(number + node_id if placeholder_count else number, data_type)
+    return _to_signed(integer_value + node_id if placeholder_count else integer_value, data_type)
 
 
-def _to_signed(number: int | None, data_type: int) -> int | None:
+def _to_signed(integer_value: int | None, data_type: int) -> int | None:
     """Convert a positive number that encodes a negative one (two's complement) of a data type."""
     if (
-        number is not None
+        integer_value is not None
         and data_type in _SIGNED_TYPES
-        and number >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
+        and integer_value >> _TYPE_LENGTHS_BIT[data_type] - 1 == 1
     ):
-        return number - (1 << _TYPE_LENGTHS_BIT[data_type])
-    return number
+        return integer_value - (1 << _TYPE_LENGTHS_BIT[data_type])
+    return integer_value
 
 
 def _identity_number(
     entries: Mapping[tuple[int, int], EdsEntry], sub: int, header_text: str
 ) -> int:
-    """Return a number of the drive's identity from object 1018, else from the file's header."""
-    entry = entries.get((0x1018, sub))
-    value = (entry.default if entry else None) or _parse_integer_or_zero(header_text)
-    return value if 0 <= value < 0xFFFF_FFFF else 0  # in some files, all bits set: not stated
+    """Return a number of the drive's identity, from object 1018 or else from the file's header."""
+    identity_entry = entries.get((0x1018, sub))
+    identity_value = (identity_entry.default if identity_entry else None) or _parse_integer_or_zero(
+        header_text
+    )
+    return (
+        identity_value if 0 <= identity_value < 0xFFFF_FFFF else 0
+    )  # in some files, all bits set: not stated
 
 
 def _parse_integer_or_zero(text: str) -> int:
@@ -422,14 +450,14 @@ def _is_set(text: str) -> bool:
 
 def _parse_integer(text: str) -> int | None:
     """Parse an integer in CiA 306's notation: 0x1F, 31, or octal 037; return None if invalid."""
-    match = _INTEGER_PATTERN.fullmatch(text.strip())
-    if match is None:
+    integer_match = _INTEGER_PATTERN.fullmatch(text.strip())
+    if integer_match is None:
         return None
-    digits = match[0].lower()
-    octal = re.fullmatch(r"([+-]?)0([0-7]+)", digits)
-    if octal:
-        return int(octal[1] + octal[2], 8)
-    return int(digits, 16) if "x" in digits else int(digits)
+    digit_text = integer_match[0].lower()
+    octal_match = re.fullmatch(r"([+-]?)0([0-7]+)", digit_text)
+    if octal_match:
+        return int(octal_match[1] + octal_match[2], 8)
+    return int(digit_text, 16) if "x" in digit_text else int(digit_text)
 
 
 def _printable_line(text: str) -> str:

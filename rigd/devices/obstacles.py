@@ -83,9 +83,9 @@ _LATEST_TIME_S = 1e6
 """Largest time in seconds at which an obstacle or impact can begin or end."""
 
 
-def _is_time_allowed(value: float) -> bool:
+def _is_time_allowed(time_s: float) -> bool:
     """Return whether a value in seconds is allowed as a time."""
-    return 0 <= value <= _LATEST_TIME_S
+    return 0 <= time_s <= _LATEST_TIME_S
 
 
 _OBSTACLE_KEYS: dict[type[Disturbance], dict[str, _ObstacleKey]] = {
@@ -157,38 +157,42 @@ def parse_obstacle(text: str) -> Disturbance:
     3000.0
     """
     assignments = [assignment.strip() for assignment in text.split(",")]
-    kind = (
+    disturbance_type = (
         ImpactSpecification
         if any(assignment.partition("=")[0].strip() == "force" for assignment in assignments)
         else Obstacle
     )
-    keys = _OBSTACLE_KEYS[kind]
-    values: dict[str, float] = {}
+    allowed_keys = _OBSTACLE_KEYS[disturbance_type]
+    field_values: dict[str, float] = {}
     for assignment in assignments:
-        name, _, value_text = (part.strip() for part in assignment.partition("="))
-        if name not in keys:
-            raise _obstacle_error(text, f"unknown key '{name}'; give {', '.join(keys)}")
-        key = keys[name]
-        if key.field in values:
-            raise _obstacle_error(text, f"'{name}' is given twice")
+        key_name, _, value_text = (text_part.strip() for text_part in assignment.partition("="))
+        if key_name not in allowed_keys:
+            raise _obstacle_error(text, f"unknown key '{key_name}'; give {', '.join(allowed_keys)}")
+        key = allowed_keys[key_name]
+        if key.field in field_values:
+            raise _obstacle_error(text, f"'{key_name}' is given twice")
         try:
-            value = (
+            field_value = (
                 _NAMED_VALUES[value_text]
                 if value_text in _NAMED_VALUES
                 else _parse_finite(value_text)
             )
-            if not key.is_allowed(value):
+            if not key.is_allowed(field_value):
                 raise ValueError(value_text)
         except ValueError:
-            raise _obstacle_error(text, f"{name}={value_text}: give {key.allowed_text}") from None
-        values[key.field] = value
-    for name, key in keys.items():
-        if key.is_required and key.field not in values:
-            raise _obstacle_error(text, f"'{name}' is missing; give {name}=…, {key.allowed_text}")
-    if kind is ImpactSpecification:
-        return ImpactSpecification(**values)
-    side = int(values.pop("side", _default_side(values["angle_rad"])))
-    obstacle = Obstacle(**values, side=side)
+            raise _obstacle_error(
+                text, f"{key_name}={value_text}: give {key.allowed_text}"
+            ) from None
+        field_values[key.field] = field_value
+    for key_name, key in allowed_keys.items():
+        if key.is_required and key.field not in field_values:
+            raise _obstacle_error(
+                text, f"'{key_name}' is missing; give {key_name}=…, {key.allowed_text}"
+            )
+    if disturbance_type is ImpactSpecification:
+        return ImpactSpecification(**field_values)
+    side = int(field_values.pop("side", _default_side(field_values["angle_rad"])))
+    obstacle = Obstacle(**field_values, side=side)
     if obstacle.until_s <= obstacle.from_s:
         raise _obstacle_error(text, "until is not later than from")
     return obstacle
@@ -197,7 +201,7 @@ def parse_obstacle(text: str) -> Disturbance:
 def check_obstacles(
     disturbances: Iterable[Disturbance], beam: Beam, simulated_effects: Mapping[str, float | None]
 ) -> None:
-    """Raise if obstacles or impacts cannot be simulated on a beam with its other simulated effects.
+    """Raise if obstacles or impacts cannot be simulated, because of position or other effects.
 
     Parameters
     ----------
@@ -220,15 +224,15 @@ def check_obstacles(
                 f"Obstacle '{describe_obstacle(disturbance)}': x={disturbance.x_m:g} m lies beyond "
                 f"the tip of the beam at {beam.length_m:g} m (beam.length_m); give a smaller x."
             )
-        for name, value in simulated_effects.items():
-            if value:
+        for effect_name, effect_value in simulated_effects.items():
+            if effect_value:
                 raise ObstacleError(
-                    f"simulation.{name} and an obstacle cannot be simulated together; leave one of "
-                    "them out."
+                    f"simulation.{effect_name} and an obstacle cannot be simulated together; leave "
+                    "one of them out."
                 )
 
 
-def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
+def with_obstacles(rig: RigParameters, added_texts: Iterable[str]) -> RigParameters:
     """Return a rig's parameters with more obstacles and impacts on its simulated beam.
 
     Parameters
@@ -249,10 +253,14 @@ def with_obstacles(rig: RigParameters, texts: Iterable[str]) -> RigParameters:
             f"The profile {rig.name} has no section [simulation], so that its beam can meet no "
             "obstacle; copy it from that of rigd profiles show sim."
         )
-    texts = tuple(texts)
-    simulated_effects = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
-    check_obstacles(map(parse_obstacle, texts), rig.beam, simulated_effects)
-    return replace(rig, simulation=replace(simulation, obstacles=simulation.obstacles + texts))
+    added_texts = tuple(added_texts)
+    simulated_effects = {
+        effect_name: getattr(simulation, effect_name) for effect_name in INCOMPATIBLE_WITH_OBSTACLES
+    }
+    check_obstacles(map(parse_obstacle, added_texts), rig.beam, simulated_effects)
+    return replace(
+        rig, simulation=replace(simulation, obstacles=simulation.obstacles + added_texts)
+    )
 
 
 def describe_obstacle(disturbance: Disturbance) -> str:
@@ -263,13 +271,17 @@ def describe_obstacle(disturbance: Disturbance) -> str:
     disturbance
         Obstacle or impact.
     """
-    default_values = {each.name: each.default for each in fields(disturbance)}
+    default_values = {
+        dataclass_field.name: dataclass_field.default for dataclass_field in fields(disturbance)
+    }
     if isinstance(disturbance, Obstacle):
         default_values["side"] = _default_side(disturbance.angle_rad)
     return ",".join(
-        f"{name}={value:g}" if float(f"{value:g}") == value else f"{name}={value!r}"
-        for name, key in _OBSTACLE_KEYS[type(disturbance)].items()
-        if (value := getattr(disturbance, key.field)) != default_values[key.field]
+        f"{key_name}={field_value:g}"
+        if float(f"{field_value:g}") == field_value
+        else f"{key_name}={field_value!r}"
+        for key_name, key in _OBSTACLE_KEYS[type(disturbance)].items()
+        if (field_value := getattr(disturbance, key.field)) != default_values[key.field]
     )
 
 
@@ -280,12 +292,12 @@ def _default_side(angle_rad: float) -> int:
 
 def _parse_finite(text: str) -> float:
     """Parse a finite number, or raise ValueError."""
-    value = float(text)
-    if not isfinite(value):
+    parsed_number = float(text)
+    if not isfinite(parsed_number):
         raise ValueError(text)
-    return value
+    return parsed_number
 
 
-def _obstacle_error(text: str, what: str) -> ObstacleError:
-    """Return the error for an obstacle's text, with the text and the reason."""
-    return ObstacleError(f"Obstacle '{text}': {what}.")
+def _obstacle_error(text: str, reason: str) -> ObstacleError:
+    """Return the error for a wrong text of an obstacle or impact; it states text and reason."""
+    return ObstacleError(f"Obstacle '{text}': {reason}.")

@@ -63,10 +63,11 @@ def differences(rig: "RigParameters", simulator: SimulatorAddress) -> list[str]:
     """
     own_parameters, simulated_parameters = described(rig), simulator.rig
     return [
-        f"{key} = {_format_value(simulated_parameters[key])} instead of {_format_value(value)}"
-        for key, value in own_parameters.items()
+        f"{key} = {_format_value(simulated_parameters[key])} instead of "
+        f"{_format_value(profile_value)}"
+        for key, profile_value in own_parameters.items()
         if key in simulated_parameters
-        and simulated_parameters[key] != value
+        and simulated_parameters[key] != profile_value
         and key != "simulation.seed"
     ]
 
@@ -81,9 +82,9 @@ def announce(rig_name: str, address: SimulatorAddress) -> Path:
     address
         Address of the simulator.
     """
-    path = _address_file(rig_name)
-    write_address(path, asdict(address))
-    return path
+    address_path = _address_file(rig_name)
+    write_address(address_path, asdict(address))
+    return address_path
 
 
 def forget(rig_name: str) -> None:
@@ -94,11 +95,13 @@ def forget(rig_name: str) -> None:
 def find_simulator(rig_name: str) -> SimulatorAddress | None:
     """Return the address of the running simulator of a rig, or None if none answers."""
     try:
-        address = SimulatorAddress(**read_address(_address_file(rig_name)))
+        simulator_address = SimulatorAddress(**read_address(_address_file(rig_name)))
     except TypeError:  # the file has missing or other members
         return None
-    is_running = isinstance(address.control_socket, str) and answers(address.control_socket)
-    return address if is_running else None
+    is_running = isinstance(simulator_address.control_socket, str) and answers(
+        simulator_address.control_socket
+    )
+    return simulator_address if is_running else None
 
 
 def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[str, Any]:
@@ -117,12 +120,12 @@ def ask_simulator(address: SimulatorAddress, request: dict[str, Any]) -> dict[st
         If the simulator does not answer, or refuses; the message is then that of the simulator.
     """
     try:
-        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as link:
-            link.settimeout(_REPLY_TIMEOUT_S)
-            link.connect(address.control_socket)
-            link.sendall(json.dumps(request).encode() + b"\n")
-            with link.makefile("rb") as lines:
-                reply = json.loads(lines.readline(_LONGEST_REPLY))
+        with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as control_link:
+            control_link.settimeout(_REPLY_TIMEOUT_S)
+            control_link.connect(address.control_socket)
+            control_link.sendall(json.dumps(request).encode() + b"\n")
+            with control_link.makefile("rb") as reply_lines:
+                reply = json.loads(reply_lines.readline(_LONGEST_REPLY))
     except (OSError, ValueError) as error:
         raise DeviceError(
             f"The simulated rig (process {address.pid}) does not answer ({error}); start it again."
@@ -139,19 +142,23 @@ def unreachable_simulators(rig_name: str) -> list[Path]:
     `find_simulator` finds no simulator: this process then cannot reach those that are listed.
     """
     try:
-        return [path for path in listening_sockets() if path.name == f"{rig_name}.control"]
+        return [
+            socket_path
+            for socket_path in listening_sockets()
+            if socket_path.name == f"{rig_name}.control"
+        ]
     except OSError:
         return []
 
 
 def _flatten(table: Mapping[str, object], prefix: str) -> Iterator[tuple[str, object]]:
     """Yield dotted key and value of each leaf of a nested table."""
-    for key, value in table.items():
+    for key, leaf_value in table.items():
         dotted_key = prefix + key.rstrip("_")
-        if isinstance(value, dict):
-            yield from _flatten(value, dotted_key + ".")
+        if isinstance(leaf_value, dict):
+            yield from _flatten(leaf_value, dotted_key + ".")
         else:
-            yield dotted_key, value
+            yield dotted_key, leaf_value
 
 
 def _format_value(value: object) -> str:

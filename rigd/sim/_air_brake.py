@@ -39,7 +39,9 @@ They are those of the third-order Adams-Bashforth method."""
 
 
 class AirBrake:
-    """Air drag on a beam: its forces, and its effect on the coupled model of motor and beam.
+    """Drag of the still air on a simulated beam: its force, and its effect on the coupled model.
+
+    The coupled model is that of motor and beam.
 
     Parameters
     ----------
@@ -75,36 +77,42 @@ class AirBrake:
         self, beam: Beam, damping: Damping, realisation: Realisation, drag_m: float
     ) -> None:
         poles = realisation.poles_rad_s[realisation.poles_rad_s.imag > 0][:_DRAG_MODES]
-        modes = poles.size
+        mode_count = poles.size
         self._poles = poles
-        self._grid = grid = DragGrid.of(beam, modes, _DRAG_POINTS)
-        k_fourth = (clamped_free_eigenvalues(modes) / beam.length_m) ** 4
-        inertial = beam.density_over_stiffness * poles**2
-        external = damping.gamma * poles**damping.lambda_
-        internal = damping.zeta * poles**damping.alpha * k_fourth
-        load = inertial + external
-        slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
-        leverage_m2 = beam.length_m * grid.leverage_m
-        self._torque_of_mode = _real_part_rows(leverage_m2 * load / slope).sum(axis=0)
-        self._moment_m2 = leverage_m2 @ grid.to_modes - grid.to_moment
-        mean_m = beam.length_m * mode_mean(modes)
-        self._shear_of_mode = _real_part_rows(mean_m * load / slope).sum(axis=0)
-        self._force_m = mean_m @ grid.to_modes - grid.weight_m
+        self._grid = drag_grid = DragGrid.of(beam, mode_count, _DRAG_POINTS)
+        k_fourth = (clamped_free_eigenvalues(mode_count) / beam.length_m) ** 4
+        inertial_terms = beam.density_over_stiffness * poles**2
+        external_terms = damping.gamma * poles**damping.lambda_
+        internal_terms = damping.zeta * poles**damping.alpha * k_fourth
+        load_terms = inertial_terms + external_terms
+        pole_slopes = (
+            2 * inertial_terms + damping.lambda_ * external_terms + damping.alpha * internal_terms
+        ) / poles
+        leverage_m2 = beam.length_m * drag_grid.leverage_m
+        self._torque_of_mode = _real_part_rows(leverage_m2 * load_terms / pole_slopes).sum(axis=0)
+        self._moment_m2 = leverage_m2 @ drag_grid.to_modes - drag_grid.to_moment
+        mean_deflections_m = beam.length_m * mode_mean(mode_count)
+        self._shear_of_mode = _real_part_rows(mean_deflections_m * load_terms / pole_slopes).sum(
+            axis=0
+        )
+        self._force_m = mean_deflections_m @ drag_grid.to_modes - drag_grid.weight_m
 
-        states = 2 + realisation.b.size
-        self.speed: Real = np.zeros((_DRAG_POINTS, states + 2 * modes))
-        self.speed[:, 1] = grid.x_m
-        modal_rows = _real_part_rows(-grid.leverage_m * load / slope / poles)
-        self.speed[:, 2 : 2 + 2 * modes] = grid.shapes.T @ modal_rows
-        force_rows = _real_part_rows(poles / slope / beam.bending_stiffness_n_m2)
-        self.speed[:, states:] = grid.shapes.T @ force_rows
+        coupled_states = 2 + realisation.b.size
+        self.speed: Real = np.zeros((_DRAG_POINTS, coupled_states + 2 * mode_count))
+        self.speed[:, 1] = drag_grid.x_m
+        modal_rows = _real_part_rows(-drag_grid.leverage_m * load_terms / pole_slopes / poles)
+        self.speed[:, 2 : 2 + 2 * mode_count] = drag_grid.shapes.T @ modal_rows
+        force_rows = _real_part_rows(poles / pole_slopes / beam.bending_stiffness_n_m2)
+        self.speed[:, coupled_states:] = drag_grid.shapes.T @ force_rows
 
         self._forces = np.zeros((3, _DRAG_POINTS))
         self._magnitude = np.zeros(_DRAG_POINTS)
         self._newest = 0
         # The forces are in a ring buffer: one set of weights for each position of the newest.
-        ages_by_newest = (newest - np.arange(3) for newest in range(3))
-        self._weights = [np.array(_EXTRAPOLATION_WEIGHTS)[ages % 3] for ages in ages_by_newest]
+        ages_by_newest = (newest_index - np.arange(3) for newest_index in range(3))
+        self._weights = [
+            np.array(_EXTRAPOLATION_WEIGHTS)[force_ages % 3] for force_ages in ages_by_newest
+        ]
         self._per_square = -0.5 * AIR_DENSITY_KG_PER_M3 * drag_m
 
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
@@ -126,14 +134,14 @@ class AirBrake:
         a[first_states, first_states] = a[first_states + 1, first_states + 1] = self._poles.real
         a[first_states, first_states + 1] = self._poles.imag
         a[first_states + 1, first_states] = -self._poles.imag
-        of_force = np.zeros((n + added_states, _DRAG_POINTS))
-        of_force[:n] = -np.outer(model.b, self._moment_m2)
-        of_force[first_states] = self._grid.to_modes
+        force_input = np.zeros((n + added_states, _DRAG_POINTS))
+        force_input[:n] = -np.outer(model.b, self._moment_m2)
+        force_input[first_states] = self._grid.to_modes
 
         def row(model_row: Real, per_torque: float = 0.0, direct_effect: float = 0.0) -> Real:
             return np.concatenate([model_row, (direct_effect - per_torque) * self._torque_of_mode])
 
-        extended = replace(
+        extended_coupled = replace(
             model,
             a=a,
             b=np.concatenate([model.b, np.zeros(added_states)]),
@@ -147,10 +155,12 @@ class AirBrake:
                 self._shear_of_mode - model.shear_per_torque * self._torque_of_mode,
             ),
         )
-        return extended, of_force
+        return extended_coupled, force_input
 
     def update_force(self, speed_m_s: Real) -> tuple[float, float]:
-        """Compute and store the drag force for the given speeds; return its immediate effect.
+        """Compute and store the drag force for speeds in m/s at the points of the beam.
+
+        The immediate effect of the force is returned.
 
         Returns
         -------
@@ -158,15 +168,15 @@ class AirBrake:
             Immediate effect of the force on the beam's torque and shear, for unchanged modes.
         """
         self._newest = (self._newest + 1) % 3
-        force = self._forces[self._newest]
+        force_n_per_m = self._forces[self._newest]
         np.absolute(speed_m_s, self._magnitude)
-        np.multiply(self._magnitude, speed_m_s, force)
-        force *= self._per_square
-        return float(self._moment_m2.dot(force)), float(self._force_m.dot(force))
+        np.multiply(self._magnitude, speed_m_s, force_n_per_m)
+        force_n_per_m *= self._per_square
+        return float(self._moment_m2.dot(force_n_per_m)), float(self._force_m.dot(force_n_per_m))
 
-    def write_held_force(self, out: Real) -> None:
-        """Write the force per metre that acts over the coming period to `out`, in N/m."""
-        self._weights[self._newest].dot(self._forces, out)
+    def write_held_force(self, force_output: Real) -> None:
+        """Write the drag force per metre that acts over the coming period to an array, in N/m."""
+        self._weights[self._newest].dot(self._forces, force_output)
 
 
 def _real_part_rows(gains: Complex) -> Real:
@@ -174,8 +184,8 @@ def _real_part_rows(gains: Complex) -> Real:
 
     The two states are the real part of z and the negative of its imaginary part.
     """
-    rows = np.zeros((gains.size, 2 * gains.size))
-    number = np.arange(gains.size)
-    rows[number, 2 * number] = 2 * gains.real
-    rows[number, 2 * number + 1] = 2 * gains.imag
-    return rows
+    real_part_matrix = np.zeros((gains.size, 2 * gains.size))
+    pole_index = np.arange(gains.size)
+    real_part_matrix[pole_index, 2 * pole_index] = 2 * gains.real
+    real_part_matrix[pole_index, 2 * pole_index + 1] = 2 * gains.imag
+    return real_part_matrix

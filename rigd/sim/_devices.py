@@ -106,10 +106,10 @@ class SimulatedRig:
                 "The profile has no section [simulation], which a simulated rig needs; copy it "
                 "from that of rigd profiles show sim."
             )
-        weights: tuple[float, ...] = (1.0,)
+        filter_weights: tuple[float, ...] = (1.0,)
         self.records_per_period = 1
         if rig.ati_serial is not None:
-            weights = rig.ati_serial.weights(rig.rate_hz)
+            filter_weights = rig.ati_serial.weights(rig.rate_hz)
             self.records_per_period = rig.ati_serial.records_per_tick(rig.rate_hz)
             # The delay in the profile includes the filter's delay; the rest is the sensor's delay.
             remaining_delay_s = rig.sensor.delay_s - rig.ati_serial.filter_delay_s(rig.rate_hz)
@@ -121,7 +121,9 @@ class SimulatedRig:
         self._removed_disturbances: list[Disturbance] = []
         self._preparation: tuple[int, IO[bytes]] | None = None
         self.plant = SimulatedPlant(rig)
-        self.sensor = SimulatedSensor(self.plant, rig.sensor, rig.simulation, rig.rate_hz, weights)
+        self.sensor = SimulatedSensor(
+            self.plant, rig.sensor, rig.simulation, rig.rate_hz, filter_weights
+        )
         self._resolution_rad = rig.encoder.resolution_rad
         self.stuck_encoder: StuckReadings | None = None
 
@@ -153,7 +155,7 @@ class SimulatedRig:
             self.sensor.sample()
 
     def check_disturbance(self, disturbance: Disturbance) -> None:
-        """Raise if a disturbance cannot be simulated in addition to the present ones.
+        """Raise if an obstacle or impact cannot be simulated in addition to the present ones.
 
         Raises
         ------
@@ -191,49 +193,52 @@ class SimulatedRig:
         self.plant.remove_obstacle(disturbance)
 
     def _plant_with_disturbances(self) -> tuple[int, SimulatedPlant]:
-        """Return the number of added disturbances, and a plant with all of them."""
+        """Return a plant with all added obstacles and impacts, after their number."""
         texts = [describe_obstacle(disturbance) for disturbance in self._added_disturbances]
         return len(texts), SimulatedPlant(with_obstacles(self._parameters, texts))
 
     def _start_preparation(self) -> None:
-        """Start computing the plant with all disturbances in another process.
+        """Start computing the plant with all obstacles and impacts in another process.
 
         A thread would block the interpreter.
         """
         import tempfile  # imported late, because no session needs it
 
-        file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
-        process = os.fork()
-        if process == 0:
+        plant_file = tempfile.TemporaryFile()  # noqa: SIM115 - closed when it was read
+        process_id = os.fork()
+        if process_id == 0:
             has_failed = True
             with suppress(BaseException):
                 with suppress(OSError):  # it has time
                     os.sched_setscheduler(0, os.SCHED_OTHER, os.sched_param(0))
-                pickle.dump(self._plant_with_disturbances(), file, protocol=5)
-                file.flush()
+                pickle.dump(self._plant_with_disturbances(), plant_file, protocol=5)
+                plant_file.flush()
                 has_failed = False
             os._exit(has_failed)
-        self._preparation = process, file
+        self._preparation = process_id, plant_file
 
     def _poll_preparation(self) -> None:
-        """Use the prepared plant if it is ready, and prepare disturbances added since then."""
+        """Use the plant computed in the other process if it is ready.
+
+        The computation of disturbances added since then is started.
+        """
         assert self._preparation is not None
-        process, file = self._preparation
-        ended_process, status = os.waitpid(process, os.WNOHANG)
-        if not ended_process:
+        process_id, plant_file = self._preparation
+        ended_id, exit_status = os.waitpid(process_id, os.WNOHANG)
+        if not ended_id:
             return
         self._preparation = None
-        with file:
-            if status != 0:
+        with plant_file:
+            if exit_status != 0:
                 raise DeviceError("The simulated rig could not make ready for an obstacle.")
-            file.seek(0)
-            count, plant = pickle.load(file)
-        self._use_prepared_plant(plant)
-        if count < len(self._added_disturbances):
+            plant_file.seek(0)
+            disturbance_count, prepared_plant = pickle.load(plant_file)
+        self._use_prepared_plant(prepared_plant)
+        if disturbance_count < len(self._added_disturbances):
             self._start_preparation()
 
     def _use_prepared_plant(self, plant: SimulatedPlant) -> None:
-        """Let the plant use the disturbances of a prepared plant, without the removed ones."""
+        """Let the plant use a prepared plant's obstacles and impacts, except the removed ones."""
         self.plant.use_obstacles_of(plant)
         for disturbance in self._removed_disturbances:
             self.plant.remove_obstacle(disturbance)
@@ -355,13 +360,19 @@ class SimulatedSensor:
         self.records: deque[Wrench] = deque(maxlen=len(weights))
         self._sensor = sensor
         self._simulation = simulation
-        per_torque, per_shear = _unit_wrenches(sensor, simulation.crosstalk_percent)
+        torque_wrench, shear_wrench = _unit_wrenches(sensor, simulation.crosstalk_percent)
         # Axes on which neither torque nor shear acts show noise only, which is drawn, limited and
         # quantised in blocks. The other axes are computed tick by tick.
         self._loaded_axes = [
-            (axis, per_torque[axis], per_shear[axis], sensor.range[axis], sensor.resolution[axis])
+            (
+                axis,
+                torque_wrench[axis],
+                shear_wrench[axis],
+                sensor.range[axis],
+                sensor.resolution[axis],
+            )
             for axis in range(6)
-            if per_torque[axis] != 0.0 or per_shear[axis] != 0.0
+            if torque_wrench[axis] != 0.0 or shear_wrench[axis] != 0.0
         ]
         self._noise_rows = chain.from_iterable(self._noise(simulation.seed))
         self._hum_nm = simulation.hum_nm
@@ -411,32 +422,38 @@ class SimulatedSensor:
         self.records.clear()
 
     def sample(self) -> None:
-        """Take a reading of the simulated sensor and add it to the decimating filter."""
+        """Measure the wrench of the simulated sensor once, and add it to the decimating filter."""
         self.records.append(self.measure())
         self._saturated |= self.wrench_saturated
 
-    def advance_hum(self, readings: int) -> None:
+    def advance_hum(self, reading_count: int) -> None:
         """Advance the phase of the hum by a number of reading periods."""
         if self._hum_nm:
             # Whole cycles are dropped to keep the phase exact.
-            self._hum_cycles = (self._hum_cycles + readings * self._hum_cycles_per_reading) % 1.0
+            self._hum_cycles = (
+                self._hum_cycles + reading_count * self._hum_cycles_per_reading
+            ) % 1.0
 
     def measure(self) -> Wrench:
-        """Return the simulated wrench, in N and N·m, at the current simulation time."""
-        row = next(self._noise_rows)
+        """Return the simulated sensor's wrench, in N and N·m, at the current simulation time."""
+        noise_row = next(self._noise_rows)
         torque_nm = self._plant.sensed_torque_nm
         if self._hum_nm:
             torque_nm += self._hum_nm * sin(tau * self._hum_cycles)
         shear_n = self._plant.sensed_shear_n
-        saturated = False
-        for axis, per_torque, per_shear, limit, step in self._loaded_axes:
-            value = row[axis] + per_torque * torque_nm + per_shear * shear_n
-            if not -limit < value < limit:
-                value = limit if value > 0 else -limit
-                saturated = True
-            row[axis] = round(value / step) * step if step else value
-        self.wrench_saturated = saturated
-        fx, fy, fz, tx, ty, tz = row
+        is_saturated = False
+        for axis, per_torque, per_shear, axis_range, axis_resolution in self._loaded_axes:
+            axis_reading = noise_row[axis] + per_torque * torque_nm + per_shear * shear_n
+            if not -axis_range < axis_reading < axis_range:
+                axis_reading = axis_range if axis_reading > 0 else -axis_range
+                is_saturated = True
+            noise_row[axis] = (
+                round(axis_reading / axis_resolution) * axis_resolution
+                if axis_resolution
+                else axis_reading
+            )
+        self.wrench_saturated = is_saturated
+        fx, fy, fz, tx, ty, tz = noise_row
         wrench = fx, fy, fz, tx, ty, tz
         return wrench if self.stuck is None else self.stuck(wrench)
 
@@ -444,31 +461,37 @@ class SimulatedSensor:
         """Do nothing: a sensor simulated in this process has no line to release."""
 
     def _noise(self, seed: int | None) -> Iterator[list[list[float]]]:
-        """Yield blocks of unloaded wrenches with noise and offset; without a seed, random ones."""
+        """Yield blocks of readings without load: noise and offset, in N and N·m.
+
+        Without a seed the noise is random.
+        """
         simulation = self._simulation
-        generator = np.random.default_rng(seed)
+        random_generator = np.random.default_rng(seed)
         noise_deviations = np.array(
             [simulation.force_noise_n] * 3 + [simulation.torque_noise_nm] * 3
         )
-        offset = np.array(simulation.offset)
-        limit = np.array(self._sensor.range)
-        step = np.array(self._sensor.resolution)
+        wrench_offset = np.array(simulation.offset)
+        axis_ranges = np.array(self._sensor.range)
+        axis_resolutions = np.array(self._sensor.resolution)
         unloaded_axes = [
             axis
             for axis in range(6)
             if axis not in {loaded_axis[0] for loaded_axis in self._loaded_axes}
         ]
-        quantised_axes = [axis for axis in unloaded_axes if step[axis] > 0]
+        quantised_axes = [axis for axis in unloaded_axes if axis_resolutions[axis] > 0]
         while True:
             noise_block = (
-                offset + generator.standard_normal((_NOISE_BLOCK_READINGS, 6)) * noise_deviations
+                wrench_offset
+                + random_generator.standard_normal((_NOISE_BLOCK_READINGS, 6)) * noise_deviations
             )
             noise_block[:, unloaded_axes] = np.clip(
-                noise_block[:, unloaded_axes], -limit[unloaded_axes], limit[unloaded_axes]
+                noise_block[:, unloaded_axes],
+                -axis_ranges[unloaded_axes],
+                axis_ranges[unloaded_axes],
             )
             noise_block[:, quantised_axes] = (
-                np.round(noise_block[:, quantised_axes] / step[quantised_axes])
-                * step[quantised_axes]
+                np.round(noise_block[:, quantised_axes] / axis_resolutions[quantised_axes])
+                * axis_resolutions[quantised_axes]
             )
             yield noise_block.tolist()
 
@@ -492,12 +515,14 @@ def _unit_wrenches(
     """Return the wrenches of a coupling torque of 1 N·m alone and of a base shear of 1 N alone."""
     projections = np.array([sensor.projection, sensor.shear_projection])
     is_known = projections.any(axis=1)
-    wrenches = np.zeros((6, 2))
-    rows = projections[is_known]
-    wrenches[:, is_known] = rows.T @ np.linalg.inv(rows @ rows.T)
+    unit_wrenches = np.zeros((6, 2))
+    projection_rows = projections[is_known]
+    unit_wrenches[:, is_known] = projection_rows.T @ np.linalg.inv(
+        projection_rows @ projection_rows.T
+    )
     if crosstalk_percent:
         full_ranges = np.array(sensor.range)
-        crosstalk = 0.01 * crosstalk_percent * np.array(_CROSSTALK_PATTERN)
-        wrenches += crosstalk * full_ranges[:, None] / full_ranges @ wrenches
-    per_torque, per_shear = wrenches.T.tolist()
-    return per_torque, per_shear
+        crosstalk_matrix = 0.01 * crosstalk_percent * np.array(_CROSSTALK_PATTERN)
+        unit_wrenches += crosstalk_matrix * full_ranges[:, None] / full_ranges @ unit_wrenches
+    torque_wrench, shear_wrench = unit_wrenches.T.tolist()
+    return torque_wrench, shear_wrench

@@ -60,7 +60,7 @@ _CONTACT_ITERATIONS = 3
 
 
 class AttachedObstacles:
-    """Obstacles and impacts that act on the plant.
+    """Obstacles and impacts that act on the beam of the simulated plant.
 
     Parameters
     ----------
@@ -94,7 +94,7 @@ class AttachedObstacles:
         self._period_s = period_s
         self.substeps = _substeps_per_period(beam, bodies, period_s)
         self._step_s = period_s / self.substeps
-        positions_m = np.array([body.x_m for body in bodies])
+        positions_m = np.array([attached_body.x_m for attached_body in bodies])
         force_realisations = [
             realise_force(beam, damping, x, positions_m, 1 / self._step_s)
             for x in positions_m.tolist()
@@ -102,10 +102,10 @@ class AttachedObstacles:
         # Rows: displacement at each body, torque, shear. Columns of `_force_state_rows`: states of
         # each force; columns of `_direct_rows`: forces.
         self._force_state_rows = np.column_stack(
-            [known_body.rows for known_body in force_realisations]
+            [force_realisation.rows for force_realisation in force_realisations]
         )
         self._direct_rows = np.column_stack(
-            [known_body.direct for known_body in force_realisations]
+            [force_realisation.direct for force_realisation in force_realisations]
         )
         self._a, self._b = force_realisations[0].a, force_realisations[0].b  # equal for all forces
         self._oscillating_states = 2 * force_realisations[0].modes
@@ -121,12 +121,14 @@ class AttachedObstacles:
         self._rigid_rows = np.array([[t.per_angle, t.per_velocity, *t.c] for t in angle_outputs])
         self._positions_m = positions_m
         self._obstacles = [
-            (index, body, min(body.stiffness_n_per_m, _RIGID_N_PER_M))
-            for index, body in enumerate(bodies)
-            if isinstance(body, Obstacle)
+            (body_index, attached_body, min(attached_body.stiffness_n_per_m, _RIGID_N_PER_M))
+            for body_index, attached_body in enumerate(bodies)
+            if isinstance(attached_body, Obstacle)
         ]
         self._impacts = [
-            (i, body) for i, body in enumerate(bodies) if isinstance(body, ImpactSpecification)
+            (i, attached_body)
+            for i, attached_body in enumerate(bodies)
+            if isinstance(attached_body, ImpactSpecification)
         ]
         self._zero_forces: Real = np.zeros((self.substeps, len(bodies)))
         self.forces_n = self._zero_forces
@@ -141,7 +143,7 @@ class AttachedObstacles:
         return np.column_stack([self._rigid_rows, self._force_state_rows[:-2]])
 
     def extended_model(self, model: CoupledModel) -> tuple[CoupledModel, Real]:
-        """Return the model of motor and beam, extended by the effect of the forces on the beam.
+        """Return the model of motor and beam, with more states for the effect of the forces.
 
         Returns
         -------
@@ -150,32 +152,34 @@ class AttachedObstacles:
         of_force
             Contribution of each force (1 N) to the derivative of the state, shape (n, bodies).
         """
-        bodies, own_states = self._positions_m.size, self._b.size
-        n, added_states = model.b.size, bodies * own_states
-        torque, shear = self._force_state_rows[-2], self._force_state_rows[-1]
+        body_count, own_states = self._positions_m.size, self._b.size
+        n, added_states = model.b.size, body_count * own_states
+        torque_row, shear_row = self._force_state_rows[-2], self._force_state_rows[-1]
         a = np.zeros((n + added_states, n + added_states))
         a[:n, :n] = model.a
-        a[:n, n:] = -np.outer(model.b, torque)
-        of_force = np.zeros((n + added_states, bodies))
-        of_force[:n] = -np.outer(model.b, self._direct_rows[-2])
-        for index in range(bodies):
-            states = slice(n + index * own_states, n + (index + 1) * own_states)
-            a[states, states] = self._a
-            of_force[states, index] = self._b
-        extended = replace(
+        a[:n, n:] = -np.outer(model.b, torque_row)
+        force_input = np.zeros((n + added_states, body_count))
+        force_input[:n] = -np.outer(model.b, self._direct_rows[-2])
+        for body_index in range(body_count):
+            body_states = slice(n + body_index * own_states, n + (body_index + 1) * own_states)
+            a[body_states, body_states] = self._a
+            force_input[body_states, body_index] = self._b
+        extended_coupled = replace(
             model,
             a=a,
             b=np.append(model.b, np.zeros(added_states)),
             angle=np.append(model.angle, np.zeros(added_states)),
             velocity=np.append(model.velocity, np.zeros(added_states)),
-            acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque),
-            beam_torque=np.append(model.beam_torque, (1 - model.beam_torque_per_torque) * torque),
-            sensor_torque=np.append(
-                model.sensor_torque, (1 - model.sensor_torque_per_torque) * torque
+            acceleration=np.append(model.acceleration, -model.acceleration_per_torque * torque_row),
+            beam_torque=np.append(
+                model.beam_torque, (1 - model.beam_torque_per_torque) * torque_row
             ),
-            shear=np.append(model.shear, shear - model.shear_per_torque * torque),
+            sensor_torque=np.append(
+                model.sensor_torque, (1 - model.sensor_torque_per_torque) * torque_row
+            ),
+            shear=np.append(model.shear, shear_row - model.shear_per_torque * torque_row),
         )
-        return extended, of_force
+        return extended_coupled, force_input
 
     def substep_matrices(
         self,
@@ -185,7 +189,7 @@ class AttachedObstacles:
         switch_s: float,
         angle_instant_s: float,
         torque_instant_s: float,
-        friction: Real,
+        friction_effect: Real,
     ) -> "SubstepMatrices":
         """Compute the matrices for the substeps of a period, for a free or a locked motor.
 
@@ -198,75 +202,84 @@ class AttachedObstacles:
         friction
             Effect of the previous period's friction (1 N·m) on the state, shape (n,).
         """
-        steps, step_s, bodies = self.substeps, self._step_s, self._positions_m.size
+        substep_count, step_s, body_count = self.substeps, self._step_s, self._positions_m.size
         n = model.b.size
         phi, step_response = propagator(model, step_s)
         displacement_rows = self.displacement_rows
 
         # Displacement without a force: rows for the states, columns for the torques.
-        rows = np.empty((steps, bodies, n))
+        displacement_by_state = np.empty((substep_count, body_count, n))
         row = displacement_rows
-        for j in range(steps):
-            rows[j] = row = row @ phi
-        torques = np.empty((steps, bodies, 2))
-        state = np.zeros((n, 2))
-        for j in range(steps):
+        for j in range(substep_count):
+            displacement_by_state[j] = row = row @ phi
+        displacement_by_torque = np.empty((substep_count, body_count, 2))
+        state_per_torque = np.zeros((n, 2))
+        for j in range(substep_count):
             before_s = min(max(switch_s - j * step_s, 0.0), step_s)
-            after = (
+            response_after = (
                 propagator(model, step_s - before_s)[1] if 0 < before_s < step_s else step_response
             )
-            after = after * (before_s < step_s)
-            state = phi @ state + np.column_stack([step_response - after, after])
-            torques[j] = displacement_rows @ state
-        free = np.column_stack([rows.reshape(-1, n), torques.reshape(-1, 2)])
-        free = np.column_stack([free, free[:, :n] @ friction])
+            response_after = response_after * (before_s < step_s)
+            state_per_torque = phi @ state_per_torque + np.column_stack(
+                [step_response - response_after, response_after]
+            )
+            displacement_by_torque[j] = displacement_rows @ state_per_torque
+        free_matrix = np.column_stack(
+            [displacement_by_state.reshape(-1, n), displacement_by_torque.reshape(-1, 2)]
+        )
+        free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect])
 
         # State j substeps after a force of 1 N that acted for one substep.
-        decayed_states = np.empty((steps, n, bodies))
+        decayed_states = np.empty((substep_count, n, body_count))
         decayed_states[0] = states_after_constant_inputs(model, of_force, step_s)
-        for j in range(1, steps):
+        for j in range(1, substep_count):
             decayed_states[j] = phi @ decayed_states[j - 1]
-        kernel = displacement_rows @ decayed_states
-        kernel[0] += self._direct_rows[:-2]
+        force_kernel = displacement_rows @ decayed_states
+        force_kernel[0] += self._direct_rows[:-2]
 
-        def effect_on(row: Real, direct: Real, instant_s: float) -> Real:
+        def effect_on(row: Real, direct_effect: Real, instant_s: float) -> Real:
             """Return the effect of each substep's force on an output at an instant."""
-            at = instant_s / step_s
-            number = min(int(at), steps - 1)
-            fraction = at - number
-            effect = np.zeros((steps, bodies))
-            for node, weight in ((number, 1 - fraction), (number + 1, fraction)):
-                effect[:node] += weight * (row @ decayed_states[:node])[::-1]
-            effect[number] += direct
-            return effect.ravel()
+            substeps_before = instant_s / step_s
+            substep_index = min(int(substeps_before), substep_count - 1)
+            substep_fraction = substeps_before - substep_index
+            effect_matrix = np.zeros((substep_count, body_count))
+            for substep_node, node_weight in (
+                (substep_index, 1 - substep_fraction),
+                (substep_index + 1, substep_fraction),
+            ):
+                effect_matrix[:substep_node] += (
+                    node_weight * (row @ decayed_states[:substep_node])[::-1]
+                )
+            effect_matrix[substep_index] += direct_effect
+            return effect_matrix.ravel()
 
-        at_sensor = (1 - model.sensor_torque_per_torque) * self._direct_rows[-2]
-        shear = self._direct_rows[-1] - model.shear_per_torque * self._direct_rows[-2]
-        zero_row, period_s = np.zeros(bodies), self._period_s
-        effect = np.vstack(
+        direct_sensor_torque = (1 - model.sensor_torque_per_torque) * self._direct_rows[-2]
+        direct_shear = self._direct_rows[-1] - model.shear_per_torque * self._direct_rows[-2]
+        zero_row, period_s = np.zeros(body_count), self._period_s
+        effect_matrix = np.vstack(
             [
                 decayed_states[::-1].transpose(1, 0, 2).reshape(n, -1),
                 effect_on(model.angle, zero_row, period_s),
                 effect_on(model.velocity, zero_row, period_s),
-                effect_on(model.sensor_torque, at_sensor, period_s),
+                effect_on(model.sensor_torque, direct_sensor_torque, period_s),
                 effect_on(holding_torque, self._direct_rows[-2], period_s),
-                effect_on(model.shear, shear, period_s),
+                effect_on(model.shear, direct_shear, period_s),
                 effect_on(model.angle, zero_row, angle_instant_s),
-                effect_on(model.sensor_torque, at_sensor, torque_instant_s),
-                effect_on(model.shear, shear, torque_instant_s),
+                effect_on(model.sensor_torque, direct_sensor_torque, torque_instant_s),
+                effect_on(model.shear, direct_shear, torque_instant_s),
             ]
         )
         return SubstepMatrices(
-            free=np.asfortranarray(free).dot,
-            friction=-torques.sum(axis=2),
-            kernel=kernel,
-            history=_history_matrices(kernel),
-            effect=np.asfortranarray(effect).dot,
+            free=np.asfortranarray(free_matrix).dot,
+            friction=-displacement_by_torque.sum(axis=2),
+            kernel=force_kernel,
+            history=_history_matrices(force_kernel),
+            effect=np.asfortranarray(effect_matrix).dot,
             velocity_row=n + 1,
         )
 
     def cannot_touch(self, displacement_m: Real, time_s: float) -> bool:
-        """Return whether the beam cannot have touched any obstacle, nor been hit, in a period.
+        """Return whether contact of the beam with any obstacle or impact is excluded in a period.
 
         Parameters
         ----------
@@ -278,16 +291,22 @@ class AttachedObstacles:
         end_s = time_s + self._period_s
         before_m = self._start_m = self._displacement_m
         self._displacement_m = displacement_m.copy()
-        for _, impact in self._impacts:
-            if time_s < impact.at_s + impact.duration_s and impact.at_s < end_s:
+        for _, active_impact in self._impacts:
+            if (
+                time_s < active_impact.at_s + active_impact.duration_s
+                and active_impact.at_s < end_s
+            ):
                 return False
-        for index, body, _ in self._obstacles:
-            if body.from_s < end_s and time_s < body.until_s:
-                if self._penetration_m[index] > 0:
+        for body_index, active_body, _ in self._obstacles:
+            if active_body.from_s < end_s and time_s < active_body.until_s:
+                if self._penetration_m[body_index] > 0:
                     return False
-                old, new = before_m.item(index), displacement_m.item(index)
-                motion_m = 2 * abs(new - old) + body.x_m * abs(body.rate_rad_s) * self._period_s
-                if body.side * (new - _surface_displacement_m(body, end_s)) > -(
+                old, new = before_m.item(body_index), displacement_m.item(body_index)
+                motion_m = (
+                    2 * abs(new - old)
+                    + active_body.x_m * abs(active_body.rate_rad_s) * self._period_s
+                )
+                if active_body.side * (new - _surface_displacement_m(active_body, end_s)) > -(
                     motion_m + _CONTACT_MARGIN_M
                 ):
                     return False
@@ -296,7 +315,7 @@ class AttachedObstacles:
         return True
 
     def forces(self, substep_matrices: "SubstepMatrices", free_m: Real, time_s: float) -> Real:
-        """Compute the forces of obstacles and impacts on the beam in each substep of a period.
+        """Compute the forces in N of obstacles and impacts on the beam in each substep of a period.
 
         Parameters
         ----------
@@ -313,51 +332,61 @@ class AttachedObstacles:
         (substeps, bodies)
             Forces in N, positive in the direction of increasing angles.
         """
-        steps, step_s = self.substeps, self._step_s
-        kernel = substep_matrices.kernel
-        forces = np.zeros_like(self._zero_forces)
+        substep_count, step_s = self.substeps, self._step_s
+        force_kernel = substep_matrices.kernel
+        forces_n = np.zeros_like(self._zero_forces)
         free_m = free_m.copy()
-        for index, impact in self._impacts:
-            edges_s = time_s - impact.at_s + step_s * np.arange(steps + 1)
+        for body_index, active_impact in self._impacts:
+            edges_s = time_s - active_impact.at_s + step_s * np.arange(substep_count + 1)
             # Mean of half a sine over each substep.
-            phase = pi / impact.duration_s * np.clip(edges_s, 0.0, impact.duration_s)
-            forces[:, index] = (
-                -impact.force_n * impact.duration_s / pi / step_s * np.diff(np.cos(phase))
+            pulse_phase = (
+                pi / active_impact.duration_s * np.clip(edges_s, 0.0, active_impact.duration_s)
             )
-            for j in np.flatnonzero(forces[:, index]).tolist():
-                free_m[j:] += kernel[: steps - j, :, index] * forces[j, index]
+            forces_n[:, body_index] = (
+                -active_impact.force_n
+                * active_impact.duration_s
+                / pi
+                / step_s
+                * np.diff(np.cos(pulse_phase))
+            )
+            for j in np.flatnonzero(forces_n[:, body_index]).tolist():
+                free_m[j:] += (
+                    force_kernel[: substep_count - j, :, body_index] * forces_n[j, body_index]
+                )
 
-        ends_s = time_s + step_s * np.arange(1, steps + 1)
-        obstacles = []
-        for index, body, stiffness in self._obstacles:
-            is_present = (ends_s > body.from_s) & (ends_s <= body.until_s)
+        ends_s = time_s + step_s * np.arange(1, substep_count + 1)
+        active_obstacles = []
+        for body_index, active_body, stiffness_n_per_m in self._obstacles:
+            is_present = (ends_s > active_body.from_s) & (ends_s <= active_body.until_s)
             if not is_present.any():
                 continue
-            surface_m = _surface_displacement_m(body, ends_s)
-            start_m = self._penetration_m[index]
-            if start_m == -inf and body.from_s <= time_s:
-                start_m = body.side * (
-                    self._start_m.item(index) - _surface_displacement_m(body, time_s)
+            surface_m = _surface_displacement_m(active_body, ends_s)
+            start_m = self._penetration_m[body_index]
+            if start_m == -inf and active_body.from_s <= time_s:
+                start_m = active_body.side * (
+                    self._start_m.item(body_index) - _surface_displacement_m(active_body, time_s)
                 )
-            obstacles.append(
+            active_obstacles.append(
                 _ActiveObstacle(
-                    index=index,
-                    side=body.side,
-                    stiffness_n_per_m=stiffness,
-                    damping_n_per_m=body.damping_n_s_per_m / step_s,
-                    compliance_m_per_n=kernel.item(0, index, index),
-                    free_m=np.where(is_present, body.side * (free_m[:, index] - surface_m), -inf),
+                    index=body_index,
+                    side=active_body.side,
+                    stiffness_n_per_m=stiffness_n_per_m,
+                    damping_n_per_m=active_body.damping_n_s_per_m / step_s,
+                    compliance_m_per_n=force_kernel.item(0, body_index, body_index),
+                    free_m=np.where(
+                        is_present, active_body.side * (free_m[:, body_index] - surface_m), -inf
+                    ),
                     start_m=start_m,
-                    force_n=np.zeros(steps),
+                    force_n=np.zeros(substep_count),
                 )
             )
-        if obstacles:
-            self._compute_obstacle_forces(substep_matrices, obstacles)
+        if active_obstacles:
+            self._compute_obstacle_forces(substep_matrices, active_obstacles)
         self._ends_m = dict.fromkeys(range(self._positions_m.size), -inf)
-        for obstacle in obstacles:
-            self._ends_m[obstacle.index] = obstacle.start_m
-            forces[:, obstacle.index] = -obstacle.side * obstacle.force_n
-        return forces
+        for active_obstacle in active_obstacles:
+            self._ends_m[active_obstacle.index] = active_obstacle.start_m
+            forces_n[:, active_obstacle.index] = -active_obstacle.side * active_obstacle.force_n
+        return forces_n
 
     def _compute_obstacle_forces(
         self, substep_matrices: "SubstepMatrices", obstacles: "list[_ActiveObstacle]"
@@ -366,55 +395,57 @@ class AttachedObstacles:
 
         Forces of later substeps are still zero, so that whole rows can be summed.
         """
-        steps = self.substeps
+        substep_count = self.substeps
         # By how much each force moves the beam out of an obstacle until the end of each substep.
         displacement_kernels = [
-            [(one.side * other.side * substep_matrices.history[one.index, other.index],
-              other.force_n) for other in obstacles]
+            [(one.side * other_one.side * substep_matrices.history[one.index, other_one.index],
+              other_one.force_n) for other_one in obstacles]
             for one in obstacles
         ]  # fmt: skip
-        rows = [
-            [(list(matrix), force_n) for matrix, force_n in pairs] for pairs in displacement_kernels
+        kernel_rows = [
+            [(list(kernel_matrix), force_n) for kernel_matrix, force_n in kernel_pairs]
+            for kernel_pairs in displacement_kernels
         ]
-        obstacles_with_rows = list(zip(obstacles, rows, strict=True))
-        iterations = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
+        obstacles_with_rows = list(zip(obstacles, kernel_rows, strict=True))
+        iteration_count = _CONTACT_ITERATIONS if len(obstacles) > 1 else 1
         j = 0
-        while j < steps:
+        while j < substep_count:
             if all(obstacle.start_m <= 0 for obstacle in obstacles):
                 # Nothing is touched: skip to the first substep with a contact at its end.
-                first = steps
+                contact_substep = substep_count
                 free_penetrations_m = [
-                    obstacle.free_m - sum(matrix @ force_n for matrix, force_n in pairs)
-                    for obstacle, pairs in zip(obstacles, displacement_kernels, strict=True)
+                    obstacle.free_m
+                    - sum(kernel_matrix @ force_n for kernel_matrix, force_n in kernel_pairs)
+                    for obstacle, kernel_pairs in zip(obstacles, displacement_kernels, strict=True)
                 ]
                 for free_penetration_m in free_penetrations_m:
-                    is_touching = free_penetration_m[j:first] > 0
+                    is_touching = free_penetration_m[j:contact_substep] > 0
                     if is_touching.any():
-                        first = j + int(is_touching.argmax())
-                if first > j:
+                        contact_substep = j + int(is_touching.argmax())
+                if contact_substep > j:
                     for obstacle, free_penetration_m in zip(
                         obstacles, free_penetrations_m, strict=True
                     ):
-                        obstacle.start_m = free_penetration_m.item(first - 1)
-                j = first
-                if j == steps:
+                        obstacle.start_m = free_penetration_m.item(contact_substep - 1)
+                j = contact_substep
+                if j == substep_count:
                     return
-            for _ in range(iterations):
-                for obstacle, pairs_of_rows in obstacles_with_rows:
+            for _ in range(iteration_count):
+                for obstacle, row_pairs in obstacles_with_rows:
                     obstacle.force_n[j] = 0.0
-                    free_penetration = obstacle.free_m.item(j)
-                    for matrix_rows, force_n in pairs_of_rows:
-                        free_penetration -= matrix_rows[j].dot(force_n)
-                    force, obstacle.end_m = obstacle.force_and_penetration(free_penetration)
-                    obstacle.force_n[j] = force
+                    free_end_m = obstacle.free_m.item(j)
+                    for matrix_rows, force_n in row_pairs:
+                        free_end_m -= matrix_rows[j].dot(force_n)
+                    mean_force_n, obstacle.end_m = obstacle.force_and_penetration(free_end_m)
+                    obstacle.force_n[j] = mean_force_n
             for obstacle in obstacles:
                 obstacle.start_m = obstacle.end_m
             j += 1
 
-    def adopt_states(self, state: Real, other: "AttachedObstacles | None") -> Real:
-        """Adopt the states of the obstacles so far, and return the plant's new state.
+    def adopt_states(self, old_state: Real, old_obstacles: "AttachedObstacles | None") -> Real:
+        """Adopt the states of the previous obstacles, and return the plant's new state.
 
-        The obstacles so far are the first of these obstacles.
+        The previous obstacles are the first of these obstacles.
 
         Parameters
         ----------
@@ -428,37 +459,41 @@ class AttachedObstacles:
         ndarray
             State of the plant with these obstacles.
         """
-        size = self._b.size
-        old_size = 0 if other is None else other._b.size
-        old_bodies = 0 if other is None else other._positions_m.size
-        n = state.size - old_size * old_bodies
-        new_state = np.zeros(n + size * self._positions_m.size)
-        new_state[:n] = state[:n]
-        if other is not None:
-            modal_states = min(self._oscillating_states, other._oscillating_states)
-            real_states = min(size - self._oscillating_states, old_size - other._oscillating_states)
-            for index in range(old_bodies):
-                new = new_state[n + index * size :]
-                old = state[n + index * old_size :]
+        states_per_body = self._b.size
+        old_states_per_body = 0 if old_obstacles is None else old_obstacles._b.size
+        old_body_count = 0 if old_obstacles is None else old_obstacles._positions_m.size
+        n = old_state.size - old_states_per_body * old_body_count
+        new_state = np.zeros(n + states_per_body * self._positions_m.size)
+        new_state[:n] = old_state[:n]
+        if old_obstacles is not None:
+            modal_states = min(self._oscillating_states, old_obstacles._oscillating_states)
+            real_states = min(
+                states_per_body - self._oscillating_states,
+                old_states_per_body - old_obstacles._oscillating_states,
+            )
+            for body_index in range(old_body_count):
+                new = new_state[n + body_index * states_per_body :]
+                old = old_state[n + body_index * old_states_per_body :]
                 new[:modal_states] = old[:modal_states]
                 new[self._oscillating_states : self._oscillating_states + real_states] = old[
-                    other._oscillating_states : other._oscillating_states + real_states
+                    old_obstacles._oscillating_states : old_obstacles._oscillating_states
+                    + real_states
                 ]
-            self._penetration_m.update(other._penetration_m)
+            self._penetration_m.update(old_obstacles._penetration_m)
         self._displacement_m = self.displacement_rows @ new_state
         return new_state
 
-    def remove(self, body: Disturbance, time_s: float) -> None:
+    def remove(self, removed_body: Disturbance, time_s: float) -> None:
         """Remove an obstacle from the simulation at a time in seconds."""
         self._obstacles = [
             (
-                index,
+                body_index,
                 replace(known_body, until_s=min(known_body.until_s, time_s))
-                if known_body == body
+                if known_body == removed_body
                 else known_body,
                 k,
             )
-            for index, known_body, k in self._obstacles
+            for body_index, known_body, k in self._obstacles
         ]
 
     def store_forces(
@@ -487,46 +522,61 @@ class _ActiveObstacle:
     end_m: float = -inf  # penetration at the end of the present substep
 
     def force_and_penetration(self, p: float) -> tuple[float, float]:
-        """Return mean force and final penetration of a substep that ends at p without the force.
+        """Return mean force in N and final penetration in m of the beam in a substep.
+
+        Without the force the penetration would be `p` at the end.
 
         The mean force over the substep follows from the work, as the module's docstring explains.
         """
         if p == -inf:  # the obstacle is not present
             return 0.0, p
-        a, compliance, damping = self.start_m, self.compliance_m_per_n, self.damping_n_per_m
-        stiffness = self.stiffness_n_per_m
+        a, compliance_m_per_n, damping_n_per_m = (
+            self.start_m,
+            self.compliance_m_per_n,
+            self.damping_n_per_m,
+        )
+        stiffness_n_per_m = self.stiffness_n_per_m
         if a == -inf:  # the obstacle has just appeared
             a = 0.0
         if a >= 0:
-            ratio = (stiffness * compliance) ** 2
+            squared_ratio = (stiffness_n_per_m * compliance_m_per_n) ** 2
             # From 1/2, which conserves energy, to 1, which damps oscillation between substeps.
-            weight = 0.5 + 0.5 * ratio / (1 + ratio)
-            force = stiffness * ((1 - weight) * a + weight * p) + damping * (p - a)
-            force /= 1 + compliance * (stiffness * weight + damping)
-            q = p - compliance * force
+            end_weight = 0.5 + 0.5 * squared_ratio / (1 + squared_ratio)
+            mean_force_n = stiffness_n_per_m * (
+                (1 - end_weight) * a + end_weight * p
+            ) + damping_n_per_m * (p - a)
+            mean_force_n /= 1 + compliance_m_per_n * (
+                stiffness_n_per_m * end_weight + damping_n_per_m
+            )
+            q = p - compliance_m_per_n * mean_force_n
             if q >= 0:
-                return (force, q) if force > 0 else (0.0, p)
+                return (mean_force_n, q) if mean_force_n > 0 else (0.0, p)
             # The beam leaves: (p - q) (a - q) / compliance = k a²/2 - damping a (a - q)
-            p_less = p + compliance * damping * a
-            root = sqrt((p_less - a) ** 2 + 2 * compliance * stiffness * a * a)
-            q = 0.5 * (p_less + a - root)
-            force = 0.5 * stiffness * a * a / (a - q) - damping * a
+            damped_end_m = p + compliance_m_per_n * damping_n_per_m * a
+            root_m = sqrt(
+                (damped_end_m - a) ** 2 + 2 * compliance_m_per_n * stiffness_n_per_m * a * a
+            )
+            q = 0.5 * (damped_end_m + a - root_m)
+            mean_force_n = 0.5 * stiffness_n_per_m * a * a / (a - q) - damping_n_per_m * a
         elif p > 0:
             # The beam arrives: (p - q) (q - a) / compliance = k q²/2 + damping q (q - a)
-            square = 1 + compliance * (0.5 * stiffness + damping)
-            linear = p + a + compliance * damping * a
-            root = sqrt(linear * linear - 4 * square * p * a)
+            square = 1 + compliance_m_per_n * (0.5 * stiffness_n_per_m + damping_n_per_m)
+            linear = p + a + compliance_m_per_n * damping_n_per_m * a
+            root_m = sqrt(linear * linear - 4 * square * p * a)
             # Two forms of the positive root: choose the one without cancellation.
-            q = (linear + root) / (2 * square) if linear > 0 else 2 * p * a / (linear - root)
-            force = 0.5 * stiffness * q * q / (q - a) + damping * q
+            q = (linear + root_m) / (2 * square) if linear > 0 else 2 * p * a / (linear - root_m)
+            mean_force_n = 0.5 * stiffness_n_per_m * q * q / (q - a) + damping_n_per_m * q
         else:
             return 0.0, p
-        return (force, q) if force > 0 else (0.0, p)
+        return (mean_force_n, q) if mean_force_n > 0 else (0.0, p)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SubstepMatrices:
-    """Matrices for the substeps of a period, for a free or a locked motor."""
+    """Matrices for computing the contact with obstacles in the substeps of a period.
+
+    They hold for a free or for a locked motor.
+    """
 
     free: Callable[[Real], Real]
     """Function from [state, torque before and after the switch, friction of the previous period] to
@@ -546,11 +596,17 @@ class SubstepMatrices:
 
 
 def _history_matrices(kernel: Real) -> Real:
-    """Return lower triangular matrices (m, m, substeps, substeps) of a kernel (substeps, m, m)."""
-    steps = len(kernel)
-    lag = np.subtract.outer(np.arange(steps), np.arange(steps))
-    history: Real = np.where(lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0)
-    return history
+    """Return the effect of a force in each substep on the displacement at each later end, in m/N.
+
+    A `kernel` of shape (substeps, m, m) gives lower triangular matrices of shape (m, m, substeps,
+    substeps) for m obstacles and impacts.
+    """
+    substep_count = len(kernel)
+    lag = np.subtract.outer(np.arange(substep_count), np.arange(substep_count))
+    history_matrices: Real = np.where(
+        lag >= 0, kernel.transpose(1, 2, 0)[:, :, np.maximum(lag, 0)], 0.0
+    )
+    return history_matrices
 
 
 def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401 - one time or several
@@ -561,13 +617,15 @@ def _surface_displacement_m(body: Obstacle, time_s: Any) -> Any:  # noqa: ANN401
 def _substeps_per_period(beam: Beam, bodies: tuple[Disturbance, ...], period_s: float) -> int:
     """Return the number of substeps per period, which resolves the contacts of all obstacles."""
     # A force that grows like k t moves a beam without ends by k t^(3/2) / unit.
-    unit = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
+    rate_factor = 2 * sqrt(2) * beam.density_kg_per_m**0.75 * beam.bending_stiffness_n_m2**0.25
     required_rates_per_s = [_FEWEST_SUBSTEPS_PER_S]
-    for body in bodies:
-        if isinstance(body, Obstacle):
-            rate_per_s = (min(body.stiffness_n_per_m, _STIFFEST_N_PER_M) / unit) ** (2 / 3)
+    for attached_body in bodies:
+        if isinstance(attached_body, Obstacle):
+            rate_per_s = (
+                min(attached_body.stiffness_n_per_m, _STIFFEST_N_PER_M) / rate_factor
+            ) ** (2 / 3)
             reach_m = (beam.density_over_stiffness * rate_per_s**2) ** -0.25
-            tip_proximity = exp((body.x_m - beam.length_m) / reach_m)
+            tip_proximity = exp((attached_body.x_m - beam.length_m) / reach_m)
             compliance_ratio = 1 + (_TIP_COMPLIANCE_RATIO - 1) * tip_proximity
             required_rates_per_s.append(
                 _SUBSTEPS_PER_CONTACT_TIME * rate_per_s * compliance_ratio ** (2 / 3)

@@ -142,11 +142,11 @@ class SimulatedPlant:
     )
 
     def __init__(self, parameters: RigParameters) -> None:
-        period = 1 / parameters.rate_hz
-        periods, switch_s = split_delay(parameters.actuation.delay_s, period)
-        angle_periods, angle_age = split_delay(parameters.encoder.delay_s, period)
-        torque_periods, torque_age = split_delay(parameters.sensor.delay_s, period)
-        instants = (switch_s, period - angle_age, period - torque_age)
+        period_s = 1 / parameters.rate_hz
+        delay_periods, switch_s = split_delay(parameters.actuation.delay_s, period_s)
+        angle_periods, angle_age_s = split_delay(parameters.encoder.delay_s, period_s)
+        torque_periods, torque_age_s = split_delay(parameters.sensor.delay_s, period_s)
+        sample_instants_s = (switch_s, period_s - angle_age_s, period_s - torque_age_s)
 
         simulation = parameters.simulation or Simulation(torque_noise_nm=0.0, force_noise_n=0.0)
         nominal_beam = parameters.beam
@@ -156,65 +156,92 @@ class SimulatedPlant:
             bending_stiffness_n_m2=simulation.stiffness_ratio * nominal_beam.bending_stiffness_n_m2,
         )
         parameters = replace(parameters, beam=simulated_beam)
-        beam, free, locked = beam_and_coupled_models(parameters, simulation)
+        beam_realisation, free_model, locked_model = beam_and_coupled_models(parameters, simulation)
         has_sensor_filter = simulation.torque_filter_hz > 0
-        self._air = _air(parameters, beam)
+        self._air = _air(parameters, beam_realisation)
         if self._air is not None:
-            (free, on_free), (locked, on_locked) = map(self._air.extended_model, (free, locked))
-        self._contact = _contact(parameters, beam, period)
+            (free_model, free_input), (locked_model, locked_input) = map(
+                self._air.extended_model, (free_model, locked_model)
+            )
+        self._contact = _contact(parameters, beam_realisation, period_s)
         if self._contact is not None:
-            (free, on_free), (locked, on_locked) = map(self._contact.extended_model, (free, locked))
-        n = free.b.size
+            (free_model, free_input), (locked_model, locked_input) = map(
+                self._contact.extended_model, (free_model, locked_model)
+            )
+        n = free_model.b.size
         self._rest_state_per_angle = np.eye(1, n)[0]
-        self._rest_state_per_angle[2:] = -np.linalg.solve(locked.a[2:, 2:], locked.a[2:, 0])
-        step, locked_step, friction = free_and_locked_steps(free, locked, period, instants)
-        self._friction_effects: list[float] = friction[n:].tolist()
+        self._rest_state_per_angle[2:] = -np.linalg.solve(
+            locked_model.a[2:, 2:], locked_model.a[2:, 0]
+        )
+        free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
+            free_model, locked_model, period_s, sample_instants_s
+        )
+        self._friction_effects: list[float] = friction_effect[n:].tolist()
         point_count = 0
         if self._air is not None:
             point_count = len(self._air.speed)
-            held_effect = constant_force_effect(
-                free, on_free, locked.sensor_torque, period, *instants[1:]
+            free_drag_effect = constant_force_effect(
+                free_model, free_input, locked_model.sensor_torque, period_s, *sample_instants_s[1:]
             )
-            locked_held_effect = constant_force_effect(
-                locked, on_locked, locked.sensor_torque, period, *instants[1:]
+            locked_drag_effect = constant_force_effect(
+                locked_model,
+                locked_input,
+                locked_model.sensor_torque,
+                period_s,
+                *sample_instants_s[1:],
             )
-            step, locked_step = (
+            free_matrix, locked_matrix = (
                 np.vstack(
-                    [step_matrix := np.column_stack(parts), self._air.speed @ step_matrix[:n]]
+                    [
+                        step_matrix := np.column_stack(matrix_parts),
+                        self._air.speed @ step_matrix[:n],
+                    ]
                 )
-                for parts in ((step, held_effect), (locked_step, locked_held_effect))
+                for matrix_parts in (
+                    (free_matrix, free_drag_effect),
+                    (locked_matrix, locked_drag_effect),
+                )
             )
-            self._friction_speed = self._air.speed @ friction[:n]
+            self._friction_speed = self._air.speed @ friction_effect[:n]
             self._drag_torque_nm = self._drag_shear_n = 0.0
-            self._drag_torque_fraction = 1 - free.sensor_torque_per_torque
-            self._drag_shear_fraction = -free.shear_per_torque
-            self._torque_instant_fraction = 1 - torque_age / period
+            self._drag_torque_fraction = 1 - free_model.sensor_torque_per_torque
+            self._drag_shear_fraction = -free_model.shear_per_torque
+            self._torque_instant_fraction = 1 - torque_age_s / period_s
         if self._contact is not None:
             point_count = len(self._contact.displacement_rows)
             self._free_march, self._locked_march = (
                 self._contact.substep_matrices(
-                    model, of_force, locked.sensor_torque, *instants, friction=friction[:n]
+                    coupled_model,
+                    force_input,
+                    locked_model.sensor_torque,
+                    *sample_instants_s,
+                    friction_effect=friction_effect[:n],
                 )
-                for model, of_force in ((free, on_free), (locked, on_locked))
+                for coupled_model, force_input in (
+                    (free_model, free_input),
+                    (locked_model, locked_input),
+                )
             )
-            step, locked_step = (
+            free_matrix, locked_matrix = (
                 np.vstack([step_matrix, self._contact.displacement_rows @ step_matrix[:n]])
-                for step_matrix in (step, locked_step)
+                for step_matrix in (free_matrix, locked_matrix)
             )
         self._drift: StiffnessDrift | None = None
         if simulation.stiffness_drift_per_s:
             self._drift = StiffnessDrift(
                 simulation.stiffness_drift_per_s,
-                period,
-                np.abs(beam.poles_rad_s).max(initial=0.0, where=beam.poles_rad_s.imag > 0),
+                period_s,
+                np.abs(beam_realisation.poles_rad_s).max(
+                    initial=0.0, where=beam_realisation.poles_rad_s.imag > 0
+                ),
                 lambda fraction: drifted_step_arrays(
-                    fraction, parameters, simulation, beam, period, instants
+                    fraction, parameters, simulation, beam_realisation, period_s, sample_instants_s
                 ),
             )
-            step, locked_step = self._drift.arrays[:2]
+            free_matrix, locked_matrix = self._drift.arrays[:2]
         # The bound method of a matrix in column order is NumPy's fastest product of this size.
-        self._free_step = np.asfortranarray(step).dot
-        self._locked_step = np.asfortranarray(locked_step).dot
+        self._free_step = np.asfortranarray(free_matrix).dot
+        self._locked_step = np.asfortranarray(locked_matrix).dot
 
         # Two vectors that are alternately the input [state, torque before and after the switch,
         # friction, drag force] and the output [state, outputs, speeds or displacements at the
@@ -229,13 +256,13 @@ class SimulatedPlant:
         self._friction_nm = 0.0
         self._is_stuck = self._coulomb_nm > 0
         self._holding_beam_nm = 0.0
-        self._fraction_before_switch = switch_s / period
-        self._next_is_known = switch_s == 0 and periods > 0
-        self._jump_is_sensed = torque_age == 0 and not has_sensor_filter
-        self._set_jump_gains(free.sensor_torque_per_torque, free.shear_per_torque)
+        self._fraction_before_switch = switch_s / period_s
+        self._next_is_known = switch_s == 0 and delay_periods > 0
+        self._jump_is_sensed = torque_age_s == 0 and not has_sensor_filter
+        self._set_jump_gains(free_model.sensor_torque_per_torque, free_model.shear_per_torque)
 
         self._torque_nm = 0.0
-        self._torques = deque([0.0] * (periods + 2), maxlen=periods + 2)
+        self._torques = deque([0.0] * (delay_periods + 2), maxlen=delay_periods + 2)
         self._sensed_angles = deque([0.0] * (angle_periods + 1), maxlen=angle_periods + 1)
         clock_difference = simulation.clock_rate_difference
         self._sensed_torques, self._sensed_shears = (
@@ -244,7 +271,7 @@ class SimulatedPlant:
             else deque([0.0] * (torque_periods + 1), maxlen=torque_periods + 1)
             for _ in range(2)
         )
-        self._period_s = period
+        self._period_s = period_s
         self._periods_since_enabling = (
             -1
         )  # number of periods since the drive was first enabled; -1 before
@@ -258,12 +285,12 @@ class SimulatedPlant:
         self.sensed_shear_n = 0.0
 
     def enable(self) -> None:
-        """Switch the drive on; its torque is zero until the next command takes effect."""
+        """Switch the simulated drive on; its torque is zero until the next command takes effect."""
         self.enabled = True
         self._periods_since_enabling = max(self._periods_since_enabling, 0)
 
     def disable(self) -> None:
-        """Switch the drive off: the torque is zero at once, and delayed commands are dropped."""
+        """Switch the simulated drive off; its torque is zero and delayed commands are dropped."""
         self.enabled = False
         self._torque_nm = 0.0
         self._torques.extend([0.0] * len(self._torques))
@@ -281,7 +308,7 @@ class SimulatedPlant:
         """Time in seconds since the drive was first enabled; 0 before."""
         return max(self._periods_since_enabling, 0) * self._period_s
 
-    def adopt(self, other: "SimulatedPlant") -> None:
+    def adopt(self, other_plant: "SimulatedPlant") -> None:
         """Adopt another plant's parameters, at rest at the present angle, with the drive off.
 
         Parameters
@@ -290,9 +317,11 @@ class SimulatedPlant:
             Plant with the same rates and delays, which must not be used any more.
         """
         angle_rad = self.angle_rad
-        for name in self.__slots__:
-            if hasattr(other, name):  # some attributes exist only with drag or obstacles
-                setattr(self, name, getattr(other, name))
+        for attribute_name in self.__slots__:
+            if hasattr(
+                other_plant, attribute_name
+            ):  # some attributes exist only with drag or obstacles
+                setattr(self, attribute_name, getattr(other_plant, attribute_name))
         self._vectors[0][0][: self._state_count] = self._rest_state_per_angle * angle_rad
         self._sensed_angles.extend([angle_rad] * len(self._sensed_angles))
         self.angle_rad = self.sensed_angle_rad = angle_rad
@@ -306,13 +335,15 @@ class SimulatedPlant:
             Plant of the same rig, at rest, with the obstacles of this plant and more. It is created
             beforehand, because that takes a tenth of a second.
         """
-        contact = prepared._contact
-        assert contact is not None
-        state = contact.adopt_states(self._vectors[0][0][: self._state_count], self._contact)
-        for name in _OBSTACLE_ATTRIBUTES:
-            setattr(self, name, getattr(prepared, name))
-        self._vectors = _vectors(state.size, len(contact.bodies), drag_points=0)
-        self._vectors[0][0][: state.size] = state
+        new_obstacles = prepared._contact
+        assert new_obstacles is not None
+        plant_state = new_obstacles.adopt_states(
+            self._vectors[0][0][: self._state_count], self._contact
+        )
+        for attribute_name in _OBSTACLE_ATTRIBUTES:
+            setattr(self, attribute_name, getattr(prepared, attribute_name))
+        self._vectors = _vectors(plant_state.size, len(new_obstacles.bodies), drag_points=0)
+        self._vectors[0][0][: plant_state.size] = plant_state
 
     def remove_obstacle(self, obstacle: Disturbance) -> None:
         """Remove an obstacle, if one equal to the given one is simulated."""
@@ -320,7 +351,7 @@ class SimulatedPlant:
             self._contact.remove(obstacle, self.elapsed_s)
 
     def command(self, torque_nm: float) -> float:
-        """Command a torque in N·m that acts from this tick on, after the actuation delay.
+        """Command a motor torque in N·m that acts from this tick on, after the actuation delay.
 
         Returns
         -------
@@ -337,95 +368,112 @@ class SimulatedPlant:
         return torque_nm
 
     def advance(self, n_periods: int = 1) -> None:
-        """Advance by `n_periods` ticks; the last torque command acts in all of them."""
+        """Advance the plant by `n_periods` ticks; the last torque command acts in all of them."""
         n = self._state_count
-        torques = self._torques
+        torques_nm = self._torques
         for _ in range(n_periods):
             if self._drift is not None and self._drift.refresh_if_due(self._periods_since_enabling):
                 self._use_stiffness(self._drift)
-            torques.append(self._torque_nm)
-            torque_before, torque_after = torques[0], torques[1]
-            (vector, input_, _), (output, _, output_values) = self._vectors
-            vector[n] = torque_before
-            vector[n + 1] = torque_after
-            vector[n + 2] = self._friction_nm
+            torques_nm.append(self._torque_nm)
+            old_torque_nm, new_torque_nm = torques_nm[0], torques_nm[1]
+            (step_vector, step_input, _), (step_output, _, output_values) = self._vectors
+            step_vector[n] = old_torque_nm
+            step_vector[n + 1] = new_torque_nm
+            step_vector[n + 2] = self._friction_nm
             self._vectors = self._vectors[1], self._vectors[0]
             if self._air is not None:
-                self._air.write_held_force(input_[n + 3 :])
+                self._air.write_held_force(step_input[n + 3 :])
 
-            fraction = self._fraction_before_switch
+            fraction_before = self._fraction_before_switch
             shaft_load_nm = (
-                fraction * torque_before + (1 - fraction) * torque_after - self._holding_beam_nm
+                fraction_before * old_torque_nm
+                + (1 - fraction_before) * new_torque_nm
+                - self._holding_beam_nm
             )
             if self._is_stuck and abs(shaft_load_nm) <= self._coulomb_nm:
-                self._locked_step(input_, output)
+                self._locked_step(step_input, step_output)
                 if self._contact is not None:
-                    self._add_contact_effect(self._locked_march, input_, output, is_turning=False)
+                    self._add_contact_effect(
+                        self._locked_march, step_input, step_output, is_turning=False
+                    )
                 (
-                    angle,
+                    angle_rad,
                     _,
-                    torque,
-                    holding_torque,
-                    shear,
-                    sensed_angle,
-                    sensed_torque,
-                    sensed_shear,
+                    torque_nm,
+                    holding_torque_nm,
+                    shear_n,
+                    sensed_angle_rad,
+                    sensed_torque_nm,
+                    sensed_shear_n,
                 ) = output_values.tolist()
-                self._friction_nm = velocity = 0.0
-                free = False
+                self._friction_nm = velocity_rad_s = 0.0
+                is_shaft_free = False
             else:
-                free = True
-                self._free_step(input_, output)
+                is_shaft_free = True
+                self._free_step(step_input, step_output)
                 if self._contact is not None:
-                    self._add_contact_effect(self._free_march, input_, output, is_turning=True)
+                    self._add_contact_effect(
+                        self._free_march, step_input, step_output, is_turning=True
+                    )
                 (
-                    angle, velocity, torque, holding_torque, shear,
-                    sensed_angle, sensed_torque, sensed_shear,
+                    angle_rad, velocity_rad_s, torque_nm, holding_torque_nm, shear_n,
+                    sensed_angle_rad, sensed_torque_nm, sensed_shear_n,
                 ) = output_values.tolist()  # fmt: skip
                 if self._torque_jump_gain:
-                    torque_jump = torques[2] - torque_after
-                    torque += self._torque_jump_gain * torque_jump
-                    shear += self._shear_jump_gain * torque_jump
-                    sensed_torque += self._sensed_torque_jump_gain * torque_jump
-                    sensed_shear += self._sensed_shear_jump_gain * torque_jump
+                    torque_jump_nm = torques_nm[2] - new_torque_nm
+                    torque_nm += self._torque_jump_gain * torque_jump_nm
+                    shear_n += self._shear_jump_gain * torque_jump_nm
+                    sensed_torque_nm += self._sensed_torque_jump_gain * torque_jump_nm
+                    sensed_shear_n += self._sensed_shear_jump_gain * torque_jump_nm
                 if self._coulomb_nm:
                     friction_effects = self._friction_effects
-                    friction = -velocity / friction_effects[1]
-                    self._is_stuck = abs(friction) <= self._coulomb_nm
+                    friction_nm = -velocity_rad_s / friction_effects[1]
+                    self._is_stuck = abs(friction_nm) <= self._coulomb_nm
                     if self._is_stuck:
-                        velocity = 0.0
+                        velocity_rad_s = 0.0
                     else:
-                        friction = self._coulomb_nm if friction > 0 else -self._coulomb_nm
-                        velocity += friction_effects[1] * friction
-                    self._friction_nm = friction
-                    angle += friction_effects[0] * friction
-                    torque += friction_effects[2] * friction
-                    holding_torque += friction_effects[3] * friction
-                    shear += friction_effects[4] * friction
-                    sensed_angle += friction_effects[5] * friction
-                    sensed_torque += friction_effects[6] * friction
-                    sensed_shear += friction_effects[7] * friction
+                        friction_nm = self._coulomb_nm if friction_nm > 0 else -self._coulomb_nm
+                        velocity_rad_s += friction_effects[1] * friction_nm
+                    self._friction_nm = friction_nm
+                    angle_rad += friction_effects[0] * friction_nm
+                    torque_nm += friction_effects[2] * friction_nm
+                    holding_torque_nm += friction_effects[3] * friction_nm
+                    shear_n += friction_effects[4] * friction_nm
+                    sensed_angle_rad += friction_effects[5] * friction_nm
+                    sensed_torque_nm += friction_effects[6] * friction_nm
+                    sensed_shear_n += friction_effects[7] * friction_nm
             if self._air is not None:
-                torque, holding_torque, shear, sensed_torque, sensed_shear = self._with_drag_effect(
-                    output, free, torque, holding_torque, shear, sensed_torque, sensed_shear
+                torque_nm, holding_torque_nm, shear_n, sensed_torque_nm, sensed_shear_n = (
+                    self._with_drag_effect(
+                        step_output,
+                        is_shaft_free,
+                        torque_nm,
+                        holding_torque_nm,
+                        shear_n,
+                        sensed_torque_nm,
+                        sensed_shear_n,
+                    )
                 )
             if self._periods_since_enabling >= 0:
                 self._periods_since_enabling += 1
-            self._holding_beam_nm = holding_torque
-            self._sensed_angles.append(sensed_angle)
-            self._sensed_torques.append(sensed_torque)
-            self._sensed_shears.append(sensed_shear)
+            self._holding_beam_nm = holding_torque_nm
+            self._sensed_angles.append(sensed_angle_rad)
+            self._sensed_torques.append(sensed_torque_nm)
+            self._sensed_shears.append(sensed_shear_n)
         if n_periods > 0:
-            self.angle_rad = angle
-            self.velocity_rad_s = velocity
-            self.coupling_torque_nm = torque
-            self.base_shear_n = shear
+            self.angle_rad = angle_rad
+            self.velocity_rad_s = velocity_rad_s
+            self.coupling_torque_nm = torque_nm
+            self.base_shear_n = shear_n
             self.sensed_angle_rad = self._sensed_angles[0]
             self.sensed_torque_nm = self._sensed_torques[0]
             self.sensed_shear_n = self._sensed_shears[0]
 
     def _set_jump_gains(self, torque_per_torque: float, shear_per_torque: float) -> None:
-        """Set the effect of half a jump of the motor's torque on the outputs at a tick."""
+        """Set the gains from a jump of the motor's torque at a tick to the outputs at this tick.
+
+        The gains contain the factor 0.5, since half of the jump counts at the tick.
+        """
         self._torque_jump_gain = 0.5 * torque_per_torque if self._next_is_known else 0.0
         self._shear_jump_gain = 0.5 * shear_per_torque if self._next_is_known else 0.0
         self._sensed_torque_jump_gain = self._torque_jump_gain if self._jump_is_sensed else 0.0
@@ -439,70 +487,73 @@ class SimulatedPlant:
     def _add_contact_effect(
         self, substep_matrices: SubstepMatrices, input_: Real, output: Real, *, is_turning: bool
     ) -> None:
-        """Add the effect of the obstacles to the output of a step computed without them.
+        """Add the effect of the obstacles to the state and outputs of a step computed without them.
 
         Friction and contact depend on each other. They are computed alternately, starting with the
         friction of the previous period.
         """
-        contact = self._contact
-        assert contact is not None
+        attached_obstacles = self._contact
+        assert attached_obstacles is not None
         n = self._state_count
         time_s = self.elapsed_s
-        if contact.cannot_touch(output[n + OUTPUTS :], time_s):
+        if attached_obstacles.cannot_touch(output[n + OUTPUTS :], time_s):
             return
-        free_m = substep_matrices.free(input_).reshape(contact.substeps, -1)
-        friction = self._friction_nm if is_turning else 0.0
+        free_m = substep_matrices.free(input_).reshape(attached_obstacles.substeps, -1)
+        friction_nm = self._friction_nm if is_turning else 0.0
         for _ in range(_FRICTION_ITERATIONS):
-            displacement_m = free_m + friction * substep_matrices.friction
-            forces = contact.forces(substep_matrices, displacement_m, time_s)
-            effect = substep_matrices.effect(forces.ravel())
+            displacement_m = free_m + friction_nm * substep_matrices.friction
+            forces_n = attached_obstacles.forces(substep_matrices, displacement_m, time_s)
+            contact_effect = substep_matrices.effect(forces_n.ravel())
             if not is_turning or not self._coulomb_nm:
                 break
-            velocity = output.item(substep_matrices.velocity_row) + effect.item(
+            velocity_rad_s = output.item(substep_matrices.velocity_row) + contact_effect.item(
                 substep_matrices.velocity_row
             )
-            required_friction = -velocity / self._friction_effects[1]
-            required_friction = min(max(required_friction, -self._coulomb_nm), self._coulomb_nm)
-            if abs(required_friction - friction) < _FRICTION_TOLERANCE * self._coulomb_nm:
+            required_friction_nm = -velocity_rad_s / self._friction_effects[1]
+            required_friction_nm = min(
+                max(required_friction_nm, -self._coulomb_nm), self._coulomb_nm
+            )
+            if abs(required_friction_nm - friction_nm) < _FRICTION_TOLERANCE * self._coulomb_nm:
                 break
-            friction = required_friction
-        contact.store_forces(substep_matrices, forces, displacement_m)
-        output[: effect.size] += effect
+            friction_nm = required_friction_nm
+        attached_obstacles.store_forces(substep_matrices, forces_n, displacement_m)
+        output[: contact_effect.size] += contact_effect
 
     def _with_drag_effect(
         self,
         output: Real,
-        free: bool,
-        torque: float,
-        holding_torque: float,
-        shear: float,
-        sensed_torque: float,
-        sensed_shear: float,
+        is_shaft_free: bool,
+        torque_nm: float,
+        holding_torque_nm: float,
+        shear_n: float,
+        sensed_torque_nm: float,
+        sensed_shear_n: float,
     ) -> tuple[float, float, float, float, float]:
         """Return the outputs at the end of a step with the immediate effect of the drag force."""
         assert self._air is not None
         speed_m_s = output[self._state_count + OUTPUTS :]
-        if free and self._friction_nm:
+        if is_shaft_free and self._friction_nm:
             speed_m_s += self._friction_nm * self._friction_speed
-        before_nm, before_n = self._drag_torque_nm, self._drag_shear_n
-        now_nm, now_n = self._air.update_force(speed_m_s)
-        fraction, shear_fraction = (
-            (self._drag_torque_fraction, self._drag_shear_fraction) if free else (1.0, 0.0)
+        old_drag_nm, old_drag_n = self._drag_torque_nm, self._drag_shear_n
+        new_drag_nm, new_drag_n = self._air.update_force(speed_m_s)
+        torque_fraction, shear_fraction = (
+            (self._drag_torque_fraction, self._drag_shear_fraction) if is_shaft_free else (1.0, 0.0)
         )
-        now_n += shear_fraction * now_nm
-        self._drag_torque_nm, self._drag_shear_n = now_nm, now_n
-        at = self._torque_instant_fraction
+        new_drag_n += shear_fraction * new_drag_nm
+        self._drag_torque_nm, self._drag_shear_n = new_drag_nm, new_drag_n
+        instant_fraction = self._torque_instant_fraction
         return (
-            torque + fraction * now_nm,
-            holding_torque + now_nm,
-            shear + now_n,
-            sensed_torque + fraction * (before_nm + at * (now_nm - before_nm)),
-            sensed_shear + before_n + at * (now_n - before_n),
+            torque_nm + torque_fraction * new_drag_nm,
+            holding_torque_nm + new_drag_nm,
+            shear_n + new_drag_n,
+            sensed_torque_nm
+            + torque_fraction * (old_drag_nm + instant_fraction * (new_drag_nm - old_drag_nm)),
+            sensed_shear_n + old_drag_n + instant_fraction * (new_drag_n - old_drag_n),
         )
 
 
 def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
-    """Return the air drag on the beam, or None if the profile has no drag."""
+    """Return the air drag on the simulated beam, or None if the profile has no air drag."""
     simulation = parameters.simulation
     if simulation is None or not simulation.air_drag_m:
         return None
@@ -512,26 +563,32 @@ def _air(parameters: RigParameters, beam: Realisation) -> AirBrake | None:
 def _contact(
     parameters: RigParameters, beam: Realisation, period_s: float
 ) -> AttachedObstacles | None:
-    """Return the profile's obstacles and impacts, attached to the beam, or None without any."""
+    """Return a profile's obstacles and impacts, attached to the beam; None if it has none."""
     simulation = parameters.simulation
     if simulation is None or not simulation.obstacles:
         return None
-    bodies = tuple(parse_obstacle(text) for text in simulation.obstacles)
-    simulated_effects = {name: getattr(simulation, name) for name in INCOMPATIBLE_WITH_OBSTACLES}
-    check_obstacles(bodies, parameters.beam, simulated_effects)
-    return AttachedObstacles(parameters.beam, parameters.damping, beam, bodies, period_s)
+    disturbances = tuple(parse_obstacle(obstacle_text) for obstacle_text in simulation.obstacles)
+    simulated_effects = {
+        effect_name: getattr(simulation, effect_name) for effect_name in INCOMPATIBLE_WITH_OBSTACLES
+    }
+    check_obstacles(disturbances, parameters.beam, simulated_effects)
+    return AttachedObstacles(parameters.beam, parameters.damping, beam, disturbances, period_s)
 
 
 def _vectors(
-    states: int, point_count: int, *, drag_points: int
+    state_count: int, point_count: int, *, drag_points: int
 ) -> tuple[tuple[Real, Real, Real], ...]:
-    """Return two vectors for the steps, with views of input and outputs.
+    """Return two vectors for steps of the plant, each with views of its input and its outputs.
 
-    The input has `drag_points` drag forces.
+    The input contains `drag_points` drag forces.
     """
     return tuple(
-        (vector, vector[: states + 3 + drag_points], vector[states : states + OUTPUTS])
-        for vector in np.zeros((2, states + OUTPUTS + point_count))
+        (
+            step_vector,
+            step_vector[: state_count + 3 + drag_points],
+            step_vector[state_count : state_count + OUTPUTS],
+        )
+        for step_vector in np.zeros((2, state_count + OUTPUTS + point_count))
     )
 
 
@@ -555,22 +612,24 @@ class GrowingDelayLine:
         self._growth = growth
         self._readings = [0.0] * (periods + _INTERPOLATION_POINTS)
 
-    def append(self, value: float) -> None:
+    def append(self, new_reading: float) -> None:
         """Append the reading of the next tick to the delay line, and increase the delay."""
         self._age += self._growth
-        readings = self._readings
-        readings.append(value)
-        if len(readings) > self._age + _INTERPOLATION_POINTS:
-            del readings[0]
+        stored_readings = self._readings
+        stored_readings.append(new_reading)
+        if len(stored_readings) > self._age + _INTERPOLATION_POINTS:
+            del stored_readings[0]
 
     def __getitem__(self, index: int) -> float:
         """Return the interpolated reading at the present delay of the line; `index` must be 0."""
         assert index == 0
-        readings = self._readings
-        position = len(readings) - 1 - self._age
-        first = min(max(int(position) - 1, 0), len(readings) - _INTERPOLATION_POINTS)
-        x = position - first
-        a, b, c, d = readings[first : first + _INTERPOLATION_POINTS]
+        stored_readings = self._readings
+        read_position = len(stored_readings) - 1 - self._age
+        first_index = min(
+            max(int(read_position) - 1, 0), len(stored_readings) - _INTERPOLATION_POINTS
+        )
+        x = read_position - first_index
+        a, b, c, d = stored_readings[first_index : first_index + _INTERPOLATION_POINTS]
         return (
             -a * (x - 1) * (x - 2) * (x - 3) / 6
             + b * x * (x - 2) * (x - 3) / 2

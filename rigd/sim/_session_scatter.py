@@ -51,17 +51,23 @@ def session_parameters(rig: RigParameters, seed: int) -> RigParameters:
     standard_normals = np.random.default_rng((seed, _RANDOM_STREAM)).standard_normal(
         percentages.size
     )
-    zeta, gamma, stiffness = np.exp(0.01 * percentages * standard_normals).tolist()
+    zeta_factor, gamma_factor, stiffness_factor = np.exp(
+        0.01 * percentages * standard_normals
+    ).tolist()
     damping = rig.damping
     return replace(
         rig,
-        damping=replace(damping, zeta=zeta * damping.zeta, gamma=gamma * damping.gamma),
-        simulation=replace(simulation, stiffness_ratio=stiffness * simulation.stiffness_ratio),
+        damping=replace(
+            damping, zeta=zeta_factor * damping.zeta, gamma=gamma_factor * damping.gamma
+        ),
+        simulation=replace(
+            simulation, stiffness_ratio=stiffness_factor * simulation.stiffness_ratio
+        ),
     )
 
 
 def _scatter_percentages(rig: RigParameters) -> tuple[float, float, float]:
-    """Return the percentages by which zeta, gamma and stiffness scatter between sessions."""
+    """Return the percentages by which zeta, gamma and bending stiffness vary between sessions."""
     simulation = rig.simulation
     if simulation is None:
         return 0.0, 0.0, 0.0

@@ -53,37 +53,37 @@ def beam_and_coupled_models(
     modes_of
         As for :func:`rigd.beam.realisation.realise`.
     """
-    beam = realise(
+    beam_realisation = realise(
         parameters.beam,
         parameters.damping,
         tip_mass_kg=simulation.tip_mass_kg,
         root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
         modes_of=modes_of,
     )
-    loaded = LoadedBeam(
+    loaded_beam = LoadedBeam(
         parameters.beam,
         parameters.damping,
         simulation.tip_mass_kg,
         simulation.clamp_compliance_rad_per_nm,
     )
-    attach = partial(
+    attach_beam = partial(
         couple,
-        beam,
+        beam_realisation,
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-        shear=state_output(beam, loaded.shear, inertial=True),
+        shear=state_output(beam_realisation, loaded_beam.shear, inertial=True),
     )
-    free = attach(
+    free_model = attach_beam(
         motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,
         viscous_nm_s_per_rad=parameters.motor.viscous_nm_s_per_rad,
     )
     # No torque turns an infinite inertia: the beam on a locked shaft.
-    locked = attach(motor_inertia_kg_m2=np.inf)
+    locked_model = attach_beam(motor_inertia_kg_m2=np.inf)
     if simulation.torque_filter_hz > 0:
-        free, locked = (
-            with_filter(model, simulation.torque_filter_hz, simulation.torque_filter_order)
-            for model in (free, locked)
+        free_model, locked_model = (
+            with_filter(coupled_model, simulation.torque_filter_hz, simulation.torque_filter_order)
+            for coupled_model in (free_model, locked_model)
         )
-    return beam, free, locked
+    return beam_realisation, free_model, locked_model
 
 
 def free_and_locked_steps(
@@ -103,16 +103,16 @@ def free_and_locked_steps(
 
     Returns
     -------
-    step, locked_step : (n + 8, n + 3)
-    friction : (n + 8,)
+    free_matrix, locked_matrix : (n + 8, n + 3)
+    friction_effect : (n + 8,)
     """
     n = free.b.size
-    step = _step_matrix(free, locked.sensor_torque, period_s, *instants)
-    locked_step = _step_matrix(locked, locked.sensor_torque, period_s, *instants)
-    friction = -(step[:, n] + step[:, n + 1])
-    step = np.column_stack([step, step[:, :n] @ friction[:n]])
-    locked_step = np.column_stack([locked_step, locked_step[:, :n] @ friction[:n]])
-    return step, locked_step, friction
+    free_matrix = _step_matrix(free, locked.sensor_torque, period_s, *instants)
+    locked_matrix = _step_matrix(locked, locked.sensor_torque, period_s, *instants)
+    friction_effect = -(free_matrix[:, n] + free_matrix[:, n + 1])
+    free_matrix = np.column_stack([free_matrix, free_matrix[:, :n] @ friction_effect[:n]])
+    locked_matrix = np.column_stack([locked_matrix, locked_matrix[:, :n] @ friction_effect[:n]])
+    return free_matrix, locked_matrix, friction_effect
 
 
 def drifted_step_arrays(
@@ -123,7 +123,7 @@ def drifted_step_arrays(
     period_s: float,
     instants: tuple[float, float, float],
 ) -> tuple[Real, Real, Real, Real]:
-    """Return the arrays of a step for a beam whose bending stiffness has drifted.
+    """Return the matrices of a plant's step for a beam whose bending stiffness has drifted.
 
     Parameters
     ----------
@@ -138,9 +138,9 @@ def drifted_step_arrays(
 
     Returns
     -------
-    step, locked_step : (n + 8, n + 3)
+    free_matrix, locked_matrix : (n + 8, n + 3)
     friction_effects : (8,)
-    per_torque : (2,)
+    effects_per_torque : (2,)
         Immediate effect of the motor's torque on torque and shear of the sensor.
 
     Raises
@@ -153,7 +153,7 @@ def drifted_step_arrays(
         beam_at_start, bending_stiffness_n_m2=stiffness_ratio * beam_at_start.bending_stiffness_n_m2
     )
     try:
-        beam, *models = beam_and_coupled_models(
+        drifted_realisation, *coupled_models = beam_and_coupled_models(
             replace(parameters, beam=drifted_beam), simulation, beam_at_start
         )
     except RealisationError as error:
@@ -162,10 +162,17 @@ def drifted_step_arrays(
             f"{stiffness_ratio:.4g} times its stiffness, which it drifts to; leave the drift out. "
             f"{error}"
         ) from error
-    free, locked = (with_modal_displacements(model, beam, at_start) for model in models)
-    step, locked_step, friction = free_and_locked_steps(free, locked, period_s, instants)
-    per_torque = np.array([free.sensor_torque_per_torque, free.shear_per_torque])
-    return step, locked_step, friction[free.b.size :], per_torque
+    free_model, locked_model = (
+        with_modal_displacements(coupled_model, drifted_realisation, at_start)
+        for coupled_model in coupled_models
+    )
+    free_matrix, locked_matrix, friction_effect = free_and_locked_steps(
+        free_model, locked_model, period_s, instants
+    )
+    effects_per_torque = np.array(
+        [free_model.sensor_torque_per_torque, free_model.shear_per_torque]
+    )
+    return free_matrix, locked_matrix, friction_effect[free_model.b.size :], effects_per_torque
 
 
 def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
@@ -176,9 +183,9 @@ def split_delay(delay_s: float, period_s: float) -> tuple[int, float]:
     delay_s, period_s
         Delay and duration of a period in seconds.
     """
-    periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
-    remainder_s = delay_s - periods * period_s
-    return periods, remainder_s if remainder_s > _SAME_INSTANT_PERIODS * period_s else 0.0
+    whole_periods = int(delay_s / period_s + _SAME_INSTANT_PERIODS)
+    remainder_s = delay_s - whole_periods * period_s
+    return whole_periods, remainder_s if remainder_s > _SAME_INSTANT_PERIODS * period_s else 0.0
 
 
 def _step_matrix(
@@ -189,7 +196,9 @@ def _step_matrix(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """Return the matrix from [state, torque before and after its change] to [state, outputs].
+    """Return the matrix of a step of the plant, which lasts one period.
+
+    It maps [state, motor torque before and after its change] to [state, outputs].
 
     Parameters
     ----------
@@ -212,8 +221,8 @@ def _step_matrix(
     @cache
     def state_at(instant_s: float) -> Real:
         phi, step_response = propagator(model, instant_s)
-        after = propagator(model, max(instant_s - switch_s, 0.0))[1]
-        return np.column_stack([phi, step_response - after, after])
+        response_after = propagator(model, max(instant_s - switch_s, 0.0))[1]
+        return np.column_stack([phi, step_response - response_after, response_after])
 
     def torque_at(instant_s: float) -> Real:
         return row_with_immediate_effect(
@@ -223,9 +232,9 @@ def _step_matrix(
     def shear_at(instant_s: float) -> Real:
         return row_with_immediate_effect(model.shear, model.shear_per_torque, instant_s)
 
-    def row_with_immediate_effect(of_state: Real, per_torque: float, instant_s: float) -> Real:
-        """Return the row of the immediate effect of the torque."""
-        row: Real = of_state @ state_at(instant_s)
+    def row_with_immediate_effect(state_row: Real, per_torque: float, instant_s: float) -> Real:
+        """Return the row of an output on which the motor torque acts at once."""
+        row: Real = state_row @ state_at(instant_s)
         after_switch_s = instant_s - switch_s
         if abs(after_switch_s) <= _SAME_INSTANT_PERIODS * period_s:
             fraction_after = 0.5
@@ -234,10 +243,10 @@ def _step_matrix(
         row[-2:] += per_torque * np.array([1 - fraction_after, fraction_after])
         return row
 
-    end = state_at(period_s)
+    end_rows = state_at(period_s)
     return np.vstack(
         [
-            *_output_rows(model, end, torque_at(period_s), holding_torque),
+            *_output_rows(model, end_rows, torque_at(period_s), holding_torque),
             shear_at(period_s),
             model.angle @ state_at(angle_instant_s),
             torque_at(torque_instant_s)
@@ -251,10 +260,16 @@ def _step_matrix(
 
 
 def _output_rows(
-    model: CoupledModel, end: Real, torque: Real, holding_torque: Real
+    model: CoupledModel, end_rows: Real, torque_row: Real, holding_torque: Real
 ) -> tuple[Real, ...]:
     """Return the rows of the state after a period, and of the outputs except shear and sensors."""
-    return end, model.angle @ end, model.velocity @ end, torque, holding_torque @ end
+    return (
+        end_rows,
+        model.angle @ end_rows,
+        model.velocity @ end_rows,
+        torque_row,
+        holding_torque @ end_rows,
+    )
 
 
 def constant_force_effect(
@@ -265,7 +280,7 @@ def constant_force_effect(
     angle_instant_s: float,
     torque_instant_s: float,
 ) -> Real:
-    """Return the effect of a drag force, constant over a period, on [next state, outputs].
+    """Return the effect of a drag force, constant over a period, on the next state and outputs.
 
     Parameters
     ----------

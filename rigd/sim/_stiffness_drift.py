@@ -64,36 +64,41 @@ class StiffnessDrift:
         arrays_at: Callable[[float], Sequence[Real]],
     ) -> None:
         # The phase of the fastest mode in a step, from the middle of the drift to its ends.
-        half_rad = 0.25 * LARGEST_DRIFT * fastest_rad_s * period_s
-        points = 3
+        half_angle_rad = 0.25 * LARGEST_DRIFT * fastest_rad_s * period_s
+        point_count = 3
         while (
-            2 * (0.5 * half_rad) ** points / math.factorial(points) > _LARGEST_INTERPOLATION_ERROR
+            2 * (0.5 * half_angle_rad) ** point_count / math.factorial(point_count)
+            > _LARGEST_INTERPOLATION_ERROR
         ):
-            points += 1
-        chebyshev_points = -np.cos(np.pi * np.arange(points) / (points - 1))
-        end = math.copysign(LARGEST_DRIFT, rate_per_s)
+            point_count += 1
+        chebyshev_points = -np.cos(np.pi * np.arange(point_count) / (point_count - 1))
+        end_drift = math.copysign(LARGEST_DRIFT, rate_per_s)
         arrays_at_points = [
-            arrays_at(1 + end * 0.5 * (1 + chebyshev_point))
+            arrays_at(1 + end_drift * 0.5 * (1 + chebyshev_point))
             for chebyshev_point in chebyshev_points.tolist()
         ]
-        shapes = [array.shape for array in arrays_at_points[0]]
-        values = np.stack(
-            [np.concatenate([a.ravel("F") for a in arrays]) for arrays in arrays_at_points]
+        array_shapes = [start_array.shape for start_array in arrays_at_points[0]]
+        stacked_values = np.stack(
+            [
+                np.concatenate([a.ravel("F") for a in point_arrays])
+                for point_arrays in arrays_at_points
+            ]
         )
         self._coefficients = np.linalg.solve(
-            np.polynomial.chebyshev.chebvander(chebyshev_points, points - 1), values
+            np.polynomial.chebyshev.chebvander(chebyshev_points, point_count - 1), stacked_values
         )
-        self._flat_arrays = values[0].copy()
-        sizes = [math.prod(shape) for shape in shapes]
-        parts = np.split(self._flat_arrays, np.cumsum(sizes[:-1]))
+        self._flat_arrays = stacked_values[0].copy()
+        array_sizes = [math.prod(array_shape) for array_shape in array_shapes]
+        flat_parts = np.split(self._flat_arrays, np.cumsum(array_sizes[:-1]))
         self.arrays = tuple(
-            part.reshape(shape, order="F") for part, shape in zip(parts, shapes, strict=True)
+            flat_part.reshape(array_shape, order="F")
+            for flat_part, array_shape in zip(flat_parts, array_shapes, strict=True)
         )
         self._periods_per_update = max(1, round(_UPDATE_INTERVAL_S / period_s))
         self._drift_fraction_per_period = abs(rate_per_s) * period_s / LARGEST_DRIFT
 
     def refresh_if_due(self, periods: int) -> bool:
-        """Update the arrays for the coming periods if an update is due.
+        """Update the step matrices for the coming periods if an update is due.
 
         Parameters
         ----------
@@ -107,13 +112,15 @@ class StiffnessDrift:
         """
         if periods < 0 or periods % self._periods_per_update:
             return False
-        fraction = (periods + 0.5 * self._periods_per_update) * self._drift_fraction_per_period
-        if fraction - self._periods_per_update * self._drift_fraction_per_period > 1:
+        drift_fraction = (
+            periods + 0.5 * self._periods_per_update
+        ) * self._drift_fraction_per_period
+        if drift_fraction - self._periods_per_update * self._drift_fraction_per_period > 1:
             return False  # the drift has ended
-        angle = math.acos(1 - 2 * min(fraction, 1.0))
+        chebyshev_rad = math.acos(1 - 2 * min(drift_fraction, 1.0))
         # The k-th polynomial is cos(k arccos x); x runs from -1 to 1.
-        weights = np.cos((math.pi - angle) * np.arange(len(self._coefficients)))
-        weights.dot(self._coefficients, self._flat_arrays)
+        polynomial_values = np.cos((math.pi - chebyshev_rad) * np.arange(len(self._coefficients)))
+        polynomial_values.dot(self._coefficients, self._flat_arrays)
         return True
 
 
@@ -131,14 +138,16 @@ def with_modal_displacements(
     at_start
         Realisation at the start of the drift, which defines the units of the displacements.
     """
-    n, states = model.b.size, beam.b.size
+    n, beam_state_count = model.b.size, beam.b.size
     from_displacements = np.eye(n)
-    from_displacements[2 : 2 + states, 2 : 2 + states] = _states_from_displacements(beam, at_start)
+    from_displacements[2 : 2 + beam_state_count, 2 : 2 + beam_state_count] = (
+        _states_from_displacements(beam, at_start)
+    )
     to_displacements = np.linalg.inv(from_displacements)
 
-    def row(own: Real) -> Real:
-        transformed: Real = own @ from_displacements
-        return transformed
+    def row(old_row: Real) -> Real:
+        new_row: Real = old_row @ from_displacements
+        return new_row
 
     return replace(
         model,
@@ -156,31 +165,38 @@ def with_modal_displacements(
 
 
 def _states_from_displacements(beam: Realisation, at_start: Realisation) -> Real:
-    """Return the matrix from modal displacements, speeds and other states to the states."""
+    """Return the matrix that computes the beam model's states from modal displacements and speeds.
+
+    States that belong to no mode are unchanged.
+    """
     rates_at_start = {
-        mode: abs(pole)
-        for mode, pole in zip(at_start.modes.tolist(), at_start.poles_rad_s.tolist(), strict=True)
+        beam_mode: abs(pole)
+        for beam_mode, pole in zip(
+            at_start.modes.tolist(), at_start.poles_rad_s.tolist(), strict=True
+        )
     }
-    poles, modes = beam.poles_rad_s, beam.modes
-    first = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
-    matrix = np.zeros((beam.b.size, beam.b.size))
-    column = 0
+    poles, pole_modes = beam.poles_rad_s, beam.modes
+    first_states = np.cumsum([0, *np.where(poles.imag > 0, 2, 1)])  # state of each pole
+    state_matrix = np.zeros((beam.b.size, beam.b.size))
+    column_index = 0
     unchanged_states: list[int] = []
-    for mode in np.unique(modes):
-        of_mode = np.flatnonzero(modes == mode)
-        states = first[of_mode]
-        if mode >= 0 and poles[of_mode[0]].imag > 0:
-            pole = poles[of_mode[0]]
+    for beam_mode in np.unique(pole_modes):
+        mode_poles = np.flatnonzero(pole_modes == beam_mode)
+        mode_states = first_states[mode_poles]
+        if beam_mode >= 0 and poles[mode_poles[0]].imag > 0:
+            pole = poles[mode_poles[0]]
             # With x - i y of the realisation: x - i y = p* q - q'.
-            rows = [[pole.real, -1.0], [pole.imag, 0.0]]
-            states = np.array([states[0], states[0] + 1])
-        elif mode >= 0 and of_mode.size == 2:
-            rows = [[pole.real, -1.0] for pole in poles[of_mode[::-1]]]
+            state_rows = [[pole.real, -1.0], [pole.imag, 0.0]]
+            mode_states = np.array([mode_states[0], mode_states[0] + 1])
+        elif beam_mode >= 0 and mode_poles.size == 2:
+            state_rows = [[pole.real, -1.0] for pole in poles[mode_poles[::-1]]]
         else:
-            unchanged_states += states.tolist()
+            unchanged_states += mode_states.tolist()
             continue
-        unit = np.array([1 / rates_at_start[int(mode)], 1.0])
-        matrix[states, column : column + 2] = np.array(rows) * unit
-        column += 2
-    matrix[unchanged_states, np.arange(column, beam.b.size)] = 1.0
-    return matrix
+        column_scales = np.array([1 / rates_at_start[int(beam_mode)], 1.0])
+        state_matrix[mode_states, column_index : column_index + 2] = (
+            np.array(state_rows) * column_scales
+        )
+        column_index += 2
+    state_matrix[unchanged_states, np.arange(column_index, beam.b.size)] = 1.0
+    return state_matrix

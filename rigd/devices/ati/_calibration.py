@@ -95,7 +95,7 @@ class Calibration:
     ratings: tuple[float, ...] | None = None
 
     def __post_init__(self) -> None:
-        """Raise if no wrench can be computed with the calibration."""
+        """Raise ValueError if no wrench can be computed with the calibration."""
         if self.force_unit not in _FORCE_UNITS or self.torque_unit not in _TORQUE_UNITS:
             raise ValueError(
                 f"its calibration has the unit codes {self.force_unit} (force) and "
@@ -110,24 +110,25 @@ class Calibration:
         self._check_matrix()
 
     def _check_matrix(self) -> None:
-        """Raise if an entry of the calibration matrix is implausible, or the matrix is singular."""
-        for number, (axis, row) in enumerate(zip(_AXES, self.matrix, strict=True)):
-            unit = self.force_unit_n if number < 3 else self.torque_unit_nm
-            counts = self.counts_per_force if number < 3 else self.counts_per_torque
-            full_scale_unit = unit / counts * _FULL_SCALE_COUNTS
-            name = "N" if number < 3 else "N·m"
-            for gauge, entry in enumerate(row):
-                if not isfinite(entry):
+        """Raise ValueError if the calibration matrix has an implausible entry or is singular."""
+        for axis_index, (axis, row) in enumerate(zip(_AXES, self.matrix, strict=True)):
+            axis_unit = self.force_unit_n if axis_index < 3 else self.torque_unit_nm
+            counts_per_unit = self.counts_per_force if axis_index < 3 else self.counts_per_torque
+            full_scale_unit = axis_unit / counts_per_unit * _FULL_SCALE_COUNTS
+            unit_name = "N" if axis_index < 3 else "N·m"
+            for gauge, matrix_entry in enumerate(row):
+                if not isfinite(matrix_entry):
                     raise ValueError(
-                        f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry}, "
-                        "which is not a number. Choose another calibration."
+                        f"the entry {axis}, gauge {gauge} of its calibration matrix is "
+                        f"{matrix_entry}, which is not a number. Choose another calibration."
                     )
-                if abs(entry) * full_scale_unit > _LARGEST_ENTRY:
+                if abs(matrix_entry) * full_scale_unit > _LARGEST_ENTRY:
                     raise ValueError(
-                        f"the entry {axis}, gauge {gauge} of its calibration matrix is {entry:.4g} "
-                        f"({abs(entry) * full_scale_unit:.2g} {name} for a gauge at full scale), "
-                        f"more than any sensor has ({_LARGEST_ENTRY:g} {name}): its memory is "
-                        "damaged. Choose another calibration, or have the sensor repaired."
+                        f"the entry {axis}, gauge {gauge} of its calibration matrix is "
+                        f"{matrix_entry:.4g} ({abs(matrix_entry) * full_scale_unit:.2g} "
+                        f"{unit_name} for a gauge at full scale), more than any sensor has "
+                        f"({_LARGEST_ENTRY:g} {unit_name}): its memory is damaged. Choose another "
+                        "calibration, or have the sensor repaired."
                     )
             if not any(row):
                 raise ValueError(
@@ -137,14 +138,16 @@ class Calibration:
             if max(map(abs, row)) * full_scale_unit < _SMALLEST_ENTRY:
                 raise ValueError(
                     f"no entry of the row {axis} of its calibration matrix is beyond "
-                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST_ENTRY:g} {name} for a gauge "
-                    "at full scale): its memory is damaged. Choose another calibration, or have "
-                    "the sensor repaired."
+                    f"{max(map(abs, row)):.2g} (less than {_SMALLEST_ENTRY:g} {unit_name} for a "
+                    "gauge at full scale): its memory is damaged. Choose another calibration, or "
+                    "have the sensor repaired."
                 )
-        rows = np.array(self.matrix)
-        rows /= np.abs(rows).max(axis=1, keepdims=True)
-        rows /= np.abs(rows).max(axis=0, keepdims=True).clip(min=np.finfo(float).tiny)
-        singular_values = np.linalg.svd(rows, compute_uv=False)
+        scaled_matrix = np.array(self.matrix)
+        scaled_matrix /= np.abs(scaled_matrix).max(axis=1, keepdims=True)
+        scaled_matrix /= (
+            np.abs(scaled_matrix).max(axis=0, keepdims=True).clip(min=np.finfo(float).tiny)
+        )
+        singular_values = np.linalg.svd(scaled_matrix, compute_uv=False)
         if singular_values[-1] < _LEAST_SINGULAR_VALUE_RATIO * singular_values[0]:
             raise ValueError(
                 "its calibration matrix is singular: some of its six axes are combinations of the "
@@ -164,10 +167,13 @@ class Calibration:
 
     def wrench_per_count(self) -> MatrixRows:
         """Return the 6x6 matrix that converts counts of gauges 0 to 5 to a wrench in N and N·m."""
-        force = self.force_unit_n / self.counts_per_force
-        torque = self.torque_unit_nm / self.counts_per_torque
+        force_per_count = self.force_unit_n / self.counts_per_force
+        torque_per_count = self.torque_unit_nm / self.counts_per_torque
         return tuple(
-            tuple((force if axis < 3 else torque) * entry for entry in row)
+            tuple(
+                (force_per_count if axis < 3 else torque_per_count) * matrix_entry
+                for matrix_entry in row
+            )
             for axis, row in enumerate(self.matrix)
         )
 
@@ -198,7 +204,7 @@ class Calibration:
 
 
 def wrench_function(
-    rows: MatrixRows,
+    matrix_rows: MatrixRows,
 ) -> Callable[[float, float, float, float, float, float], Wrench]:
     """Return a function that multiplies six gauge counts by a 6x6 matrix.
 
@@ -211,7 +217,7 @@ def wrench_function(
         (ua, ub, uc, ud, ue, uf),
         (va, vb, vc, vd, ve, vf),
         (wa, wb, wc, wd, we, wf),
-    ) = rows
+    ) = matrix_rows
 
     def wrench(a: float, b: float, c: float, d: float, e: float, f: float) -> Wrench:
         return (
@@ -232,10 +238,14 @@ def same_serial_number(profile_number: str, sensor_number: str) -> bool:
 
 
 def printable_text(raw: Sequence[int]) -> str:
-    """Decode bytes to text without padding, or to hexadecimal digits if they are not text."""
-    data = bytes(raw).rstrip(b"\0\xff ")
-    text = data.decode("latin-1").strip()
-    return text if text.isascii() and (text.isprintable() or not text) else data.hex(" ")
+    """Decode bytes to text without padding, or to hexadecimal digits if they are not printable."""
+    unpadded_bytes = bytes(raw).rstrip(b"\0\xff ")
+    decoded_text = unpadded_bytes.decode("latin-1").strip()
+    return (
+        decoded_text
+        if decoded_text.isascii() and (decoded_text.isprintable() or not decoded_text)
+        else unpadded_bytes.hex(" ")
+    )
 
 
 # Calibration block of a Digital F/T
@@ -261,9 +271,9 @@ class CalibrationBlock:
     """Amplifier offsets of gauges 0 to 5, as register values."""
 
 
-def first_block_register(number: int) -> int:
-    """Return the address of the first register of calibration block `number` (1 to 16)."""
-    return _FIRST_BLOCK_REGISTER + (number - 1) * _BLOCK_SPACING_REGISTERS
+def first_block_register(block_number: int) -> int:
+    """Return the address of the first register of calibration block `block_number` (1 to 16)."""
+    return _FIRST_BLOCK_REGISTER + (block_number - 1) * _BLOCK_SPACING_REGISTERS
 
 
 def parse_block(registers: Sequence[int]) -> CalibrationBlock:

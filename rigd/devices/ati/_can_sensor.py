@@ -75,9 +75,9 @@ class AtiCanSensor:
     def __init__(self, rig: RigParameters, link: CanLink) -> None:
         settings, acquisition = rig.ati_can, rig.acquisition
         if settings is None or acquisition is None:
-            missing = "ati_can" if settings is None else "acquisition"
+            missing_section = "ati_can" if settings is None else "acquisition"
             raise DeviceError(
-                f"The profile has no section [{missing}], which a sensor on CAN needs."
+                f"The profile has no section [{missing_section}], which a sensor on CAN needs."
             )
         self._settings = settings
         self._link = link
@@ -131,14 +131,14 @@ class AtiCanSensor:
             )
             self._select_calibration()
             serial_number = self._read_serial_number()  # belongs to the calibration, not to the box
-            matrix = self._read_matrix()
+            calibration_matrix = self._read_matrix()
             # A wrong entry would falsify every result, and the protocol has no checksum of its own.
-            if self._read_matrix() != matrix:
+            if self._read_matrix() != calibration_matrix:
                 raise DeviceError(
                     f"{self._name}: its calibration matrix read differently the second time; "
                     "check cable and termination."
                 )
-            self._calibration = self._read_scale(serial_number, matrix)
+            self._calibration = self._read_scale(serial_number, calibration_matrix)
             self._wrench_from_counts = wrench_function(self._calibration.wrench_per_wire_count())
             self._evaluate(self._first_reading())
             self.polls.forget()
@@ -178,20 +178,23 @@ class AtiCanSensor:
         DeviceError
             If the bus has failed, or the sensor has restarted.
         """
-        polls = self.polls
+        gauge_polls = self.polls
         if self._lock_step and not self._waits_for_reply:
             # No time passes between two ticks: the reply to the last poll is still in preparation.
-            polls.wait(time.monotonic_ns() + self._deadline_ns)
-        polls.drain()
+            gauge_polls.wait(time.monotonic_ns() + self._deadline_ns)
+        gauge_polls.drain()
         if not self._waits_for_reply:
-            self._previous_reply, self._previous_ns = polls.process_replies(), polls.sent_ns
+            self._previous_reply, self._previous_ns = (
+                gauge_polls.process_replies(),
+                gauge_polls.sent_ns,
+            )
         elif self._missed_deadline:
-            self.late_replies += polls.process_replies() is not None
+            self.late_replies += gauge_polls.process_replies() is not None
         if self._calibration_in_doubt and not self._has_same_calibration():
-            polls.register_pause()
+            gauge_polls.register_pause()
         else:
-            polls.send_or_pause()
-        self._reply_deadline_ns = polls.sent_ns + self._deadline_ns
+            gauge_polls.send_or_pause()
+        self._reply_deadline_ns = gauge_polls.sent_ns + self._deadline_ns
 
     def read_wrench(self) -> Wrench:
         """Return the wrench in N and N·m from the latest valid reply.
@@ -202,11 +205,11 @@ class AtiCanSensor:
             If the bus has failed or the sensor reports an error.
         """
         if self._waits_for_reply:
-            answer, sent_ns = self.polls.wait(self._reply_deadline_ns), self.polls.sent_ns
-            self._missed_deadline = answer is None
+            poll_reply, sent_ns = self.polls.wait(self._reply_deadline_ns), self.polls.sent_ns
+            self._missed_deadline = poll_reply is None
         else:
-            answer, sent_ns = self._previous_reply, self._previous_ns
-        if answer is None:
+            poll_reply, sent_ns = self._previous_reply, self._previous_ns
+        if poll_reply is None:
             self.wrench_stale = True
             self._unanswered_ticks += 1
             return self._wrench
@@ -221,12 +224,12 @@ class AtiCanSensor:
             return self._wrench
         self.wrench_stale = False
         self.wrench_time_ns = sent_ns
-        return self._evaluate(answer)
+        return self._evaluate(poll_reply)
 
     def health(self) -> LineHealth:
-        """Return errors on the line to the sensor, and the sensor's status word."""
-        errors = self.polls.lost + self.bus_errors
-        return LineHealth(errors=errors, status=self._status_word)
+        """Return the number of errors on the line to the sensor, and the sensor's status word."""
+        error_count = self.polls.lost + self.bus_errors
+        return LineHealth(errors=error_count, status=self._status_word)
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Poll the sensor continuously for a while, before the first tick; return statistics.
@@ -235,7 +238,7 @@ class AtiCanSensor:
         -------
         dict
             ``polls_hz`` (readings per second), ``turnaround_median_s`` and ``turnaround_p99_s``
-            (time from poll to reply; NaN without replies), ``lost`` (polls without a reply).
+            (time from poll to reply; NaN without replies), ``lost_polls`` (polls without a reply).
 
         Raises
         ------
@@ -243,15 +246,15 @@ class AtiCanSensor:
             If the bus has failed or the sensor reports an error.
         """
         turnarounds_ns: list[int] = []
-        lost = 0
+        lost_polls = 0
         begin_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         while time.monotonic_ns() < end_ns:
-            answer = self._poll(_LOST_POLL_S)
-            if answer is None:
-                lost += 1
+            poll_reply = self._poll(_LOST_POLL_S)
+            if poll_reply is None:
+                lost_polls += 1
                 continue
-            self._evaluate(answer)
+            self._evaluate(poll_reply)
             turnarounds_ns.append(self.polls.turnaround_ns)
         elapsed_s = (time.monotonic_ns() - begin_ns) * 1e-9
         self.polls.forget()
@@ -260,7 +263,7 @@ class AtiCanSensor:
             "polls_hz": len(turnarounds_ns) / elapsed_s,
             "turnaround_median_s": _quantile_s(turnarounds_ns, 0.5),
             "turnaround_p99_s": _quantile_s(turnarounds_ns, 0.99),
-            "lost": float(lost),
+            "lost": float(lost_polls),
         }
 
     def close(self) -> None:
@@ -280,18 +283,18 @@ class AtiCanSensor:
             )
             for opcode in REPLY_LENGTHS:
                 if opcode not in (netcanoem.GAUGES, netcanoem.GAUGES_REST):
-                    store = partial(self._inbox.__setitem__, opcode)
-                    exchange.subscribe(identifier(base_id, opcode), store)
+                    store_reply = partial(self._inbox.__setitem__, opcode)
+                    exchange.subscribe(identifier(base_id, opcode), store_reply)
             self._subscribed_to = exchange
         exchange.start()
 
-    def _evaluate(self, answer: PollReply) -> Wrench:
-        """Store status word, gauges and wrench of a reply, and return the wrench in N and N·m."""
-        status, g0, g2, g4 = netcanoem.read_gauges(answer[0])
-        g1, g3, g5 = netcanoem.read_gauges_rest(answer[1])
-        previous_status, self._status_word = self._status_word, status
-        if status:
-            self._check_status(status, previous_status)
+    def _evaluate(self, poll_reply: PollReply) -> Wrench:
+        """Store status word, gauge counts and wrench of a reply; return the wrench in N and N·m."""
+        status_word, g0, g2, g4 = netcanoem.read_gauges(poll_reply[0])
+        g1, g3, g5 = netcanoem.read_gauges_rest(poll_reply[1])
+        previous_word, self._status_word = self._status_word, status_word
+        if status_word:
+            self._check_status(status_word, previous_word)
         saturation_counts = self._saturation_counts
         self.wrench_saturated = (
             max(g0, g2, g4, g1, g3, g5) >= saturation_counts
@@ -301,21 +304,22 @@ class AtiCanSensor:
         self._wrench = wrench = self._wrench_from_counts(g0, g2, g4, g1, g3, g5)
         return wrench
 
-    def _check_status(self, status: int, previous_status: int) -> None:
+    def _check_status(self, status_word: int, previous_word: int) -> None:
         """Count bus errors in a status word, and raise on a restart or a critical status bit."""
-        if status & CAN_BUS_ERROR:
+        if status_word & CAN_BUS_ERROR:
             self.bus_errors += 1
-        if status & ~previous_status & CAN_WATCHDOG_RESET:
-            raise self._restart_error(f"its watchdog has reset it (status word {status:#06x})")
-        if status & CRITICAL_CAN_STATUS_BITS:
+        if status_word & ~previous_word & CAN_WATCHDOG_RESET:
+            raise self._restart_error(f"its watchdog has reset it (status word {status_word:#06x})")
+        if status_word & CRITICAL_CAN_STATUS_BITS:
             remedy = (
                 "choose another (ati_can.calibration)"
-                if status & CAN_BAD_CALIBRATION
+                if status_word & CAN_BAD_CALIBRATION
                 else "it does not measure properly: check sensor, cable and supply"
             )
             raise DeviceError(
-                f"{self._name}: its status word {status:#06x} says that "
-                f"{'; '.join(describe_can_status(status & CRITICAL_CAN_STATUS_BITS))}; {remedy}."
+                f"{self._name}: its status word {status_word:#06x} says that "
+                f"{'; '.join(describe_can_status(status_word & CRITICAL_CAN_STATUS_BITS))}; "
+                f"{remedy}."
             )
 
     def _restart_error(self, cause: str) -> DeviceError:
@@ -335,7 +339,7 @@ class AtiCanSensor:
         """
         inbox, calibration = self._inbox, self._calibration
         row_frames = [inbox.get(opcode, b"") for opcode in netcanoem.MATRIX_ROW_REPLIES]
-        if all(len(part) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for part in row_frames):
+        if all(len(row_entry) == REPLY_LENGTHS[netcanoem.MATRIX_ROW] for row_entry in row_frames):
             row_read, earlier_row = b"".join(row_frames), self._row_read_before
             if calibration is None or netcanoem.matrix_row(row_read) == calibration.matrix[0]:
                 self._calibration_in_doubt = False
@@ -352,20 +356,20 @@ class AtiCanSensor:
         return False
 
     def _poll(self, timeout_s: float) -> PollReply | None:
-        """Poll the sensor once outside the cycle; return the reply, or None after the timeout."""
-        polls = self.polls
-        polls.drain()
-        polls.forget()
-        polls.send()
-        return polls.wait(polls.sent_ns + int(timeout_s * 1e9))
+        """Poll the sensor once outside the control loop; return the reply, or None on timeout."""
+        gauge_polls = self.polls
+        gauge_polls.drain()
+        gauge_polls.forget()
+        gauge_polls.send()
+        return gauge_polls.wait(gauge_polls.sent_ns + int(timeout_s * 1e9))
 
     def _first_reading(self) -> PollReply:
-        """Return the first reading after set-up, with repeated polls, or raise without a reply."""
+        """Poll the sensor repeatedly after set-up; return the first reply, or raise without one."""
         for _ in range(_REQUEST_ATTEMPTS):
-            answer = self._poll(_REPLY_TIMEOUT_S)
-            if answer is not None:
-                self._status_texts = describe_can_status(netcanoem.read_gauges(answer[0])[0])
-                return answer
+            poll_reply = self._poll(_REPLY_TIMEOUT_S)
+            if poll_reply is not None:
+                self._status_texts = describe_can_status(netcanoem.read_gauges(poll_reply[0])[0])
+                return poll_reply
         raise self._no_reply_error("a reading")
 
     def _request_reply(
@@ -373,28 +377,29 @@ class AtiCanSensor:
     ) -> bytes:
         """Send a request and return its reply frames, concatenated; repeat it if unanswered."""
         exchange, inbox = self.polls.exchange, self._inbox
-        expected = replies or (opcode,)
-        frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
+        reply_opcodes = replies or (opcode,)
+        request_frame = netcanoem.request(self._settings.base_id, opcode, *arguments)
         for attempt in range(_REQUEST_ATTEMPTS):
             inbox.clear()
-            exchange.send(frame)
+            exchange.send(request_frame)
             if exchange.wait_until(
-                lambda: all(each in inbox for each in expected), _ns_after(_REPLY_TIMEOUT_S)
+                lambda: all(reply_opcode in inbox for reply_opcode in reply_opcodes),
+                _ns_after(_REPLY_TIMEOUT_S),
             ):
-                received = [inbox[each] for each in expected]
+                reply_frames = [inbox[reply_opcode] for reply_opcode in reply_opcodes]
                 if attempt:
                     exchange.wait_until(lambda: False, _ns_after(_LATE_REPLY_S))  # all is dropped
                 break
         else:
             raise self._no_reply_error(requested_item)
-        for each, data in zip(expected, received, strict=True):
-            if len(data) != REPLY_LENGTHS[each]:
+        for reply_opcode, reply_data in zip(reply_opcodes, reply_frames, strict=True):
+            if len(reply_data) != REPLY_LENGTHS[reply_opcode]:
                 raise DeviceError(
-                    f"{self._name}: asked for {requested_item}, it sent {len(data)} bytes instead "
-                    f"of {REPLY_LENGTHS[each]}. Check that the box is a NETCANOEM and that no "
-                    "other device uses its identifiers."
+                    f"{self._name}: asked for {requested_item}, it sent {len(reply_data)} bytes "
+                    f"instead of {REPLY_LENGTHS[reply_opcode]}. Check that the box is a NETCANOEM "
+                    "and that no other device uses its identifiers."
                 )
-        return b"".join(received)
+        return b"".join(reply_frames)
 
     def _no_reply_error(self, requested_item: str) -> DeviceError:
         """Return the error for a request without a complete reply."""
@@ -406,16 +411,17 @@ class AtiCanSensor:
 
     def _read_serial_number(self) -> str:
         """Read the sensor's serial number, compare it with the profile, and return it."""
-        received = netcanoem.serial_number(
+        reported_number = netcanoem.serial_number(
             self._request_reply("its serial number", netcanoem.SERIAL_NUMBER)
         )
-        expected = self._settings.serial_number
-        if not same_serial_number(expected, received):
+        profile_number = self._settings.serial_number
+        if not same_serial_number(profile_number, reported_number):
             raise DeviceError(
-                f"{self._name}: its serial number is {received or 'empty'}, where the profile asks "
-                f"for {expected} (ati_can.serial_number). Check which sensor is on the rig."
+                f"{self._name}: its serial number is {reported_number or 'empty'}, where the "
+                f"profile asks for {profile_number} (ati_can.serial_number). Check which sensor is "
+                "on the rig."
             )
-        return received
+        return reported_number
 
     @property
     def _reports_scale(self) -> bool:
@@ -423,19 +429,21 @@ class AtiCanSensor:
         return self._firmware[:2] >= netcanoem.FIRST_FIRMWARE_WITH_SCALE
 
     def _select_calibration(self) -> None:
-        """Select the calibration that the profile names, and check that it is valid."""
-        expected = self._settings.calibration
-        requested_item = f"calibration {expected}"
-        selected = self._request_reply(requested_item, netcanoem.SELECT_CALIBRATION, expected)[0]
-        if selected != expected:
+        """Select the calibration that the profile names; raise if the sensor reports it as bad."""
+        calibration_index = self._settings.calibration
+        requested_item = f"calibration {calibration_index}"
+        selected_index = self._request_reply(
+            requested_item, netcanoem.SELECT_CALIBRATION, calibration_index
+        )[0]
+        if selected_index != calibration_index:
             raise DeviceError(
-                f"{self._name}: asked for calibration {expected}, it selected {selected}. Choose "
-                "one that it has (ati_can.calibration)."
+                f"{self._name}: asked for calibration {calibration_index}, it selected "
+                f"{selected_index}. Choose one that it has (ati_can.calibration)."
             )
         # The status shows whether the selected calibration is valid.
-        status = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
-        if status & CAN_BAD_CALIBRATION:
-            self._check_status(status, status)
+        status_word = self._status_word = netcanoem.read_gauges(self._first_reading()[0])[0]
+        if status_word & CAN_BAD_CALIBRATION:
+            self._check_status(status_word, status_word)
 
     def _read_matrix(self) -> MatrixRows:
         """Read the six rows of the calibration matrix."""
@@ -451,12 +459,12 @@ class AtiCanSensor:
             for axis in range(6)
         )
 
-    def _read_scale(self, serial_number: str, matrix: MatrixRows) -> Calibration:
+    def _read_scale(self, serial_number: str, calibration_matrix: MatrixRows) -> Calibration:
         """Read counts per unit and unit codes, and return the complete calibration."""
-        force = torque = netcanoem.COUNTS_BEFORE_SCALE
+        counts_per_force = counts_per_torque = netcanoem.COUNTS_BEFORE_SCALE
         force_unit, torque_unit = netcanoem.NEWTON, netcanoem.NEWTON_METRE
         if self._reports_scale:
-            force, torque = netcanoem.counts_per_unit(
+            counts_per_force, counts_per_torque = netcanoem.counts_per_unit(
                 self._request_reply("its counts per unit", netcanoem.COUNTS_PER_UNIT)
             )
             force_unit, torque_unit = self._request_reply("its unit codes", netcanoem.UNIT_CODES)
@@ -465,9 +473,9 @@ class AtiCanSensor:
                 serial_number=serial_number,
                 force_unit=force_unit,
                 torque_unit=torque_unit,
-                counts_per_force=force,
-                counts_per_torque=torque,
-                matrix=matrix,
+                counts_per_force=counts_per_force,
+                counts_per_torque=counts_per_torque,
+                matrix=calibration_matrix,
             )
         except ValueError as error:
             raise DeviceError(

@@ -61,19 +61,19 @@ read_gauges_rest = Struct(">hhh").unpack
 """Unpack gauges 1, 3, 5 from the second reply to a poll."""
 
 
-def identifier(base: int, opcode: int) -> int:
-    """Return the CAN identifier of a message with an opcode."""
-    return base << 4 | opcode
+def identifier(base_id: int, opcode: int) -> int:
+    """Return the CAN identifier of the box's messages with an opcode: 16 times base plus opcode."""
+    return base_id << 4 | opcode
 
 
-def request(base: int, opcode: int, *arguments: int) -> bytes:
+def request(base_id: int, opcode: int, *arguments: int) -> bytes:
     """Return the raw CAN frame of a request."""
-    return pack_frame(identifier(base, opcode), bytes(arguments))
+    return pack_frame(identifier(base_id, opcode), bytes(arguments))
 
 
-def matrix_row(replies: bytes) -> tuple[float, ...]:
+def matrix_row(reply_bytes: bytes) -> tuple[float, ...]:
     """Unpack the six entries of a calibration matrix row from three concatenated replies."""
-    return unpack(">6f", replies)
+    return unpack(">6f", reply_bytes)
 
 
 def serial_number(reply: bytes) -> str:
@@ -83,14 +83,14 @@ def serial_number(reply: bytes) -> str:
 
 def counts_per_unit(reply: bytes) -> tuple[int, int]:
     """Unpack the counts per unit of force and per unit of torque from a reply."""
-    force, torque = unpack(">II", reply)
-    return force, torque
+    counts_per_force, counts_per_torque = unpack(">II", reply)
+    return counts_per_force, counts_per_torque
 
 
 def firmware(reply: bytes) -> tuple[int, int, int]:
-    """Unpack major, minor and build number of the sensor's firmware from a reply."""
-    major, minor, build = unpack(">BBH", reply)
-    return major, minor, build
+    """Unpack major, minor and build number of the NETCANOEM box's firmware from a reply."""
+    major_number, minor_number, build_number = unpack(">BBH", reply)
+    return major_number, minor_number, build_number
 
 
 # Polls
@@ -116,7 +116,7 @@ class _FrameReceiver:
 
 
 class GaugePolls:
-    """Cyclic polls of a NETCANOEM box, and the pairing of their replies.
+    """Polls that the control loop sends to a NETCANOEM box, and the pairing of their replies.
 
     Parameters
     ----------
@@ -159,7 +159,7 @@ class GaugePolls:
         self.answer: PollReply | None = None
 
     def open(self, exchange: CanExchange) -> None:
-        """Start to use a CAN exchange, with no reply outstanding."""
+        """Use an open CAN exchange for the polls; no reply is outstanding."""
         self._exchange = exchange
         self.forget()
 
@@ -192,7 +192,7 @@ class GaugePolls:
         self.exchange.subscribe(second_id, self._second_frame.store)
 
     def drain(self) -> None:
-        """Deliver all frames that have arrived on the bus."""
+        """Deliver all frames that have arrived on the CAN bus to their drivers."""
         self.exchange.drain()
 
     def send(self) -> None:
@@ -204,7 +204,7 @@ class GaugePolls:
         self.exchange.send(self._frame)
 
     def send_or_pause(self) -> None:
-        """Send a poll, or omit it in this tick to find out if missing replies are late or lost."""
+        """Send a poll, or omit it in this tick to find out if a missing reply is late or lost."""
         first_pairing, second_pairing = self._first_pairing, self._second_pairing
         if (
             first_pairing.outstanding or second_pairing.outstanding
@@ -229,14 +229,14 @@ class GaugePolls:
     def process_replies(self) -> PollReply | None:
         """Return the reply to the last poll if it has been received, else None."""
         if self._first_pairing.process_replies() & self._second_pairing.process_replies():
-            first, second = self._first_frame.data, self._second_frame.data
-            if first and second:
-                self.answer = (first, second)
+            first_data, second_data = self._first_frame.data, self._second_frame.data
+            if first_data and second_data:
+                self.answer = (first_data, second_data)
                 self.turnaround_ns = time.monotonic_ns() - self.sent_ns
         return self.answer
 
     def forget(self) -> None:
-        """Reset the pairing: no reply is outstanding."""
+        """Reset the pairing of polls and replies: no reply is outstanding."""
         self._first_pairing.start()
         self._second_pairing.start()
         self.answer = None

@@ -68,11 +68,11 @@ class ExceptionResponse(ValueError):
 # Modbus RTU frames
 
 
-def _crc_of_byte(value: int) -> int:
+def _crc_of_byte(crc_register: int) -> int:
     """Return the Modbus checksum of a single byte, for the table of checksums."""
     for _ in range(8):
-        value = value >> 1 ^ 0xA001 if value & 1 else value >> 1
-    return value
+        crc_register = crc_register >> 1 ^ 0xA001 if crc_register & 1 else crc_register >> 1
+    return crc_register
 
 
 _CRC_TABLE = tuple(map(_crc_of_byte, range(256)))
@@ -82,15 +82,18 @@ _CRC_TABLE = tuple(map(_crc_of_byte, range(256)))
 def crc16(data: bytes) -> int:
     """Return the Modbus checksum of data (polynomial 0xA001 reflected, start 0xFFFF)."""
     crc = 0xFFFF
-    for byte in data:
-        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ byte) & 0xFF]
+    for data_byte in data:
+        crc = crc >> 8 ^ _CRC_TABLE[(crc ^ data_byte) & 0xFF]
     return crc
 
 
-def frame(function: int, content: bytes) -> bytes:
-    """Return the bytes of a Modbus request to the sensor, with address and checksum."""
-    body = bytes((ADDRESS, function)) + content
-    return body + crc16(body).to_bytes(2, "little")
+def frame(function_code: int, request_content: bytes) -> bytes:
+    """Return the bytes of a Modbus request to the sensor, from function code and content.
+
+    Address and checksum are added.
+    """
+    address_and_content = bytes((ADDRESS, function_code)) + request_content
+    return address_and_content + crc16(address_and_content).to_bytes(2, "little")
 
 
 START_STREAMING = frame(_START_FUNCTION, bytes((_STREAM_PARAMETER,)))
@@ -101,24 +104,27 @@ LOCK = frame(_LOCK_FUNCTION, bytes((_LOCK_CODE,)))
 """Request that locks the sensor's memory."""
 
 
-def read_registers(first: int, count: int) -> bytes:
-    """Return the request that reads `count` registers, at most `MAX_REGISTERS`."""
-    return frame(_READ_FUNCTION, pack(">HH", first, count))
+def read_registers(first_register: int, register_count: int) -> bytes:
+    """Return the request that reads `register_count` registers, at most `MAX_REGISTERS`."""
+    return frame(_READ_FUNCTION, pack(">HH", first_register, register_count))
 
 
-def write_registers(first: int, values: Sequence[int]) -> bytes:
+def write_registers(first_register: int, register_values: Sequence[int]) -> bytes:
     """Return the request that writes consecutive registers."""
-    content = pack(f">{len(values)}H", *values)
-    return frame(_WRITE_FUNCTION, pack(">HHB", first, len(values), len(content)) + content)
+    packed_values = pack(f">{len(register_values)}H", *register_values)
+    return frame(
+        _WRITE_FUNCTION,
+        pack(">HHB", first_register, len(register_values), len(packed_values)) + packed_values,
+    )
 
 
 def reply_length(request: bytes) -> int:
     """Return the length in bytes of the reply to a request, unless it is an exception response."""
-    function = request[1]
-    if function == _READ_FUNCTION:
-        (count,) = unpack(">H", request[4:6])
-        return 5 + 2 * int(count)
-    return 8 if function == _WRITE_FUNCTION else 5
+    function_code = request[1]
+    if function_code == _READ_FUNCTION:
+        (register_count,) = unpack(">H", request[4:6])
+        return 5 + 2 * int(register_count)
+    return 8 if function_code == _WRITE_FUNCTION else 5
 
 
 REFUSAL_LENGTH = 5
@@ -131,7 +137,9 @@ def is_refusal(reply: bytes) -> bool:
 
 
 def reply_content(request: bytes, reply: bytes) -> bytes:
-    """Check the reply to a request, and return its content without address, function and checksum.
+    """Return the content of a Modbus reply, without address, function and checksum.
+
+    The reply is checked against its request.
 
     Raises
     ------
@@ -151,23 +159,25 @@ def reply_content(request: bytes, reply: bytes) -> bytes:
         raise BadReply(f"the checksum of the reply is wrong ({reply[:16].hex(' ')})")
     if reply[0] != ADDRESS or reply[1] & ~_EXCEPTION_FLAG != request[1]:
         raise BadReply(f"the reply belongs to another request ({reply[:16].hex(' ')})")
-    content = reply[2:-2]
+    reply_data = reply[2:-2]
     if is_refusal(reply):
-        code = content[0]
-        raise ExceptionResponse(_EXCEPTION_MEANINGS.get(code, f"it declined with code {code}"))
-    function = request[1]
-    if function == _READ_FUNCTION and content[0] != expected_length - 5:
-        raise BadReply(f"{content[0]} bytes of registers came instead of {expected_length - 5}")
-    if function == _WRITE_FUNCTION and content != request[2:6]:
+        exception_code = reply_data[0]
+        raise ExceptionResponse(
+            _EXCEPTION_MEANINGS.get(exception_code, f"it declined with code {exception_code}")
+        )
+    function_code = request[1]
+    if function_code == _READ_FUNCTION and reply_data[0] != expected_length - 5:
+        raise BadReply(f"{reply_data[0]} bytes of registers came instead of {expected_length - 5}")
+    if function_code == _WRITE_FUNCTION and reply_data != request[2:6]:
         raise BadReply("it confirmed other registers than were written")
-    if function in (_LOCK_FUNCTION, _START_FUNCTION) and content[0] != _ACCEPTED_CODE:
-        raise ExceptionResponse(f"it declined with code {content[0]}")
-    return content[1:] if function == _READ_FUNCTION else content
+    if function_code in (_LOCK_FUNCTION, _START_FUNCTION) and reply_data[0] != _ACCEPTED_CODE:
+        raise ExceptionResponse(f"it declined with code {reply_data[0]}")
+    return reply_data[1:] if function_code == _READ_FUNCTION else reply_data
 
 
-def unpack_registers(content: bytes) -> tuple[int, ...]:
+def unpack_registers(reply_data: bytes) -> tuple[int, ...]:
     """Unpack the register values from the content of a reply."""
-    return unpack(f">{len(content) // 2}H", content)
+    return unpack(f">{len(reply_data) // 2}H", reply_data)
 
 
 # Record stream
@@ -243,46 +253,53 @@ class RecordStream:
 
     def feed(self, chunk: bytes) -> bytes:
         """Process received bytes; return the complete valid records, concatenated, oldest first."""
-        data = self._held_bytes + chunk if self._held_bytes else chunk
-        records = b""
+        pending_bytes = self._held_bytes + chunk if self._held_bytes else chunk
+        valid_records = b""
         while True:
             if not self.synchronised:
-                begin = self._find_first_record(data)
-                if begin is None:
+                record_offset = self._find_first_record(pending_bytes)
+                if record_offset is None:
                     break
-                self.dropped_bytes += begin
-                data = data[begin:]
+                self.dropped_bytes += record_offset
+                pending_bytes = pending_bytes[record_offset:]
                 self.synchronised = True
-            whole_length = len(data) - len(data) % RECORD_SIZE
-            valid_length = _length_of_valid_records(data, whole_length)
-            records = records + data[:valid_length] if records else data[:valid_length]
-            data = data[valid_length:]
+            whole_length = len(pending_bytes) - len(pending_bytes) % RECORD_SIZE
+            valid_length = _length_of_valid_records(pending_bytes, whole_length)
+            valid_records = (
+                valid_records + pending_bytes[:valid_length]
+                if valid_records
+                else pending_bytes[:valid_length]
+            )
+            pending_bytes = pending_bytes[valid_length:]
             if valid_length == whole_length:
-                self._held_bytes = data
+                self._held_bytes = pending_bytes
                 break
             self.checksum_errors += 1
             self.synchronised = False
             self._expected_offset = 0
-        self.records += len(records) // RECORD_SIZE
-        return records
+        self.records += len(valid_records) // RECORD_SIZE
+        return valid_records
 
     def _find_first_record(self, data: bytes) -> int | None:
-        """Return the offset of the first record, or None if more bytes are needed to find it."""
+        """Return the offset in bytes of the first record, or None if more bytes are needed."""
         last_offset = len(data) - _SYNC_SIZE
         undecided_offset = max(0, last_offset + 1)
-        for begin in range(last_offset + 1):
-            if not _records_fit(data, begin):
+        for record_offset in range(last_offset + 1):
+            if not _records_fit(data, record_offset):
                 continue
             if (
                 self._expected_offset is not None
-                and (begin - self._expected_offset) % RECORD_SIZE == 0
+                and (record_offset - self._expected_offset) % RECORD_SIZE == 0
             ):
-                return begin
-            if begin + _CHECKSUM_OFFSET > last_offset:
+                return record_offset
+            if record_offset + _CHECKSUM_OFFSET > last_offset:
                 # Not all candidate offsets have arrived yet.
-                undecided_offset = min(undecided_offset, begin)
-            elif not any(_records_fit(data, begin + shift) for shift in range(1, RECORD_SIZE)):
-                return begin
+                undecided_offset = min(undecided_offset, record_offset)
+            elif not any(
+                _records_fit(data, record_offset + byte_shift)
+                for byte_shift in range(1, RECORD_SIZE)
+            ):
+                return record_offset
         self.dropped_bytes += undecided_offset
         self._held_bytes = data[undecided_offset:]
         if self._expected_offset is not None:
@@ -292,11 +309,12 @@ class RecordStream:
 
 def _length_of_valid_records(data: bytes, whole_length: int) -> int:
     """Return the number of bytes in ``data[:whole_length]`` before the first invalid record."""
-    for begin in range(0, whole_length, RECORD_SIZE):
+    for record_offset in range(0, whole_length, RECORD_SIZE):
         if (
-            sum(data[begin : begin + _CHECKSUM_OFFSET]) ^ data[begin + _CHECKSUM_OFFSET]
+            sum(data[record_offset : record_offset + _CHECKSUM_OFFSET])
+            ^ data[record_offset + _CHECKSUM_OFFSET]
         ) & _CHECKSUM_MASK:
-            return begin
+            return record_offset
     return whole_length
 
 

@@ -86,9 +86,10 @@ class AtiSerialSensor:
     def __init__(self, rig: RigParameters, simulator: SimulatorAddress | None) -> None:
         settings, acquisition = rig.ati_serial, rig.acquisition
         if settings is None or acquisition is None:
-            missing = "ati_serial" if settings is None else "acquisition"
+            missing_section = "ati_serial" if settings is None else "acquisition"
             raise DeviceError(
-                f"The profile has no section [{missing}], which a sensor on a serial line needs."
+                f"The profile has no section [{missing_section}], which a sensor on a serial line "
+                "needs."
             )
         self._settings = settings
         self._port = settings.port
@@ -147,15 +148,15 @@ class AtiSerialSensor:
         self._check_line_rate()
         self._line = SerialLine(self._port, self._settings.baud, self._name)
         try:
-            setup = SerialSetup(self._line, self._settings, self._name)
-            setup.stop_streaming()
-            self._check_status(setup)
-            self._calibration_block = setup.read_block()
-            setup.load_amplifiers(self._calibration_block)
-            self._check_status(setup)
-            rows = self._calibration_block.calibration.wrench_per_wire_count()
-            self._filter_matrix = np.kron(np.array(self._weights), np.array(rows))
-            self._start_streaming(setup)
+            sensor_setup = SerialSetup(self._line, self._settings, self._name)
+            sensor_setup.stop_streaming()
+            self._check_status(sensor_setup)
+            self._calibration_block = sensor_setup.read_block()
+            sensor_setup.load_amplifiers(self._calibration_block)
+            self._check_status(sensor_setup)
+            wire_count_matrix = self._calibration_block.calibration.wrench_per_wire_count()
+            self._filter_matrix = np.kron(np.array(self._weights), np.array(wire_count_matrix))
+            self._start_streaming(sensor_setup)
         except BaseException:
             self._release()
             raise
@@ -188,11 +189,11 @@ class AtiSerialSensor:
     def request(self, due_ns: int) -> None:
         """Begin a tick that was due at `due_ns`; nothing is sent, because the sensor streams."""
         now_ns = self._requested_ns = time.monotonic_ns()
-        periods = 1
+        elapsed_periods = 1
         if self._tick_ns is not None and not self._lock_step:
-            periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
+            elapsed_periods = max(1, round((due_ns - self._tick_ns) / self._period_ns))
         self._tick_ns = due_ns
-        self._due_bytes += periods * self._bytes_per_tick
+        self._due_bytes += elapsed_periods * self._bytes_per_tick
         if now_ns - self._last_read_ns > _IDLE_NS and not self._lock_step:
             # Queued bytes are old and may have gaps: only bytes that arrive from now on count.
             self._split_records(self._open_line().read())
@@ -207,29 +208,30 @@ class AtiSerialSensor:
         DeviceError
             If the line has failed or the sensor reports an error.
         """
-        line = self._open_line()
-        new = self._split_records(line.read())
+        serial_line = self._open_line()
+        new = self._split_records(serial_line.read())
         while self._arrived_bytes < self._due_bytes:
             lacks_one_record = self._due_bytes - self._arrived_bytes <= RECORD_SIZE
             patience_ns = self._patience_ns if lacks_one_record else self._deadline_ns
             remaining_ns = self._requested_ns + patience_ns - time.monotonic_ns()
             if remaining_ns <= 0:
                 break
-            line.wait(remaining_ns * 1e-9)
-            new += self._split_records(line.read())
+            serial_line.wait(remaining_ns * 1e-9)
+            new += self._split_records(serial_line.read())
         self._last_read_ns = time.monotonic_ns()
         self.wrench_stale = self._is_lagging(len(new)) or not new
         if self.wrench_stale:
             return self._wrench
-        gauges = self._unpack_gauges(new)
-        self.gauges = gauges[-6:]
+        gauge_counts = self._unpack_gauges(new)
+        self.gauges = gauge_counts[-6:]
         self.wrench_saturated = (
-            max(gauges) >= self._saturation_counts or min(gauges) <= -self._saturation_counts
+            max(gauge_counts) >= self._saturation_counts
+            or min(gauge_counts) <= -self._saturation_counts
         )
         return self._filtered_wrench()
 
-    def _is_lagging(self, new: int) -> bool:
-        """Return whether the newest record is a tick or more late; `new` counts the new bytes.
+    def _is_lagging(self, new_bytes: int) -> bool:
+        """Return whether the newest record is a tick or more late; `new_bytes` have come.
 
         Late records arrive in addition to the records of later ticks, lost records do not. If some
         consecutive ticks bring only their own records, the missing records count as lost. Since
@@ -239,7 +241,7 @@ class AtiSerialSensor:
         """
         complete_bytes = self._arrived_bytes - self.stream.pending
         if self._due_bytes - complete_bytes >= self._bytes_per_tick:
-            in_step = abs(new - self._bytes_per_tick) <= RECORD_SIZE
+            in_step = abs(new_bytes - self._bytes_per_tick) <= RECORD_SIZE
             self._steady_ticks = self._steady_ticks + 1 if in_step else 0
             if self._steady_ticks < _STEADY_TICKS:
                 return True
@@ -251,7 +253,10 @@ class AtiSerialSensor:
         return False
 
     def health(self) -> LineHealth:
-        """Return the health of the line, and the status word that was read before the stream."""
+        """Return the health of the serial line, with the sensor's status word.
+
+        The status word was read before the stream started.
+        """
         return LineHealth(
             bits=self._arrived_bytes * _BITS_PER_BYTE,
             bit_rate_bit_s=self._settings.baud,
@@ -264,7 +269,7 @@ class AtiSerialSensor:
 
     @property
     def _doubt(self) -> str:
-        """Reason why the wrench may be older than stated; empty if no records are missing."""
+        """Reason why the wrench may be older than stated; empty text if no records are missing."""
         if not self._missing_records:
             return ""
         return (
@@ -275,17 +280,20 @@ class AtiSerialSensor:
 
     def _doubt_count(self) -> str:
         """Return a sentence with the number of missing records; empty if none are missing."""
-        missing = self._missing_records
-        if not missing:
+        missing_records = self._missing_records
+        if not missing_records:
             return ""
-        late_ms = 1e3 * missing / self._settings.stream_hz
+        late_ms = 1e3 * missing_records / self._settings.stream_hz
         return (
-            f"{self._name}: records that did not arrive since it was connected: {missing}; or the "
-            f"wrench is late by {late_ms:.2g} ms."
+            f"{self._name}: records that did not arrive since it was connected: {missing_records}; "
+            f"or the wrench is late by {late_ms:.2g} ms."
         )
 
     def _describe_cause(self) -> str:
-        """Return the message that the adapter delays records, if they arrive in regular blocks."""
+        """Return a message if records arrive in regular blocks, else an empty text.
+
+        The message says that the USB adapter delays the records.
+        """
         now_ns = time.monotonic_ns()
         gaps_ns = sorted(
             gap for arrival_ns, gap in self._latest_gaps if now_ns - arrival_ns < _GAP_EVALUATION_NS
@@ -317,25 +325,29 @@ class AtiSerialSensor:
         DeviceError
             If the line has failed or the sensor reports an error.
         """
-        line, stream = self._open_line(), self.stream
-        self._split_records(line.read())
-        records, errors, dropped = stream.records, stream.checksum_errors, stream.dropped_bytes
+        serial_line, record_stream = self._open_line(), self.stream
+        self._split_records(serial_line.read())
+        records_before, errors_before, dropped_before = (
+            record_stream.records,
+            record_stream.checksum_errors,
+            record_stream.dropped_bytes,
+        )
         begin_ns = last_received_ns = now_ns = time.monotonic_ns()
         end_ns = begin_ns + int(duration_s * 1e9)
         longest_ns = 0
         while now_ns < end_ns:
-            line.wait((end_ns - now_ns) * 1e-9)
-            data = line.read()
+            serial_line.wait((end_ns - now_ns) * 1e-9)
+            received_bytes = serial_line.read()
             now_ns = time.monotonic_ns()
-            if data or now_ns >= end_ns:
+            if received_bytes or now_ns >= end_ns:
                 longest_ns = max(longest_ns, now_ns - last_received_ns)
                 last_received_ns = now_ns
-                self._split_records(data)
+                self._split_records(received_bytes)
         self._last_read_ns = now_ns
         return {
-            "records_hz": (stream.records - records) / ((now_ns - begin_ns) * 1e-9),
-            "checksum_errors": float(stream.checksum_errors - errors),
-            "dropped_bytes": float(stream.dropped_bytes - dropped),
+            "records_hz": (record_stream.records - records_before) / ((now_ns - begin_ns) * 1e-9),
+            "checksum_errors": float(record_stream.checksum_errors - errors_before),
+            "dropped_bytes": float(record_stream.dropped_bytes - dropped_before),
             "longest_gap_s": longest_ns * 1e-9,
         }
 
@@ -343,9 +355,9 @@ class AtiSerialSensor:
         """Stop the stream, read the status word once more, and release the port; never raises."""
         if self._line is not None:
             with suppress(DeviceError):
-                setup = SerialSetup(self._line, self._settings, self._name)
-                setup.stop_streaming()
-                self.status = describe_serial_status(setup.read_status())
+                sensor_setup = SerialSetup(self._line, self._settings, self._name)
+                sensor_setup.stop_streaming()
+                self.status = describe_serial_status(sensor_setup.read_status())
         self._release()
 
     def _release(self) -> None:
@@ -360,39 +372,39 @@ class AtiSerialSensor:
             raise DeviceError(f"{self._name}: it is not connected.")
         return self._line
 
-    def _split_records(self, data: bytes) -> bytes:
+    def _split_records(self, received_bytes: bytes) -> bytes:
         """Split received bytes into records; return the new complete records."""
-        if not data:
-            return data
+        if not received_bytes:
+            return received_bytes
         now_ns = time.monotonic_ns()
         gap_ns = now_ns - self._arrived_ns
         if self._arrived_ns and gap_ns > _GAP_PERIODS * self._period_ns:
             self._latest_gaps.append((now_ns, gap_ns))
-        self._arrived_bytes += len(data)
+        self._arrived_bytes += len(received_bytes)
         self._arrived_ns = now_ns
-        new = self.stream.feed(data)
+        new = self.stream.feed(received_bytes)
         if new:
             if max(new[RECORD_SIZE - 1 :: RECORD_SIZE]) & ERROR_BIT:
                 self._count_errors(new)
             else:
                 self._error_records = 0
             # Before a tick's worth of records has arrived, the oldest one is repeated.
-            history = self._history or new[:RECORD_SIZE] * len(self._weights)
-            self._history = (history + new)[-self._history_size :]
+            previous_records = self._history or new[:RECORD_SIZE] * len(self._weights)
+            self._history = (previous_records + new)[-self._history_size :]
         return new
 
     def _filtered_wrench(self) -> Wrench:
-        """Compute, store and return the wrench from the newest records."""
-        newest = np.frombuffer(self._history, _RECORD_LAYOUT)["gauges"].astype(float)
-        fx, fy, fz, tx, ty, tz = (self._filter_matrix @ newest.ravel()).tolist()
+        """Compute, store and return the filtered wrench, in N and N·m, from the newest records."""
+        newest_gauges = np.frombuffer(self._history, _RECORD_LAYOUT)["gauges"].astype(float)
+        fx, fy, fz, tx, ty, tz = (self._filter_matrix @ newest_gauges.ravel()).tolist()
         self._wrench = wrench = (fx, fy, fz, tx, ty, tz)
         self.wrench_time_ns = self._arrived_ns
         return wrench
 
     def _count_errors(self, records: bytes) -> None:
         """Count consecutive records with the error bit, and raise if there are too many."""
-        for check in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
-            self._error_records = self._error_records + 1 if check & ERROR_BIT else 0
+        for check_byte in records[RECORD_SIZE - 1 :: RECORD_SIZE]:
+            self._error_records = self._error_records + 1 if check_byte & ERROR_BIT else 0
             if self._error_records >= _MOST_ERROR_RECORDS:
                 raise DeviceError(
                     f"{self._name}: its records report an error. Run rigd check to read its status "
@@ -402,10 +414,10 @@ class AtiSerialSensor:
     def _unpack_gauges(self, records: bytes) -> tuple[int, ...]:
         """Return the gauge counts of some records, without the checksums."""
         n = len(records) // RECORD_SIZE
-        unpack = self._unpackers.get(n)
-        if unpack is None:
-            unpack = self._unpackers[n] = Struct(">" + "6hx" * n).unpack
-        return unpack(records)
+        unpack_counts = self._unpackers.get(n)
+        if unpack_counts is None:
+            unpack_counts = self._unpackers[n] = Struct(">" + "6hx" * n).unpack
+        return unpack_counts(records)
 
     def _check_line_rate(self) -> None:
         """Raise if the line is too slow for the stream, or the stream is slower than the loop."""
@@ -423,9 +435,9 @@ class AtiSerialSensor:
                 f"loop's {self._rate_hz:g} ticks; change ati_serial.stream_hz or rate_hz."
             )
 
-    def _check_status(self, setup: SerialSetup) -> None:
+    def _check_status(self, sensor_setup: SerialSetup) -> None:
         """Read the status word, and raise if it has a critical bit."""
-        status_word = self._status_word = setup.read_status()
+        status_word = self._status_word = sensor_setup.read_status()
         self.status = describe_serial_status(status_word)
         if status_word & CRITICAL_SERIAL_STATUS_BITS:
             raise DeviceError(
@@ -434,10 +446,10 @@ class AtiSerialSensor:
                 "It does not measure properly: check sensor, cable and supply."
             )
 
-    def _start_streaming(self, setup: SerialSetup) -> None:
+    def _start_streaming(self, sensor_setup: SerialSetup) -> None:
         """Start the stream and wait for the first valid records, or raise."""
-        line = self._open_line()
-        first_bytes = setup.start_streaming()
+        serial_line = self._open_line()
+        first_bytes = sensor_setup.start_streaming()
         self._history = b""
         self._error_records = 0
         self.stream.start(aligned=True)
@@ -453,8 +465,8 @@ class AtiSerialSensor:
                     f"{_FIRST_RECORDS_TIMEOUT_S} s only {self.stream.records - records_before} "
                     "were sound records. Check cable, ati_serial.baud and ati_serial.stream_hz."
                 )
-            line.wait(SILENCE_S)
-            self._split_records(line.read())
+            serial_line.wait(SILENCE_S)
+            self._split_records(serial_line.read())
         if self._history:
             # Value that is used if the first tick finds no new records.
             self._filtered_wrench()

@@ -39,13 +39,13 @@ def describe_adapter_delay(gap_s: float, port: str) -> str:
     port
         File name of the port.
     """
-    name = Path(os.path.realpath(port)).name
-    if not name.startswith("ttyUSB"):
-        name = "ttyUSB…"
+    adapter_name = Path(os.path.realpath(port)).name
+    if not adapter_name.startswith("ttyUSB"):
+        adapter_name = "ttyUSB…"
     return (
         f"The records arrive in blocks every {1e3 * gap_s:.2g} ms: the latency timer of the USB "
         "adapter holds them back. Set it to 1 ms (setserial low_latency, or write 1 to "
-        f"/sys/bus/usb-serial/devices/{name}/latency_timer), or use an adapter without one."
+        f"/sys/bus/usb-serial/devices/{adapter_name}/latency_timer), or use an adapter without one."
     )
 
 
@@ -108,17 +108,17 @@ class SerialLine:
         DeviceError
             If the line is gone.
         """
-        data = b""
+        arrived_bytes = b""
         while True:  # a short chunk need not be the last: the kernel moves bytes on with each read
             try:
-                chunk = os.read(self._fd, _READ_SIZE)
+                read_bytes = os.read(self._fd, _READ_SIZE)
             except BlockingIOError:
-                return data
+                return arrived_bytes
             except OSError as error:
                 raise self._failure_error(error.strerror) from None
-            if not chunk:
+            if not read_bytes:
                 raise self._failure_error("hung up")
-            data = data + chunk if data else chunk
+            arrived_bytes = arrived_bytes + read_bytes if arrived_bytes else read_bytes
 
     def write(self, data: bytes) -> None:
         """Send a few bytes, which always fit into the kernel's buffer.
@@ -134,7 +134,7 @@ class SerialLine:
             raise self._failure_error(error.strerror) from None
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until bytes may have arrived on the serial line, at most for the timeout.
+        """Wait until bytes may have arrived on the serial line, at most for `timeout_s`.
 
         Raises
         ------
@@ -149,21 +149,23 @@ class SerialLine:
             raise self._failure_error(str(error)) from None
 
     def transact(self, request: bytes, length: int, timeout_s: float) -> bytes:
-        """Send a request and return the received bytes, at least `length` unless the time is over.
+        """Send a request; return the received bytes, at least `length` unless `timeout_s` passes.
 
         Bytes that arrived before the request are discarded.
         """
         self.read()
         self.write(request)
-        reply = b""
+        received_bytes = b""
         end_ns = time.monotonic_ns() + int(timeout_s * 1e9)
-        while len(reply) < length and (left_ns := end_ns - time.monotonic_ns()) > 0:
-            self.wait(left_ns * 1e-9)
-            reply += self.read()
-        return reply
+        while len(received_bytes) < length and (remaining_ns := end_ns - time.monotonic_ns()) > 0:
+            self.wait(remaining_ns * 1e-9)
+            received_bytes += self.read()
+        return received_bytes
 
     def drain(self, quiet_s: float, limit_s: float) -> bool:
-        """Discard received bytes until the line has been silent for `quiet_s`; return success.
+        """Discard received bytes until the line has been silent for `quiet_s`.
+
+        Return True on success, and False if `limit_s` has passed before.
 
         Returns
         -------
@@ -195,15 +197,18 @@ class SerialLine:
 
 
 def _parity(port: str) -> str:
-    """Return the parity to set: even, but none for a pseudo-terminal, which refuses it."""
+    """Return the parity of a serial port: even, but none for a pseudo-terminal.
+
+    A pseudo-terminal refuses even parity.
+    """
     is_pseudo = os.path.realpath(port).startswith("/dev/pts/")
     return str(serial.PARITY_NONE if is_pseudo else serial.PARITY_EVEN)
 
 
 def _error_text(error: Exception) -> str:
     """Return the reason of an error in words."""
-    number = error.args[0] if error.args else None
-    return os.strerror(number) if isinstance(number, int) else str(error)
+    error_number = error.args[0] if error.args else None
+    return os.strerror(error_number) if isinstance(error_number, int) else str(error)
 
 
 def _opening_remedy(error: Exception) -> str:
@@ -263,7 +268,7 @@ class SerialSetup:
         self._name = name
 
     def stop_streaming(self) -> None:
-        """Stop the stream, whether the sensor streams or not."""
+        """Stop the sensor's stream of records; harmless if the sensor does not stream."""
         for _ in range(_STOP_ATTEMPTS):
             self._line.write(_STOP_BYTES)
             if self._line.drain(_STREAM_STOPPED_SILENCE_S, _DRAIN_LIMIT_S):
@@ -279,34 +284,40 @@ class SerialSetup:
 
     def read_block(self) -> CalibrationBlock:
         """Read the calibration block that the profile selects, and check its serial number."""
-        number, profile_number = self._settings.calibration, self._settings.serial_number
-        action_text = f"read out calibration {number}"
+        calibration_number, profile_number = (
+            self._settings.calibration,
+            self._settings.serial_number,
+        )
+        action_text = f"read out calibration {calibration_number}"
         registers = self._read_register_values(
-            first_block_register(number), BLOCK_LENGTH_REGISTERS, action_text
+            first_block_register(calibration_number), BLOCK_LENGTH_REGISTERS, action_text
         )
         try:
-            block = parse_block(registers)
+            calibration_block = parse_block(registers)
         except ValueError as error:
-            raise DeviceError(f"{self._name}, ati_serial.calibration {number}: {error}") from None
-        sensor_number = block.calibration.serial_number
+            raise DeviceError(
+                f"{self._name}, ati_serial.calibration {calibration_number}: {error}"
+            ) from None
+        sensor_number = calibration_block.calibration.serial_number
         if not same_serial_number(profile_number, sensor_number):
             raise DeviceError(
                 f"{self._name}: its serial number is {sensor_number or 'empty'}, where the profile "
                 f"asks for {profile_number} (ati_serial.serial_number). Check which sensor is on "
                 "the rig."
             )
-        return block
+        return calibration_block
 
     def load_amplifiers(self, block: CalibrationBlock) -> None:
         """Write the calibration's amplifier gains and offsets, and read them back."""
         self._request_content(modbus.UNLOCK, "unlock its memory")
         try:
-            for first, values in (
+            for first_register, register_values in (
                 (modbus.ACTIVE_GAINS, block.gains),
                 (modbus.ACTIVE_OFFSETS, block.offsets),
             ):
                 self._request_content(
-                    modbus.write_registers(first, values), "load gains and offsets"
+                    modbus.write_registers(first_register, register_values),
+                    "load gains and offsets",
                 )
         finally:
             self._request_content(modbus.LOCK, "lock its memory")
@@ -322,25 +333,25 @@ class SerialSetup:
             )
 
     def start_streaming(self) -> bytes:
-        """Start the stream; return the bytes that arrived after the reply."""
+        """Start the sensor's stream of records; return the bytes received after the reply."""
         request = modbus.START_STREAMING
         time.sleep(SILENCE_S)
-        length = modbus.reply_length(request)
-        reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
+        reply_size = modbus.reply_length(request)
+        reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
         try:
-            modbus.reply_content(request, reply[:length])
+            modbus.reply_content(request, reply[:reply_size])
         except ValueError as error:
             raise DeviceError(f"{self._name}: it does not start streaming: {error}.") from None
-        return reply[length:]
+        return reply[reply_size:]
 
     def _request_content(self, request: bytes, action_text: str) -> bytes:
         """Send a request and return the content of its reply; repeat a request that failed."""
         last_error = ""
-        for attempt in range(_REQUEST_ATTEMPTS):
+        for attempt_number in range(_REQUEST_ATTEMPTS):
             time.sleep(SILENCE_S)
-            length = modbus.reply_length(request)
-            reply = self._line.transact(request, length, _REPLY_TIMEOUT_S)
-            if attempt:
+            reply_size = modbus.reply_length(request)
+            reply = self._line.transact(request, reply_size, _REPLY_TIMEOUT_S)
+            if attempt_number:
                 self._line.drain(_LATE_REPLY_S, 2 * _LATE_REPLY_S)
             try:
                 return modbus.reply_content(request, reply)
@@ -357,11 +368,13 @@ class SerialSetup:
             "ati_serial.baud."
         )
 
-    def _read_register_values(self, first: int, count: int, action_text: str) -> tuple[int, ...]:
-        """Read `count` registers, in requests of at most 64."""
-        registers: tuple[int, ...] = ()
-        while len(registers) < count:
-            chunk = min(modbus.MAX_REGISTERS, count - len(registers))
-            request = modbus.read_registers(first + len(registers), chunk)
-            registers += modbus.unpack_registers(self._request_content(request, action_text))
-        return registers
+    def _read_register_values(
+        self, first_register: int, register_count: int, action_text: str
+    ) -> tuple[int, ...]:
+        """Read consecutive registers, with several Modbus requests if necessary."""
+        register_values: tuple[int, ...] = ()
+        while len(register_values) < register_count:
+            chunk_size = min(modbus.MAX_REGISTERS, register_count - len(register_values))
+            request = modbus.read_registers(first_register + len(register_values), chunk_size)
+            register_values += modbus.unpack_registers(self._request_content(request, action_text))
+        return register_values

@@ -55,10 +55,10 @@ def drive_identifiers(drive: ServoDrive) -> dict[int, str]:
 
     The services that address all nodes are included, and so are PDOs that are not configured: they
     may be enabled in the drive's factory settings.
-
-    The PDOs that are not configured count too: a drive may have them on from the factory.
     """
-    own_services = {base + drive.node_id: name for base, name in _NODE_SERVICES.items()}
+    own_services = {
+        base_id + drive.node_id: service_name for base_id, service_name in _NODE_SERVICES.items()
+    }
     return _BROADCAST_SERVICES | own_services
 
 
@@ -87,12 +87,14 @@ def _collisions(rig: RigParameters) -> Iterator[str]:
     used_identifiers = drive_identifiers(drive) | {0x700 + drive.host_node_id: "host's heartbeat"}
     own_identifiers = sensor_identifiers(sensor)
     collisions = {
-        can_id: name
-        for can_id, name in sorted(used_identifiers.items())
+        can_id: service_name
+        for can_id, service_name in sorted(used_identifiers.items())
         if can_id in own_identifiers
     }
     if collisions:
-        collision_list = ", ".join(f"{can_id:#05x} ({name})" for can_id, name in collisions.items())
+        collision_list = ", ".join(
+            f"{can_id:#05x} ({service_name})" for can_id, service_name in collisions.items()
+        )
         yield (
             f"ati_can.base_id = {sensor.base_id:#04x} takes the identifiers "
             f"{own_identifiers[0]:#05x} to {own_identifiers[-1]:#05x}, of which the drive's bus "
@@ -149,7 +151,7 @@ class CyclicFrame:
 
 @dataclass(frozen=True, slots=True)
 class BusLoad:
-    """Cyclic frames of a CAN bus, and the bus load that they cause."""
+    """Cyclic frames of a CAN bus, and the load: the fraction of time in which the bus is busy."""
 
     traffic: tuple[CyclicFrame, ...]
     """Cyclic frames of the bus."""
@@ -161,7 +163,7 @@ class BusLoad:
     """Total number of frames per second."""
 
 
-def frame_bits(length: int) -> int:
+def frame_bits(data_length: int) -> int:
     """Return the number of bits of a CAN frame with an 11-bit identifier, without stuff bits.
 
     Parameters
@@ -169,30 +171,30 @@ def frame_bits(length: int) -> int:
     length
         Number of data bytes, 0 to 8.
     """
-    return FRAME_BITS + 8 * length
+    return FRAME_BITS + 8 * data_length
 
 
-def worst_frame_bits(length: int) -> int:
-    """Return the largest number of bits of a CAN frame with `length` data bytes, with stuff bits.
+def worst_frame_bits(data_length: int) -> int:
+    """Return the largest number of bits of a CAN frame with `data_length` bytes, with stuff bits.
 
     After five equal bits a bit of the opposite value is inserted, which counts as the first of the
     next five. So at most one bit is inserted per four bits, after the first bit.
     """
-    return frame_bits(length) + (_STUFFABLE_BITS + 8 * length - 1) // 4
+    return frame_bits(data_length) + (_STUFFABLE_BITS + 8 * data_length - 1) // 4
 
 
-def load_of_frames(traffic: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
-    """Return the load that cyclic frames cause on a bus of the given bit rate."""
+def load_of_frames(cyclic_frames: tuple[CyclicFrame, ...], bitrate_bit_s: float) -> BusLoad:
+    """Return the load that cyclic frames cause on a bus of the given bit rate, as a fraction."""
     return BusLoad(
-        traffic=traffic,
-        plain=sum(frame_bits(t.length) * t.rate_hz for t in traffic) / bitrate_bit_s,
-        worst=sum(worst_frame_bits(t.length) * t.rate_hz for t in traffic) / bitrate_bit_s,
-        frames_per_s=sum(t.rate_hz for t in traffic),
+        traffic=cyclic_frames,
+        plain=sum(frame_bits(t.length) * t.rate_hz for t in cyclic_frames) / bitrate_bit_s,
+        worst=sum(worst_frame_bits(t.length) * t.rate_hz for t in cyclic_frames) / bitrate_bit_s,
+        frames_per_s=sum(t.rate_hz for t in cyclic_frames),
     )
 
 
 def bus_load(rig: RigParameters) -> BusLoad:
-    """Return the load of the CAN bus while a session runs.
+    """Return the load of the CAN bus while a session runs, as a fraction of its bit rate.
 
     Parameters
     ----------
@@ -214,12 +216,12 @@ def bus_load(rig: RigParameters) -> BusLoad:
     """
     if rig.can is None:
         raise ValueError("The rig has no CAN bus.")
-    traffic: list[CyclicFrame] = []
+    cyclic_frames: list[CyclicFrame] = []
     if (drive := rig.cia402) is not None:
         host_heartbeat_hz = min(rig.rate_hz, 1.0 / drive.heartbeat_period_s)
         drive_heartbeat_hz = 1.0 / drive.drive_heartbeat_period_s
         node_id, host_id = drive.node_id, drive.host_node_id
-        traffic += [
+        cyclic_frames += [
             CyclicFrame("SYNC", 0x80, SYNC_LENGTH, rig.rate_hz),
             CyclicFrame("drive's TPDO1", 0x180 + node_id, TPDO_LENGTH, rig.rate_hz),
             CyclicFrame("drive's RPDO1", 0x200 + node_id, RPDO_LENGTH, rig.rate_hz),
@@ -228,11 +230,14 @@ def bus_load(rig: RigParameters) -> BusLoad:
         ]
     if (sensor := rig.ati_can) is not None:
         first_id = sensor.base_id << 4
-        traffic.append(CyclicFrame("sensor's request", first_id, REQUEST_LENGTH, rig.rate_hz))
-        traffic += [
+        cyclic_frames.append(CyclicFrame("sensor's request", first_id, REQUEST_LENGTH, rig.rate_hz))
+        cyclic_frames += [
             CyclicFrame(
-                f"sensor's reply {reply_index + 1}", first_id + reply_index, length, rig.rate_hz
+                f"sensor's reply {reply_index + 1}",
+                first_id + reply_index,
+                reply_length,
+                rig.rate_hz,
             )
-            for reply_index, length in enumerate(REPLY_LENGTHS)
+            for reply_index, reply_length in enumerate(REPLY_LENGTHS)
         ]
-    return load_of_frames(tuple(traffic), rig.can.bitrate_bit_s)
+    return load_of_frames(tuple(cyclic_frames), rig.can.bitrate_bit_s)

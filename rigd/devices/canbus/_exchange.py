@@ -95,7 +95,7 @@ class ReplyPairing:
         self.outstanding = 0
 
     def needs_pause(self) -> bool:
-        """Return whether the next tick has to make no request.
+        """Return whether the next tick has to make no request, so that late replies are recognised.
 
         Call it after all received frames are delivered.
         """
@@ -108,7 +108,7 @@ class ReplyPairing:
         )
 
     def register_request(self) -> None:
-        """Count a new request, directly before it is sent.
+        """Count a new request to the device, directly before the request is sent.
 
         Call it after all received frames are delivered.
         """
@@ -127,7 +127,7 @@ class ReplyPairing:
         return 0 < self.outstanding <= self._inbox.replies
 
     def process_replies(self) -> bool:
-        """Count the received replies; return whether they include that to this tick's request.
+        """Count the received replies; return whether that to this tick's request is among them.
 
         If replies to earlier requests were outstanding, too, the result is False: a faulty line may
         deliver a delayed reply after later replies. The next tick is then the first valid one.
@@ -155,11 +155,11 @@ class ReplyPairing:
         self._replies_in_period = 0
 
     def _count_replies(self) -> int:
-        """Move newly received replies from the inbox into the counts; return their number."""
-        replies, self._inbox.replies = self._inbox.replies, 0
-        self._replies_in_period += replies
-        self.outstanding = max(0, self.outstanding - replies)
-        return replies
+        """Add the newly received replies to the counts, and return their number."""
+        new_replies, self._inbox.replies = self._inbox.replies, 0
+        self._replies_in_period += new_replies
+        self.outstanding = max(0, self.outstanding - new_replies)
+        return new_replies
 
 
 # Exchange
@@ -286,18 +286,18 @@ class CanExchange:
 
     def _deliver(self) -> None:
         """Deliver all frames that have arrived, and register error frames of the controller."""
-        receive, handlers = self._receive, self._handlers
-        while (raw := receive()) is not None:
-            can_id, length = unpack_header(raw)
-            handler = handlers.get(can_id)
-            if handler is not None:
-                self.bits += FRAME_BITS + 8 * length
-                handler(raw[8 : 8 + length])
+        receive_frame, frame_handlers = self._receive, self._handlers
+        while (raw := receive_frame()) is not None:
+            can_id, data_length = unpack_header(raw)
+            frame_handler = frame_handlers.get(can_id)
+            if frame_handler is not None:
+                self.bits += FRAME_BITS + 8 * data_length
+                frame_handler(raw[8 : 8 + data_length])
             elif can_id & ERROR_FLAG:
                 self._register_error(can_id & ERROR_MASK, raw[8:16])
 
-    def wait_until(self, ready: Callable[[], bool], deadline_ns: int) -> bool:
-        """Deliver frames until `ready` returns True or a deadline passes.
+    def wait_until(self, is_ready: Callable[[], bool], deadline_ns: int) -> bool:
+        """Deliver frames until `is_ready` returns True, or the deadline passes.
 
         Parameters
         ----------
@@ -311,39 +311,40 @@ class CanExchange:
         bool
             Whether the condition became true before the deadline.
         """
-        failures = 0
+        wait_failures = 0
         self.drain()
-        while not ready():
-            left_ns = deadline_ns - time.monotonic_ns()
-            if left_ns <= 0:
+        while not is_ready():
+            remaining_ns = deadline_ns - time.monotonic_ns()
+            if remaining_ns <= 0:
                 return False
             try:
-                self.port.wait(left_ns * 1e-9)
+                self.port.wait(remaining_ns * 1e-9)
             except Exception:
-                failures += 1
+                wait_failures += 1
                 if not self._ignores_errors:
                     raise
-                if failures > _MOST_WAIT_FAILURES:
+                if wait_failures > _MOST_WAIT_FAILURES:
                     return False  # the adapter has failed
-                time.sleep(min(_FAILURE_PAUSE_S, left_ns * 1e-9))
+                time.sleep(min(_FAILURE_PAUSE_S, remaining_ns * 1e-9))
             self.drain()
         return True
 
-    def _register_error(self, kind: int, data: bytes) -> None:
+    def _register_error(self, error_class: int, data: bytes) -> None:
         """Count an error frame of the controller, and store a message if no frame can be sent."""
         self.error_frames += 1
-        if kind & BUS_OFF:
+        if error_class & BUS_OFF:
             self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is off the bus (bus-off) after too "
                 "many errors; check cable, termination and bit rate, then bring it up again."
             )
-        elif kind & _NO_ACKNOWLEDGE_CLASS:
+        elif error_class & _NO_ACKNOWLEDGE_CLASS:
             self._bus_error = (
                 f"CAN bus {self.port.name}: no device acknowledges the frames sent; check cable, "
                 "termination, power and bit rate."
             )
         elif (
-            kind & _CONTROLLER_STATE_CLASS and data[_CONTROLLER_STATE_OFFSET] & _ERROR_PASSIVE_BITS
+            error_class & _CONTROLLER_STATE_CLASS
+            and data[_CONTROLLER_STATE_OFFSET] & _ERROR_PASSIVE_BITS
         ):
             self._bus_error = (
                 f"CAN bus {self.port.name}: the controller is error-passive, its frames are "
@@ -411,8 +412,8 @@ class CanLink:
         self._simulator = simulator
         self._exchange: CanExchange | None = None
         self._users = 0
-        simulated = "" if simulator is None else simulator.can_socket
-        self._lock = BusLock(simulated or settings.channel, simulated=bool(simulated))
+        simulated_bus = "" if simulator is None else simulator.can_socket
+        self._lock = BusLock(simulated_bus or settings.channel, simulated=bool(simulated_bus))
 
     @property
     def exchange(self) -> CanExchange:

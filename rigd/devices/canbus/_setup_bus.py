@@ -32,14 +32,14 @@ class SetupBus(can.BusABC):
 
     def _recv_internal(self, timeout: float | None) -> tuple[can.Message | None, bool]:
         """Return the next message or None, and False because the port does not filter frames."""
-        raw = self._port.receive()
-        if raw is None:
+        raw_frame = self._port.receive()
+        if raw_frame is None:
             self._port.wait(1.0 if timeout is None else timeout)
-            raw = self._port.receive()
+            raw_frame = self._port.receive()
         # canopen ignores the flags of a frame and checks only its identifier.
-        if raw is None or unpack_header(raw)[0] & (EXTENDED_FLAG | REMOTE_FLAG):
+        if raw_frame is None or unpack_header(raw_frame)[0] & (EXTENDED_FLAG | REMOTE_FLAG):
             return None, False
-        return to_message(raw), False
+        return to_message(raw_frame), False
 
 
 def to_message(raw: bytes) -> can.Message:

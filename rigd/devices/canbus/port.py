@@ -87,8 +87,8 @@ def pack_frame(can_id: int, data: bytes = b"") -> bytes:
 
 def unpack_frame(raw: bytes) -> tuple[int, bytes]:
     """Return identifier (with flags) and data of a raw frame; a length above 8 counts as 8."""
-    can_id, length, data = _FRAME_LAYOUT.unpack(raw)
-    return can_id, data[: min(length, 8)]
+    can_id, data_length, frame_data = _FRAME_LAYOUT.unpack(raw)
+    return can_id, frame_data[: min(data_length, 8)]
 
 
 # Ports
@@ -208,7 +208,7 @@ class SocketPort:
         return raw
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until a frame may have arrived, at most for the timeout."""
+        """Wait until a frame may have arrived on the bus, at most for `timeout_s`."""
         try:
             select.select(self._fd, (), (), timeout_s)
         except (OSError, ValueError) as error:
@@ -221,9 +221,9 @@ class SocketPort:
             id_filters = (
                 [(0, 0)] if can_ids is None else [(i, filter_mask) for i in sorted(set(can_ids))]
             )
-            filters = b"".join(struct.pack("=II", *each) for each in id_filters)
+            packed_filters = b"".join(struct.pack("=II", *id_filter) for id_filter in id_filters)
             try:
-                self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, filters)
+                self._link.setsockopt(socket.SOL_CAN_RAW, socket.CAN_RAW_FILTER, packed_filters)
             except OSError as error:
                 raise DeviceError(self._error_message("takes no filter", error)) from None
 
@@ -238,17 +238,17 @@ class SocketPort:
         with suppress(OSError):
             self._link.close()
 
-    def _error_message(self, what: str, error: OSError | ValueError) -> str:
+    def _error_message(self, failed_action: str, error: OSError | ValueError) -> str:
         """Return the message of an error of the socket, with cause and remedy."""
-        reason, number = str(error), None
+        error_reason, error_number = str(error), None
         if isinstance(error, OSError):
-            reason, number = error.strerror or reason, error.errno
+            error_reason, error_number = error.strerror or error_reason, error.errno
         remedy = (
             "no other device acknowledges: check cable, termination, power and bit rate"
-            if number in (errno.ENOBUFS, errno.EAGAIN)
+            if error_number in (errno.ENOBUFS, errno.EAGAIN)
             else self._remedy
         )
-        return f"CAN bus {self.name}: it {what} ({reason}); {remedy}."
+        return f"CAN bus {self.name}: it {failed_action} ({error_reason}); {remedy}."
 
 
 class PythonCanPort:
@@ -297,7 +297,7 @@ class PythonCanPort:
         return self._receive(0.0)
 
     def wait(self, timeout_s: float) -> None:
-        """Wait until a frame has arrived, at most for the timeout."""
+        """Wait until a frame has arrived on the bus, at most for `timeout_s`."""
         if self._next_frame is None:
             self._next_frame = self._receive(timeout_s)
 
@@ -316,7 +316,7 @@ class PythonCanPort:
             self._bus.shutdown()
 
     def _receive(self, timeout_s: float) -> bytes | None:
-        """Return the next frame from the adapter, or None after the timeout."""
+        """Return the next frame from the adapter, or None if none arrives within `timeout_s`."""
         try:
             message = self._bus.recv(timeout_s)
             raw = None if message is None else self._from_message(message)
@@ -360,21 +360,23 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
     DeviceError
         If the bus does not exist or cannot be opened; the message states the remedy.
     """
-    name = f"{settings.channel} ({settings.interface})"
+    bus_name = f"{settings.channel} ({settings.interface})"
     if simulator is not None and simulator.can_socket:
-        link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER_SIZE)
+        bus_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        bus_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SIMULATOR_SEND_BUFFER_SIZE)
         try:
-            link.connect(simulator.can_socket)
+            bus_socket.connect(simulator.can_socket)
         except OSError as error:
-            link.close()
+            bus_socket.close()
             raise DeviceError(
-                f"CAN bus {name}: the simulated rig does not answer ({error.strerror}); start "
+                f"CAN bus {bus_name}: the simulated rig does not answer ({error.strerror}); start "
                 "rigd simulate again."
             ) from None
-        return SocketPort(link, f"{name}, simulated", "check whether rigd simulate still runs")
+        return SocketPort(
+            bus_socket, f"{bus_name}, simulated", "check whether rigd simulate still runs"
+        )
     if settings.interface == "socketcan":
-        return SocketPort(_open_socketcan(settings), name)
+        return SocketPort(_open_socketcan(settings), bus_name)
     import can
 
     try:
@@ -383,34 +385,37 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
         )
     except Exception as error:
         raise DeviceError(
-            f"CAN bus {name}: it cannot be opened ({_error_text(error)}); check can.interface and "
-            "can.channel."
+            f"CAN bus {bus_name}: it cannot be opened ({_error_text(error)}); check can.interface "
+            "and can.channel."
         ) from None
-    return PythonCanPort(bus, name)
+    return PythonCanPort(bus, bus_name)
 
 
 def _open_socketcan(settings: CanBus) -> socket.socket:
     """Open and bind a CAN socket of the kernel; raise with a remedy if that fails."""
-    channel = settings.channel
+    interface_name = settings.channel
     remedy = (
-        f"bring it up with: ip link set {channel} up type can bitrate {settings.bitrate_bit_s}; "
-        "or start the simulated rig: rigd simulate --profile PROFILE"
+        f"bring it up with: ip link set {interface_name} up type can bitrate "
+        f"{settings.bitrate_bit_s}; or start the simulated rig: rigd simulate --profile PROFILE"
     )
     if not hasattr(socket, "AF_CAN"):
-        raise DeviceError(f"CAN bus {channel}: this system has no CAN sockets; {remedy}.")
+        raise DeviceError(f"CAN bus {interface_name}: this system has no CAN sockets; {remedy}.")
     try:
-        link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+        can_socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
         raise DeviceError(
-            f"CAN bus {channel}: this kernel has no CAN sockets ({error.strerror}); {remedy}."
+            f"CAN bus {interface_name}: this kernel has no CAN sockets ({error.strerror}); "
+            f"{remedy}."
         ) from None
     try:
-        link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_SIZE)
-        link.setsockopt(socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_MASK))
-        link.bind((channel,))
+        can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_SIZE)
+        can_socket.setsockopt(
+            socket.SOL_CAN_RAW, _CAN_RAW_ERR_FILTER, struct.pack("=I", ERROR_MASK)
+        )
+        can_socket.bind((interface_name,))
     except OSError as error:
-        link.close()
+        can_socket.close()
         raise DeviceError(
-            f"CAN bus {channel}: it cannot be opened ({error.strerror}); {remedy}."
+            f"CAN bus {interface_name}: it cannot be opened ({error.strerror}); {remedy}."
         ) from None
-    return link
+    return can_socket

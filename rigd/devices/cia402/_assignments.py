@@ -74,23 +74,23 @@ def parse_assignment(text: str) -> Assignment:
     >>> parse_assignment("3001:2 u32 2500")
     Assignment(index=12289, sub=2, integer_type='u32', value=2500)
     """
-    match = _ASSIGNMENT_PATTERN.fullmatch(text.strip())
-    if match is None:
+    pattern_match = _ASSIGNMENT_PATTERN.fullmatch(text.strip())
+    if pattern_match is None:
         raise ValueError('must be index:sub, type and value, such as "3001:2 u32 2500"')
-    index, sub = int(match[1], 16), int(match[2] or "0", 16)
-    integer_type = match[3]
+    index, sub = int(pattern_match[1], 16), int(pattern_match[2] or "0", 16)
+    integer_type = pattern_match[3]
     if integer_type not in INTEGER_RANGES:
         raise ValueError(
             f"has the unknown type {integer_type!r}; choose {', '.join(INTEGER_RANGES)}"
         )
     try:
-        value = int(match[4], 0)
+        object_value = int(pattern_match[4], 0)
     except ValueError:
         raise ValueError(
-            f"has a value that is not a whole number ({match[4]}); write 2500, -3 or 0x9C4"
+            f"has a value that is not a whole number ({pattern_match[4]}); write 2500, -3 or 0x9C4"
         ) from None
     low, high = INTEGER_RANGES[integer_type]
-    if not low <= value <= high:
+    if not low <= object_value <= high:
         raise ValueError(f"has a value that {integer_type} does not hold ({low} to {high})")
     if (index, sub) in _SET_BY_RIGD or index in _PDO_INDICES:
         raise ValueError("is an object that rigd sets itself; remove it")
@@ -99,4 +99,4 @@ def parse_assignment(text: str) -> Assignment:
             "would have the drive store or restore its memory at every start; do that once with "
             "the drive's own tool"
         )
-    return Assignment(index, sub, integer_type, value)
+    return Assignment(index, sub, integer_type, object_value)

@@ -167,7 +167,7 @@ class Cia402Drive:
         return self._capabilities
 
     def statement(self) -> dict[str, str]:
-        """Return the drive's own safeguards as metadata of a session file.
+        """Return texts on the drive's own safeguards, such as its watchdog, as session metadata.
 
         Returns
         -------
@@ -238,7 +238,9 @@ class Cia402Drive:
         node.resume()
 
     def latch(self, due_ns: int) -> None:
-        """Send SYNC, on which the drive samples its angle, unless this tick has to omit SYNC.
+        """Send SYNC, on which the drive samples its angle.
+
+        No SYNC is sent in a tick that has to omit it, so that late replies are recognised.
 
         Parameters
         ----------
@@ -275,8 +277,8 @@ class Cia402Drive:
         if self._awaits_reply:
             self._awaits_reply = False
             if self._replies_in_same_tick:
-                caught_up = node.pairing.is_up_to_date
-                node.exchange.wait_until(caught_up, node.sync_ns + node.deadline_ns)
+                is_up_to_date = node.pairing.is_up_to_date
+                node.exchange.wait_until(is_up_to_date, node.sync_ns + node.deadline_ns)
                 self._store_reply(node)
             node.send_heartbeat()
         inbox = self._inbox
@@ -306,19 +308,19 @@ class Cia402Drive:
         DeviceError
             If the torque is not a number, or the bus has failed.
         """
-        send = self._require_node().exchange.send
+        send_frame = self._require_node().exchange.send
         if not self._enabled:
-            send(self._idle_rpdo)
+            send_frame(self._idle_rpdo)
             return 0.0
-        per_mille = torque_nm * self._per_mille_per_nm
-        limit = self._limit_per_mille
-        if not -limit <= per_mille <= limit:
-            if isnan(per_mille):
+        torque_per_mille = torque_nm * self._per_mille_per_nm
+        limit_per_mille = self._limit_per_mille
+        if not -limit_per_mille <= torque_per_mille <= limit_per_mille:
+            if isnan(torque_per_mille):
                 raise DeviceError(f"{self._name}: the torque command is not a number.")
-            per_mille = limit if per_mille > 0 else -limit
-        sent_per_mille = round(per_mille)
+            torque_per_mille = limit_per_mille if torque_per_mille > 0 else -limit_per_mille
+        sent_per_mille = round(torque_per_mille)
         self._torque_check.command(sent_per_mille)
-        send(self._frames.rpdo(ENABLE_OPERATION, sent_per_mille))
+        send_frame(self._frames.rpdo(ENABLE_OPERATION, sent_per_mille))
         return sent_per_mille / self._per_mille_per_nm
 
     def health(self) -> LineHealth:
@@ -328,23 +330,25 @@ class Cia402Drive:
         exchange = self._node.exchange
         pairing = self._node.pairing
         lost_without_proof = pairing.lost_without_proof
-        doubt = lost_count_text = ""
+        doubt_text = lost_count_text = ""
         if lost_without_proof:
-            reason = "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
-            doubt = (
+            doubt_reason = (
+                "in lock-step" if self._node.lock_step else "while cia402.sync_gaps = false"
+            )
+            doubt_text = (
                 f"{self._name}: a TPDO did not arrive, or all have been delayed by a period since, "
-                f"which is unknown {reason}: angles may be older than the file states."
+                f"which is unknown {doubt_reason}: angles may be older than the file states."
             )
             lost_count_text = (
                 f"{self._name}: TPDOs that did not arrive since it was connected: "
                 f"{lost_without_proof}."
             )
-        errors = exchange.error_frames + pairing.lost + self._inbox.malformed_frames
+        error_count = exchange.error_frames + pairing.lost + self._inbox.malformed_frames
         return LineHealth(
             exchange.bits,
             self._bit_rate_bit_s,
-            errors,
-            doubt=doubt,
+            error_count,
+            doubt=doubt_text,
             doubt_count=lost_count_text,
         )
 
@@ -444,7 +448,7 @@ class Cia402Drive:
         exchange.subscribe(self._frames.reply_id, self._inbox.store_sdo_reply)
 
     def _store_previous_reply(self, node: Node) -> None:
-        """Process the reply to the previous tick's SYNC, which should have arrived."""
+        """Process the drive's reply to the previous tick's SYNC, which should have arrived."""
         if node.lock_step and node.pairing.outstanding:
             node.exchange.wait_until(node.pairing.is_up_to_date, node.sync_ns + node.deadline_ns)
         else:
@@ -452,18 +456,21 @@ class Cia402Drive:
         self._store_reply(node)
 
     def _store_reply(self, node: Node) -> None:
-        """Store angle and torque if the last TPDO answers the last SYNC, else mark them stale."""
+        """Store the angle and compare the torque if the last TPDO answers the last SYNC.
+
+        Otherwise the angle is registered as stale.
+        """
         is_fresh = node.pairing.process_replies() and self._inbox.is_last_tpdo_valid
         self.angle_stale = not is_fresh
         if self._enabled and is_fresh:
             self._torque_check.compare(self._inbox.torque)
         if is_fresh:
-            position = self._inbox.position
+            position_counts = self._inbox.position
             # The 32-bit counter wraps around.
             self._relative_counts += (
-                position - self._position + _HALF_COUNTER_RANGE & _COUNTER_MASK
+                position_counts - self._position + _HALF_COUNTER_RANGE & _COUNTER_MASK
             ) - _HALF_COUNTER_RANGE
-            self._position = position
+            self._position = position_counts
             self.angle_rad = self._relative_counts * self._rad_per_count
             self.angle_time_ns = node.sync_ns
 

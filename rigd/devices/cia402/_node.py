@@ -144,36 +144,38 @@ class ReceivedFrames:
 
     def store_emergency(self, data: bytes) -> None:
         """Store a received emergency message as an alarm; error code zero means no error."""
-        message = read_emergency(data)
-        if message is None:
+        emergency = read_emergency(data)
+        if emergency is None:
             self.malformed_frames += 1
             return
-        code, _, vendor = message
-        if code >> 8 == 0:
+        error_code, _, vendor_bytes = emergency
+        if error_code >> 8 == 0:
             return
         self.emergency_received = True
         if self.alarm:
             return
-        if code == self.sto_error_code:
-            code_text = f" (emergency message, error code 0x{code:04X})"
+        if error_code == self.sto_error_code:
+            code_text = f" (emergency message, error code 0x{error_code:04X})"
             self.alarm = str(wired_stop_dropped(self.name, code_text))
         else:
-            vendor_text = f", vendor's bytes {vendor.hex(' ')}" if any(vendor) else ""
-            self.alarm = f"{self.name}: emergency message: {describe_error(code)}{vendor_text}."
+            vendor_text = f", vendor's bytes {vendor_bytes.hex(' ')}" if any(vendor_bytes) else ""
+            self.alarm = (
+                f"{self.name}: emergency message: {describe_error(error_code)}{vendor_text}."
+            )
 
     def store_heartbeat(self, data: bytes) -> None:
         """Store the NMT state of a received heartbeat; set an alarm if it is not operational."""
         if not data:
             self.malformed_frames += 1
             return
-        state = data[0] & ~_TOGGLE_BIT
-        self.nmt_state = state
+        nmt_state = data[0] & ~_TOGGLE_BIT
+        self.nmt_state = nmt_state
         self.heartbeat_received = True
-        if self.must_stay_operational and state != OPERATIONAL and not self.alarm:
-            if state == BOOT_UP:
+        if self.must_stay_operational and nmt_state != OPERATIONAL and not self.alarm:
+            if nmt_state == BOOT_UP:
                 event_text = "it has restarted by itself; check its supply"
             else:
-                state_name = NMT_STATES.get(state, f"state {state}")
+                state_name = NMT_STATES.get(nmt_state, f"state {nmt_state}")
                 event_text = (
                     f"it has left operational for {state_name}, as it does when it misses "
                     "heartbeats, or when another master on the bus commands it to"
@@ -274,9 +276,9 @@ class Node:
         period_s = self.settings.drive_heartbeat_period_s
         if self.lock_step:
             # Without SYNC the drive's time does not advance, not even to its next heartbeat.
-            syncs_left = ceil(3 * period_s * self.rate_hz)
-            while not self._is_operational() and syncs_left > 0 and self.sync():
-                syncs_left -= 1
+            remaining_syncs = ceil(3 * period_s * self.rate_hz)
+            while not self._is_operational() and remaining_syncs > 0 and self.sync():
+                remaining_syncs -= 1
         else:
             patience_ns = _START_TIMEOUT_NS + round(3e9 * period_s)
             self.exchange.wait_until(self._is_operational, time.monotonic_ns() + patience_ns)
@@ -345,7 +347,7 @@ class Node:
             self._next_heartbeat_ns = self.now_ns + self._heartbeat_ns
 
     def resume(self) -> None:
-        """Restart the timing of both heartbeats after a time without ticks."""
+        """Restart the timing of the heartbeats of computer and drive after a time without ticks."""
         self._next_heartbeat_ns = _BEFORE_ANY_TIME_NS
         self.inbox.heartbeat_received = True
 
@@ -363,7 +365,7 @@ class Node:
         return self.await_reply(patience_ns)
 
     def sync_if_possible(self) -> bool:
-        """Send SYNC despite bus errors, and return whether it was answered; never raises."""
+        """Send SYNC despite bus errors; return whether a TPDO answered it. Never raises."""
         with self.exchange.ignore_errors():
             self.exchange.drain()  # frames that have already arrived are no reply to this SYNC
             self.pairing.register_request()
@@ -424,18 +426,18 @@ class Node:
             self.await_alarm()
         if not (in_fault or inbox.alarm):
             return
-        reason = inbox.alarm or (
+        alarm_reason = inbox.alarm or (
             f'{self.name}: it is in the state "{drive_state(inbox.statusword).value}" (statusword '
             f"0x{inbox.statusword:04X}) and names no cause."
         )
         if in_fault:
-            reason += f" Remove the cause, then: {self._reset_command}"
+            alarm_reason += f" Remove the cause, then: {self._reset_command}"
         elif inbox.emergency_received:
             # The message may be from a drive that was off; one that was on reports its state later.
-            reason += (
+            alarm_reason += (
                 f" Remove the cause; if drive or daemon are in fault then: {self._reset_command}"
             )
-        raise DeviceError(reason)
+        raise DeviceError(alarm_reason)
 
     def _request_if_possible(self, request: bytes, is_reply_received: Callable[[], bool]) -> bool:
         """Send an SDO request despite bus errors; return whether the reply came in time."""

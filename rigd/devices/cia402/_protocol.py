@@ -86,8 +86,8 @@ TORQUE_FREE_STATES: Final = (
 
 def drive_state(statusword: int) -> DriveState:
     """Return the drive state that a statusword encodes."""
-    for mask, value, state in _STATE_CODES:
-        if statusword & mask == value:
+    for state_mask, state_code, state in _STATE_CODES:
+        if statusword & state_mask == state_code:
             return state
     return DriveState.UNKNOWN
 
@@ -205,8 +205,8 @@ def read_emergency(data: bytes) -> tuple[int, int, bytes] | None:
     """
     if len(data) < 3:
         return None
-    code, register = _unpack_emergency(data)
-    return code, register, data[3:]
+    error_code, error_register = _unpack_emergency(data)
+    return error_code, error_register, data[3:]
 
 
 def is_written(data: bytes, index: int, sub: int) -> bool:
@@ -216,24 +216,24 @@ def is_written(data: bytes, index: int, sub: int) -> bool:
 
 def read_mode(data: bytes) -> int | None:
     """Return the mode of operation in an SDO reply, or None if the reply is not for object 6061."""
-    value = _read_reply_data(data, MODE_DISPLAY)
-    return None if value is None else int.from_bytes(value[:1], "little", signed=True)
+    mode_bytes = _read_reply_data(data, MODE_DISPLAY)
+    return None if mode_bytes is None else int.from_bytes(mode_bytes[:1], "little", signed=True)
 
 
 def read_statusword(data: bytes) -> int | None:
     """Return the statusword in an SDO reply, or None if the reply is not for object 6041."""
-    value = _read_reply_data(data, STATUSWORD)
-    return None if value is None else int.from_bytes(value[:2], "little")
+    status_bytes = _read_reply_data(data, STATUSWORD)
+    return None if status_bytes is None else int.from_bytes(status_bytes[:2], "little")
 
 
 def _read_reply_data(data: bytes, expected_index: int) -> bytes | None:
     """Return the data of an SDO reply to a read request, or None if it is for another object."""
     if len(data) != 8:
         return None
-    command, index, sub, value = _unpack_sdo(data)
-    if (index, sub) != (expected_index, 0) or command & 0xE0 != _SDO_READ_REPLY:
+    sdo_command, reply_index, sub, value_bytes = _unpack_sdo(data)
+    if (reply_index, sub) != (expected_index, 0) or sdo_command & 0xE0 != _SDO_READ_REPLY:
         return None
-    return bytes(value)
+    return bytes(value_bytes)
 
 
 # Error codes
@@ -281,9 +281,9 @@ _ERROR_MEANINGS: Final = (
 """Meanings of error codes: mask, masked value, meaning; the most specific masks come first."""
 
 
-def describe_error(code: int) -> str:
+def describe_error(error_code: int) -> str:
     """Describe a 16-bit CiA 402 error code in words, followed by the code."""
-    for mask, value, meaning in _ERROR_MEANINGS:
-        if code & mask == value:
-            return f"{meaning} (error code 0x{code:04X})"
-    return f"error code 0x{code:04X}"
+    for code_mask, code_value, meaning in _ERROR_MEANINGS:
+        if error_code & code_mask == code_value:
+            return f"{meaning} (error code 0x{error_code:04X})"
+    return f"error code 0x{error_code:04X}"

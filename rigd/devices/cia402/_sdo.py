@@ -112,8 +112,6 @@ class _Receiver(MessageListener):
     """Frame listener for canopen that ignores bus errors in its thread.
 
     The next SDO request fails and reports the bus error to the caller.
-
-    The next request reports the failure.
     """
 
     def on_error(self, exc: Exception) -> None:  # noqa: ARG002
@@ -178,14 +176,17 @@ class SdoAccess:
         except SdoRefusal:
             return
         except DeviceError as error:
-            others = sorted(set(self._network.scanner.nodes) - {self._node.id})
-            received = f"; frames came from node {', '.join(map(str, others))}" if others else ""
+            other_nodes = sorted(set(self._network.scanner.nodes) - {self._node.id})
+            received_text = (
+                f"; frames came from node {', '.join(map(str, other_nodes))}" if other_nodes else ""
+            )
             raise DeviceError(
-                f"{error} Check its supply, its node id (cia402.node_id) and bit rate{received}."
+                f"{error} Check its supply, its node id (cia402.node_id) and bit "
+                f"rate{received_text}."
             ) from None
 
     def load_eds(self, path: str) -> tuple[int, int]:
-        """Load the data types of the objects from the drive's EDS file, and return its identity.
+        """Load the objects' data types from a drive's EDS file; return vendor and product code.
 
         Returns
         -------
@@ -217,13 +218,13 @@ class SdoAccess:
     @contextmanager
     def short_timeouts(self) -> Iterator[None]:
         """Allow each SDO transfer in this context one attempt of 50 ms, to switch off quickly."""
-        client = self._node.sdo
-        previous_settings = client.RESPONSE_TIMEOUT, client.MAX_RETRIES
-        client.RESPONSE_TIMEOUT, client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
+        sdo_client = self._node.sdo
+        previous_settings = sdo_client.RESPONSE_TIMEOUT, sdo_client.MAX_RETRIES
+        sdo_client.RESPONSE_TIMEOUT, sdo_client.MAX_RETRIES = _HURRIED_TIMEOUT_S, 1
         try:
             yield
         finally:
-            client.RESPONSE_TIMEOUT, client.MAX_RETRIES = previous_settings
+            sdo_client.RESPONSE_TIMEOUT, sdo_client.MAX_RETRIES = previous_settings
 
     def read(self, index: int, sub: int = 0) -> int:
         """Read an object by SDO and return its integer value.
@@ -233,10 +234,10 @@ class SdoAccess:
         DeviceError
             If the drive does not answer, or refuses (:class:`SdoRefusal`).
         """
-        value = self._transfer(index, sub, None)
-        if not isinstance(value, int):
+        object_value = self._transfer(index, sub, None)
+        if not isinstance(object_value, int):
             raise DeviceError(f"{self._name}: {self._object_name(index, sub)} is not a number.")
-        return value
+        return object_value
 
     def read_or_none(self, index: int, sub: int = 0) -> int | None:
         """Read an object by SDO and return its value, or None if the drive has no such object.
@@ -334,25 +335,25 @@ class SdoAccess:
 
     def _variable(self, index: int, sub: int) -> ODVariable:
         """Return the dictionary entry of an object; create the entry if the dictionary has none."""
-        dictionary = self._node.object_dictionary
-        variable_or_none = dictionary.get_variable(index, sub)
+        object_dictionary = self._node.object_dictionary
+        variable_or_none = object_dictionary.get_variable(index, sub)
         if variable_or_none is not None:
             return variable_or_none
-        variable = ODVariable("", index, sub)
-        variable.data_type = _DATA_TYPES[_communication_parameter_type(index, sub)]
-        if index not in dictionary:
-            dictionary.add_object(ODRecord(f"{index:04X}", index))
-        record = dictionary[index]
+        new_variable = ODVariable("", index, sub)
+        new_variable.data_type = _DATA_TYPES[_communication_parameter_type(index, sub)]
+        if index not in object_dictionary:
+            object_dictionary.add_object(ODRecord(f"{index:04X}", index))
+        record = object_dictionary[index]
         if isinstance(record, ODVariable):
-            dictionary.add_object(record := ODRecord(f"{index:04X}", index))
-        record.add_member(variable)
-        return variable
+            object_dictionary.add_object(record := ODRecord(f"{index:04X}", index))
+        record.add_member(new_variable)
+        return new_variable
 
     def _object_name(self, index: int, sub: int) -> str:
         """Return index, sub-index and name of an object for messages."""
-        name = self._variable(index, sub).name
+        object_name = self._variable(index, sub).name
         address = f"{index:04X}:{sub}" if sub else f"{index:04X}"
-        return f"object {address}" + (f" ({name})" if name else "")
+        return f"object {address}" + (f" ({object_name})" if object_name else "")
 
 
 def _transfer_skipping_late_replies(
@@ -374,30 +375,35 @@ def _transfer_skipping_late_replies(
     raise AssertionError
 
 
-def _discard_late_replies(client: SdoClient) -> None:
+def _discard_late_replies(sdo_client: SdoClient) -> None:
     """Discard late SDO replies until none arrives for a while."""
-    patience_s = min(_LATE_REPLY_SILENCE_S, client.RESPONSE_TIMEOUT)
+    patience_s = min(_LATE_REPLY_SILENCE_S, sdo_client.RESPONSE_TIMEOUT)
     with suppress(queue.Empty):
         while True:
-            client.responses.get(timeout=patience_s)
+            sdo_client.responses.get(timeout=patience_s)
 
 
-def _load_integer_types(own: ObjectDictionary, eds: str, node_id: int) -> tuple[int, int]:
-    """Copy integer data types from a drive's EDS file into `own`; return the drive's identity."""
+def _load_integer_types(
+    dictionary: ObjectDictionary, eds_path: str, node_id: int
+) -> tuple[int, int]:
+    """Copy integer data types from a drive's EDS file into the object dictionary `dictionary`.
+
+    Returned are the vendor and product code of the EDS file.
+    """
     try:
-        drive_eds = read_eds(Path(eds), node_id)
+        drive_eds = read_eds(Path(eds_path), node_id)
     except EdsError as error:
         raise DeviceError(
             f"{error} Get it again from the manufacturer, or remove cia402.eds from the profile."
         ) from None
-    for address in [(v.index, v.subindex) for o in own.values() for v in _variables(o)]:
-        entry, own_entry = drive_eds.get(*address), own.get_variable(*address)
+    for address in [(v.index, v.subindex) for o in dictionary.values() for v in _variables(o)]:
+        eds_entry, own_entry = drive_eds.get(*address), dictionary.get_variable(*address)
         if (
-            entry is not None
+            eds_entry is not None
             and own_entry is not None
-            and {entry.data_type, own_entry.data_type} <= set(datatypes.INTEGER_TYPES)
+            and {eds_entry.data_type, own_entry.data_type} <= set(datatypes.INTEGER_TYPES)
         ):
-            own_entry.data_type = entry.data_type
+            own_entry.data_type = eds_entry.data_type
     return drive_eds.vendor_id, drive_eds.product_code
 
 

@@ -95,14 +95,18 @@ class DriveCapabilities:
 
     @property
     def accepted(self) -> tuple[str, ...]:
-        """Names in ``cia402.accept_without`` of functions that this drive indeed lacks."""
-        names = [each.accept for each in self.lacks if each.accept and each.accept != WATCHDOG]
+        """Names in ``cia402.accept_without`` of functions that this drive lacks."""
+        function_names = [
+            missing_object.accept
+            for missing_object in self.lacks
+            if missing_object.accept and missing_object.accept != WATCHDOG
+        ]
         if self.watchdog is Watchdog.NONE:
-            names.insert(0, WATCHDOG)
-        return tuple(names)
+            function_names.insert(0, WATCHDOG)
+        return tuple(function_names)
 
 
-def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilities:
+def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCapabilities:
     """Verify and configure the drive by SDO; the drive stays pre-operational and disabled.
 
     Parameters
@@ -127,8 +131,8 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
     """
     settings = rig.cia402
     assert settings is not None
-    required = required_values(rig)
-    with SdoAccess(port, settings.node_id, name) as sdo:
+    required_objects = required_values(rig)
+    with SdoAccess(port, settings.node_id, drive_name) as sdo:
         # First, before the identity is known: a killed session may have left the motor turning.
         command_off(sdo)
         sdo.enter_pre_operational()
@@ -136,11 +140,11 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
         identity = _read_identity(sdo)
         try:
             eds_identity = sdo.load_eds(settings.eds) if settings.eds else (0, 0)
-            _check_identity(identity, settings, name, eds_identity)
+            _check_identity(identity, settings, drive_name, eds_identity)
         except DeviceError as error:
             raise DeviceError(f"{error}{describe_remaining_torque(sdo)}") from None
-        wait_until_disabled(sdo, rig, name)
-        configuration = _DriveConfiguration(sdo, settings, name, required)
+        wait_until_disabled(sdo, rig, drive_name)
+        configuration = _DriveConfiguration(sdo, settings, drive_name, required_objects)
         configuration.assign()
         configuration.check_rated_torque(identity, rig)
         configuration.check_gear_and_encoder(identity, rig)
@@ -166,7 +170,10 @@ def set_up_drive(port: CanPort, rig: RigParameters, name: str) -> DriveCapabilit
 
 
 def _read_identity(sdo: SdoAccess) -> dict[str, object]:
-    """Read the drive's identity by SDO; objects that the drive lacks give None or an empty text."""
+    """Read the drive's identity by SDO: numbers, names and supported modes, by key.
+
+    A number that the drive lacks is None, and a name that it lacks is an empty text.
+    """
     identity: dict[str, object] = {}
     for sub, key in enumerate(("vendor_id", "product_code", "revision", "serial_number"), 1):
         identity[key] = sdo.read_or_none(objects.IDENTITY, sub)
@@ -177,33 +184,41 @@ def _read_identity(sdo: SdoAccess) -> dict[str, object]:
 
 
 def _check_identity(
-    identity: dict[str, object], settings: ServoDrive, name: str, eds_identity: tuple[int, int]
+    identity: dict[str, object],
+    settings: ServoDrive,
+    drive_name: str,
+    eds_identity: tuple[int, int],
 ) -> None:
-    """Raise if the drive differs from the profile or its EDS file, or has no cyclic torque mode."""
+    """Raise if the drive's identity differs from that of the profile or of its EDS file.
+
+    A drive without cyclic synchronous torque mode is refused as well.
+    """
     eds_vendor, eds_product = eds_identity
-    for key, source, required in (
+    for key, value_source, required_number in (
         ("vendor_id", "cia402.vendor_id", settings.vendor_id),
         ("product_code", "cia402.product_code", settings.product_code),
         ("vendor_id", f"VendorNumber in {settings.eds}", eds_vendor),
         ("product_code", f"ProductNumber in {settings.eds}", eds_product),
     ):
-        reported = identity[key]
-        if required and reported != required:
-            got_text = "nothing" if reported is None else f"0x{reported:08X}"
+        reported_number = identity[key]
+        if required_number and reported_number != required_number:
+            reported_text = "nothing" if reported_number is None else f"0x{reported_number:08X}"
             raise DeviceError(
-                f"{name}: it is another drive: {source} is 0x{required:08X}, it says {got_text}. "
-                "Check cia402.node_id, or write into the profile what is really there."
+                f"{drive_name}: it is another drive: {value_source} is 0x{required_number:08X}, it "
+                f"says {reported_text}. Check cia402.node_id, or write into the profile what is "
+                "really there."
             )
-    modes = identity["supported_modes"]
-    if not (isinstance(modes, int) and modes & objects.SUPPORTS_CYCLIC_TORQUE):
+    mode_bits = identity["supported_modes"]
+    if not (isinstance(mode_bits, int) and mode_bits & objects.SUPPORTS_CYCLIC_TORQUE):
         raise DeviceError(
-            f"{name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
-            f"{show_value(modes)}, bit 9 is not set); this drive or its firmware cannot be used."
+            f"{drive_name}: it has no cyclic synchronous torque mode over CANopen (object 6502 = "
+            f"{show_value(mode_bits)}, bit 9 is not set); this drive or its firmware cannot be "
+            "used."
         )
 
 
 class _DriveConfiguration:
-    """Configuration of one disabled drive, which collects the objects that the drive lacks.
+    """Set-up of one disabled drive by SDO, which collects the objects that the drive lacks.
 
     Parameters
     ----------
@@ -258,14 +273,14 @@ class _DriveConfiguration:
             self._sdo.configure(row.index, row.sub, required)
         except ValueNotStored as not_stored:
             present_value = not_stored.got
-            error: DeviceError = not_stored
+            readback_error: DeviceError = not_stored
         except SdoRefusal as refusal:
             if present_value is None and refusal.is_absent:
                 self._record_missing_object(row)
                 return False
             if present_value is None:
                 raise
-            error = DeviceError(
+            readback_error = DeviceError(
                 f"{self._name}: object {row.address} ({row.name}) is {show_value(present_value)}, "
                 f"needed is {show_value(required)}, and it refuses to change it (abort code "
                 f"0x{refusal.code:08X}: {_abort_meaning(refusal)}). {row.sentence}"
@@ -277,7 +292,7 @@ class _DriveConfiguration:
         if row.accept == TORQUE_LIMIT and present_value >= required and self._accepts(row):
             self._record_missing_object(row)
             return False
-        raise error
+        raise readback_error
 
     def assign(self) -> None:
         """Write the manufacturer-specific objects that ``cia402.set_objects`` names."""
@@ -293,57 +308,70 @@ class _DriveConfiguration:
         The rated torque is added to `identity`.
         """
         settings = self._settings
-        counts = self._sdo.read_or_none(objects.RATED_TORQUE)
-        identity["rated_torque_counts"] = counts
+        torque_counts = self._sdo.read_or_none(objects.RATED_TORQUE)
+        identity["rated_torque_counts"] = torque_counts
         row = requirement(objects.RATED_TORQUE)
-        if counts is None:
+        if torque_counts is None:
             self.lacks.append(row)
         if settings.rated_torque_unit_nm == 0:
             return
-        if counts is None:
+        if torque_counts is None:
             raise DeviceError(
                 f"{self._name}: it has no object {row.address} ({row.name}). {row.sentence}"
             )
-        reported_nm = counts * settings.rated_torque_unit_nm * settings.gear_ratio
-        wanted_nm = rig.motor.rated_torque_nm
+        reported_nm = torque_counts * settings.rated_torque_unit_nm * settings.gear_ratio
+        profile_nm = rig.motor.rated_torque_nm
         identity["rated_torque_nm"] = reported_nm
-        if abs(reported_nm - wanted_nm) > _RATED_TORQUE_TOLERANCE * wanted_nm:
+        if abs(reported_nm - profile_nm) > _RATED_TORQUE_TOLERANCE * profile_nm:
             raise DeviceError(
-                f"{self._name}: its rated torque (object 6076 = {counts}) is {reported_nm:.4g} N·m "
-                f"at the output shaft, motor.rated_torque_nm says {wanted_nm:.4g} N·m; every "
-                "torque would be wrong by that ratio. Correct the profile or the drive."
+                f"{self._name}: its rated torque (object 6076 = {torque_counts}) is "
+                f"{reported_nm:.4g} N·m at the output shaft, motor.rated_torque_nm says "
+                f"{profile_nm:.4g} N·m; every torque would be wrong by that ratio. Correct the "
+                "profile or the drive."
             )
 
     def check_gear_and_encoder(self, identity: dict[str, object], rig: RigParameters) -> None:
         """Raise if the drive's gear ratio or encoder step differs from the profile's by over 2 %.
 
-        Only values that the drive states are compared. Both are added to `identity`.
+        Only values that the drive states are compared. Both values are added to `identity`.
 
         Raises
         ------
         DeviceError
             If they differ by more than 2 %.
         """
-        gear = self._read_ratio(objects.GEAR_RATIO)
-        increments = self._read_ratio(objects.ENCODER_RESOLUTION)
-        feed = self._read_ratio(objects.FEED_CONSTANT)
-        stated_gear = self._settings.gear_ratio
-        identity["gear_ratio"] = gear
-        if gear is not None and not _is_ratio_equal(gear, stated_gear):
+        drive_gear = self._read_ratio(objects.GEAR_RATIO)
+        increments_per_turn = self._read_ratio(objects.ENCODER_RESOLUTION)
+        feed_units = self._read_ratio(objects.FEED_CONSTANT)
+        profile_gear = self._settings.gear_ratio
+        identity["gear_ratio"] = drive_gear
+        if drive_gear is not None and not _is_ratio_equal(drive_gear, profile_gear):
             raise DeviceError(
-                f"{self._name}: its gear (object 6091) is {gear:.5g} turns of the motor in one of "
-                f"the output shaft, cia402.gear_ratio says {stated_gear:.5g}. Correct the profile "
-                "or the drive."
+                f"{self._name}: its gear (object 6091) is {drive_gear:.5g} turns of the motor in "
+                f"one of the output shaft, cia402.gear_ratio says {profile_gear:.5g}. Correct the "
+                "profile or the drive."
             )
         # Position units per revolution of the output shaft: encoder increments, unless the drive
         # has a feed constant that defines other units.
-        increments_a_turn = None if increments is None else increments * (gear or stated_gear)
-        turn_units = [units for units in (feed, increments_a_turn) if units is not None]
+        output_increments = (
+            None
+            if increments_per_turn is None
+            else increments_per_turn * (drive_gear or profile_gear)
+        )
+        turn_units = [
+            units_per_turn
+            for units_per_turn in (feed_units, output_increments)
+            if units_per_turn is not None
+        ]
         identity["encoder_step_rad"] = tau / turn_units[0] if turn_units else None
         step_rad = rig.encoder.resolution_rad
-        if not turn_units or any(_is_ratio_equal(tau / units, step_rad) for units in turn_units):
+        if not turn_units or any(
+            _is_ratio_equal(tau / units_per_turn, step_rad) for units_per_turn in turn_units
+        ):
             return
-        gear_objects = "6092" if feed is not None else "608F" if gear is None else "608F and 6091"
+        gear_objects = (
+            "6092" if feed_units is not None else "608F" if drive_gear is None else "608F and 6091"
+        )
         raise DeviceError(
             f"{self._name}: its encoder step (object {gear_objects}) is {tau / turn_units[0]:.4g} "
             f"rad at the output shaft ({turn_units[0]:.6g} steps a turn), encoder.resolution_rad "
@@ -356,8 +384,6 @@ class _DriveConfiguration:
 
         A ratio of 1 to 1 counts as not stated, since drives that were never configured have that
         value.
-
-        Drives that were never set up for it have it as 1 to 1.
         """
         try:
             numerator = self._sdo.read_or_none(index, 1)
@@ -384,7 +410,7 @@ class _DriveConfiguration:
         self._clear_object(requirement(objects.POLARITY))
 
     def configure_speed(self) -> None:
-        """Set the drive's speed limit, which bounds the effect of a constant torque."""
+        """Write the profile's limit of the motor speed, in rpm, to the drive, if there is one."""
         if self._settings.max_speed_rad_s == 0:
             return
         row = requirement(objects.MAX_SPEED_RPM)
@@ -422,14 +448,14 @@ class _DriveConfiguration:
             Kind of watchdog that is active.
         """
         settings, sdo = self._settings, self._sdo
-        deadline = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
-        heartbeat = self._configure_heartbeat_consumer()
-        has_deadline = sdo.read_or_none(deadline.index, deadline.sub) is not None
+        deadline_object = requirement(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
+        has_consumer = self._configure_heartbeat_consumer()
+        has_deadline = sdo.read_or_none(deadline_object.index, deadline_object.sub) is not None
         active_watchdog = watchdog(
-            heartbeat=heartbeat, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
+            heartbeat=has_consumer, rpdo_deadline=has_deadline, own=settings.own_watchdog_s > 0
         )
         row = requirement(objects.HEARTBEAT_CONSUMER, 1)
-        if not heartbeat:
+        if not has_consumer:
             self.lacks.append(row)
         if active_watchdog is Watchdog.NONE and not self._accepts(row):
             raise DeviceError(f"{self._name}: {row.refusal_reason()}")
@@ -451,17 +477,17 @@ class _DriveConfiguration:
     def configure_pdos(self, active_watchdog: Watchdog) -> None:
         """Map one RPDO and one TPDO, and disable all other PDOs."""
         settings, sdo = self._settings, self._sdo
-        for communication in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
-            _disable_unused_pdos(sdo, communication)
-        entries: tuple[int, ...] = objects.TPDO_ENTRIES
+        for communication_index in (objects.TPDO_COMMUNICATION, objects.RPDO_COMMUNICATION):
+            _disable_unused_pdos(sdo, communication_index)
+        tpdo_entries: tuple[int, ...] = objects.TPDO_ENTRIES
         row = requirement(objects.ACTUAL_TORQUE)
         if sdo.read_or_none(objects.ACTUAL_TORQUE) is None and self._accepts(row):
             self._record_missing_object(row)
-            entries = entries[:-1]
+            tpdo_entries = tpdo_entries[:-1]
         self._configure_pdo(
             objects.TPDO_COMMUNICATION,
             objects.NO_REMOTE_REQUEST,
-            entries,
+            tpdo_entries,
             {objects.INHIBIT_TIME: 0},
         )
         deadline_ms = round(settings.heartbeat_timeout_s * 1000)
@@ -478,9 +504,9 @@ class _DriveConfiguration:
             ("quick_stop_option", objects.QUICK_STOP_OPTION),
             ("fault_reaction_option", objects.FAULT_REACTION_OPTION),
         ):
-            value = self._sdo.read_or_none(index)
-            if value is not None:
-                identity[key] = value
+            option_value = self._sdo.read_or_none(index)
+            if option_value is not None:
+                identity[key] = option_value
 
     def _accepts(self, row: Requirement) -> bool:
         """Return whether the profile accepts a drive that lacks an object."""
@@ -494,9 +520,9 @@ class _DriveConfiguration:
         DeviceError
             If the object is indispensable.
         """
-        reason = row.refusal_reason(self._settings.accept_without)
-        if reason:
-            raise DeviceError(f"{self._name}: {reason}")
+        refusal_reason = row.refusal_reason(self._settings.accept_without)
+        if refusal_reason:
+            raise DeviceError(f"{self._name}: {refusal_reason}")
         self.lacks.append(row)
 
     def _clear_object(self, row: Requirement) -> None:
@@ -515,17 +541,17 @@ class _DriveConfiguration:
     def _configure_heartbeat_consumer(self) -> bool:
         """Make the drive monitor this computer's heartbeat; return whether it can do that."""
         settings, sdo = self._settings, self._sdo
-        index, host = objects.HEARTBEAT_CONSUMER, settings.host_node_id
-        required = host << 16 | round(settings.heartbeat_timeout_s * 1000)
+        index, host_id = objects.HEARTBEAT_CONSUMER, settings.host_node_id
+        required_value = host_id << 16 | round(settings.heartbeat_timeout_s * 1000)
         present_value = sdo.read_or_none(index, 1)
-        if present_value != required:
+        if present_value != required_value:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
             for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
                 stored_value = sdo.read_or_none(index, sub)
-                if stored_value is not None and stored_value >> 16 & 0x7F == host:
+                if stored_value is not None and stored_value >> 16 & 0x7F == host_id:
                     sdo.configure(index, sub, 0)
             try:
-                sdo.configure(index, 1, required)
+                sdo.configure(index, 1, required_value)
             except SdoRefusal as refusal:
                 if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
@@ -553,43 +579,45 @@ class _DriveConfiguration:
             Required values of further communication parameters by sub-index; a parameter that the
             drive does not have is skipped.
         """
-        sdo, mapping = self._sdo, communication + 0x200
+        sdo, mapping_index = self._sdo, communication + 0x200
         can_id = self._required_values[communication, 1] | flags
         transmission_type = self._required_values[communication, 2]
         cob_id_bits = EVERY_BIT & ~objects.NO_REMOTE_REQUEST
-        is_mapped = self._holds_values(mapping, (len(entries), *entries))
+        is_mapped = self._holds_values(mapping_index, (len(entries), *entries))
         has_transmission_type = sdo.read_or_none(communication, 2) == transmission_type
         cob_id_found = sdo.read_or_none(communication, 1)
         other_parameters = {
-            sub: value
-            for sub, value in parameters.items()
-            if sdo.read_or_none(communication, sub) not in (None, value)
+            sub: parameter_value
+            for sub, parameter_value in parameters.items()
+            if sdo.read_or_none(communication, sub) not in (None, parameter_value)
         }
         has_cob_id = cob_id_found is not None and not (cob_id_found ^ can_id) & cob_id_bits
         if has_cob_id and is_mapped and has_transmission_type and not other_parameters:
             return
         sdo.configure(communication, 1, can_id | objects.PDO_DISABLED, cob_id_bits)
         if not is_mapped:
-            self._write_mapping(communication, mapping, entries)
+            self._write_mapping(communication, mapping_index, entries)
         if not has_transmission_type:
             sdo.configure(communication, 2, transmission_type)
-        for sub, value in other_parameters.items():
-            self.set_object(requirement(communication, sub), value)
+        for sub, parameter_value in other_parameters.items():
+            self.set_object(requirement(communication, sub), parameter_value)
         sdo.configure(communication, 1, can_id, cob_id_bits)
 
-    def _write_mapping(self, communication: int, mapping: int, entries: tuple[int, ...]) -> None:
+    def _write_mapping(
+        self, communication: int, mapping_index: int, entries: tuple[int, ...]
+    ) -> None:
         """Write the mapping entries of a disabled PDO."""
         sdo = self._sdo
         pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
-            sdo.configure(mapping, 0, 0)
+            sdo.configure(mapping_index, 0, 0)
         except SdoRefusal as refusal:
-            raise DeviceError(f"{refusal} {requirement(mapping).sentence}") from None
-        for sub, entry in enumerate(entries, 1):
+            raise DeviceError(f"{refusal} {requirement(mapping_index).sentence}") from None
+        for sub, mapping_entry in enumerate(entries, 1):
             try:
-                sdo.configure(mapping, sub, entry)
+                sdo.configure(mapping_index, sub, mapping_entry)
             except SdoRefusal as refusal:
-                row = requirement(entry >> 16)
+                row = requirement(mapping_entry >> 16)
                 if refusal.is_absent:
                     raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
                 raise DeviceError(
@@ -597,16 +625,19 @@ class _DriveConfiguration:
                     f"{pdo_name} (abort code 0x{refusal.code:08X}: {_abort_meaning(refusal)}). "
                     f"{row.sentence}"
                 ) from None
-        sdo.configure(mapping, 0, len(entries))
+        sdo.configure(mapping_index, 0, len(entries))
 
-    def _holds_values(self, index: int, values: tuple[int, ...]) -> bool:
-        """Return whether sub-indices 0, 1, 2, … of an object hold the given values."""
-        return all(self._sdo.read_or_none(index, sub) == value for sub, value in enumerate(values))
+    def _holds_values(self, index: int, required_values: tuple[int, ...]) -> bool:
+        """Return whether sub-indices 0, 1, 2, … of a drive's object hold the given values."""
+        return all(
+            self._sdo.read_or_none(index, sub) == held_value
+            for sub, held_value in enumerate(required_values)
+        )
 
 
-def _is_ratio_equal(stated: float, required: float) -> bool:
-    """Return whether a ratio that the drive states agrees with the profile's within 2 %."""
-    return abs(stated - required) <= _SCALE_TOLERANCE * required
+def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
+    """Return whether two values, of the drive and of the profile, agree within 2 %."""
+    return abs(drive_value - profile_value) <= _SCALE_TOLERANCE * profile_value
 
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:

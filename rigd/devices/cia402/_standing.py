@@ -40,7 +40,7 @@ _PRESS_STO_ADVICE = (
 """Advice in messages about a drive that is not known to be off."""
 
 
-def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
+def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | None:
     """Switch the drive off, reset its fault, and check that it can get ready to switch on.
 
     The motor has no torque at any time. The drive is left pre-operational and disabled. Its
@@ -69,16 +69,16 @@ def reset_fault(port: CanPort, rig: RigParameters, name: str) -> str | None:
     """
     settings = rig.cia402
     assert settings is not None
-    with SdoAccess(port, settings.node_id, name) as sdo:
-        _confirm_off(sdo, name)
+    with SdoAccess(port, settings.node_id, drive_name) as sdo:
+        _confirm_off(sdo, drive_name)
         sdo.enter_pre_operational()
         with suppress(SdoRefusal):
             # No heartbeat is sent now, whose absence would be the next fault.
             sdo.write(objects.HEARTBEAT_CONSUMER, 1, 0)
         patience_s = settings.enable_timeout_s
-        fault = _reset_reported_fault(sdo, name, patience_s) if _in_fault(sdo) else None
-        _confirm_ready(sdo, name, patience_s, fault, f"rigd reset --profile {rig.name}")
-    return fault
+        fault_text = _reset_reported_fault(sdo, drive_name, patience_s) if _in_fault(sdo) else None
+        _confirm_ready(sdo, drive_name, patience_s, fault_text, f"rigd reset --profile {rig.name}")
+    return fault_text
 
 
 def command_off(sdo: SdoAccess) -> None:
@@ -88,7 +88,7 @@ def command_off(sdo: SdoAccess) -> None:
         sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
 
 
-def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
+def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, drive_name: str) -> None:
     """Wait until a drive that was commanded off is disabled, or raise.
 
     Raises
@@ -101,18 +101,18 @@ def wait_until_disabled(sdo: SdoAccess, rig: RigParameters, name: str) -> None:
     end_states = (DriveState.SWITCH_ON_DISABLED, DriveState.FAULT)
     wait_for(lambda: _read_state(sdo) in end_states, settings.enable_timeout_s)
     statusword = sdo.read(objects.STATUSWORD)
-    state = drive_state(statusword)
-    if state is DriveState.SWITCH_ON_DISABLED:
+    present_state = drive_state(statusword)
+    if present_state is DriveState.SWITCH_ON_DISABLED:
         return
     if statusword & FAULT_BIT:
         raise DeviceError(
-            f"{name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd reset "
-            f"--profile {rig.name}"
+            f"{drive_name}: it is in fault: {_describe_fault(sdo)}. Remove the cause, then: rigd "
+            f"reset --profile {rig.name}"
         )
-    remedy = "switch it off and on" if state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
+    remedy = "switch it off and on" if present_state in TORQUE_FREE_STATES else _PRESS_STO_ADVICE
     raise DeviceError(
-        f'{name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
-        f'"{state.value}" (statusword 0x{statusword:04X}); {remedy}.'
+        f'{drive_name}: expected in the state "{DriveState.SWITCH_ON_DISABLED.value}", it is in '
+        f'"{present_state.value}" (statusword 0x{statusword:04X}); {remedy}.'
     )
 
 
@@ -125,23 +125,25 @@ def describe_remaining_torque(sdo: SdoAccess) -> str:
         statusword = sdo.read(objects.STATUSWORD)
     except DeviceError:
         return ""
-    state = drive_state(statusword)
-    if state in TORQUE_FREE_STATES:
+    present_state = drive_state(statusword)
+    if present_state in TORQUE_FREE_STATES:
         return ""
-    return f' It is in "{state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
+    return (
+        f' It is in "{present_state.value}" (statusword 0x{statusword:04X}): {_PRESS_STO_ADVICE}.'
+    )
 
 
-def wait_for(condition: Callable[[], bool], patience_s: float) -> bool:
+def wait_for(is_fulfilled: Callable[[], bool], patience_s: float) -> bool:
     """Poll a condition, at least twice, and return whether it became true in time."""
-    deadline = time.monotonic() + patience_s
-    while not condition():
-        if time.monotonic() > deadline:
-            return condition()
+    deadline_s = time.monotonic() + patience_s
+    while not is_fulfilled():
+        if time.monotonic() > deadline_s:
+            return is_fulfilled()
         time.sleep(_STATE_POLL_S)
     return True
 
 
-def _confirm_off(sdo: SdoAccess, name: str) -> None:
+def _confirm_off(sdo: SdoAccess, drive_name: str) -> None:
     """Command the drive off, from any state, until its statusword confirms it.
 
     Raises
@@ -174,38 +176,40 @@ def _confirm_off(sdo: SdoAccess, name: str) -> None:
             sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
             statusword = sdo.read(objects.STATUSWORD)
         except Exception as error:
-            cause = str(error) if isinstance(error, DeviceError) else f"{name}: {error!r}."
+            failure_cause = (
+                str(error) if isinstance(error, DeviceError) else f"{drive_name}: {error!r}."
+            )
             raise DeviceError(
-                f"{cause} It has not shown that it is off: keep clear of the beam, and press the "
-                "wired stop (STO) if anything moves."
+                f"{failure_cause} It has not shown that it is off: keep clear of the beam, and "
+                "press the wired stop (STO) if anything moves."
             ) from None
         if drive_state(statusword) in TORQUE_FREE_STATES:
             return
     raise DeviceError(
-        f"{name}: it was commanded to switch off and has not done so within "
+        f"{drive_name}: it was commanded to switch off and has not done so within "
         f'{_SWITCH_OFF_TIMEOUT_S:g} s: it is in "{drive_state(statusword).value}" (statusword '
         f"0x{statusword:04X}); {_PRESS_STO_ADVICE}. Its watch over the heartbeat (object 1016) was "
         "left as it was."
     )
 
 
-def _reset_reported_fault(sdo: SdoAccess, name: str, patience_s: float) -> str:
+def _reset_reported_fault(sdo: SdoAccess, drive_name: str, patience_s: float) -> str:
     """Reset the drive's fault and return its description; raise if the fault persists."""
-    fault = _describe_fault(sdo)
+    fault_text = _describe_fault(sdo)
     for controlword in (DISABLE_VOLTAGE, FAULT_RESET):
         sdo.write(objects.CONTROLWORD, 0, controlword)
     is_reset = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     sdo.write(objects.CONTROLWORD, 0, DISABLE_VOLTAGE)
     if not is_reset:
         raise DeviceError(
-            f"{name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
+            f"{drive_name}: the fault cannot be reset: {_describe_fault(sdo)}. It is in the state "
             f'"{_read_state(sdo).value}"; remove the cause, or switch the drive off and on.'
         )
-    return fault
+    return fault_text
 
 
 def _confirm_ready(
-    sdo: SdoAccess, name: str, patience_s: float, fault: str | None, command: str
+    sdo: SdoAccess, name: str, patience_s: float, fault_text: str | None, command: str
 ) -> None:
     """Check that the drive can get ready to switch on (without torque), and disable it again.
 
@@ -222,7 +226,7 @@ def _confirm_ready(
     is_disabled = wait_for(lambda: _read_state(sdo) is DriveState.SWITCH_ON_DISABLED, patience_s)
     if is_ready and is_disabled:
         return
-    progress_text = f"its fault is reset ({fault})" if fault else "it is not in fault"
+    progress_text = f"its fault is reset ({fault_text})" if fault_text else "it is not in fault"
     state = drive_state(statusword)
     if is_ready:
         raise DeviceError(
@@ -256,8 +260,8 @@ def _read_state(sdo: SdoAccess) -> DriveState:
 def _describe_fault(sdo: SdoAccess) -> str:
     """Return a description of the cause of the drive's fault."""
     try:
-        code = sdo.read(objects.ERROR_CODE)
+        error_code = sdo.read(objects.ERROR_CODE)
     except SdoRefusal:
-        code = 0
-    code = code or sdo.last_emergency()
-    return describe_error(code) if code else "the drive names no cause"
+        error_code = 0
+    error_code = error_code or sdo.last_emergency()
+    return describe_error(error_code) if error_code else "the drive names no cause"

@@ -133,130 +133,150 @@ class _SuitabilityCheck:
         for row in REQUIREMENTS:
             if row.index in _REPORTED_ELSEWHERE or row.accept == WATCHDOG:
                 continue
-            entry = self._eds.get(row.index, row.sub)
-            yield (self._absent_object(row) if entry is None else self._present_object(row, entry))
+            eds_entry = self._eds.get(row.index, row.sub)
+            yield (
+                self._absent_object(row)
+                if eds_entry is None
+                else self._present_object(row, eds_entry)
+            )
 
     def _identity_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the findings on vendor and product code."""
-        for key, stated, name in (
+        for key, stated_number, identity_key in (
             ("vendor_id", self._eds.vendor_id, self._eds.vendor_name),
             ("product_code", self._eds.product_code, self._eds.product_name),
         ):
-            what = key.replace("_", " ")
-            wanted = getattr(self._settings, key) if self._settings else 0
-            value_text = f"0x{stated:08X}" if stated else "not stated"
-            found = f"{value_text} ({name})" if name else value_text
-            if not (stated and wanted and stated != wanted):
+            object_text = key.replace("_", " ")
+            wanted_text = getattr(self._settings, key) if self._settings else 0
+            value_text = f"0x{stated_number:08X}" if stated_number else "not stated"
+            found_text = f"{value_text} ({identity_key})" if identity_key else value_text
+            if not (stated_number and wanted_text and stated_number != wanted_text):
                 yield SuitabilityFinding(
-                    what, found, f"0x{wanted:08X}" if wanted else "any", Grade.FITS
+                    object_text,
+                    found_text,
+                    f"0x{wanted_text:08X}" if wanted_text else "any",
+                    Grade.FITS,
                 )
                 continue
             sentence = (
-                f"The file is of another drive than the profile's: cia402.{key} is 0x{wanted:08X}, "
-                f"the file says {value_text}."
+                f"The file is of another drive than the profile's: cia402.{key} is "
+                f"0x{wanted_text:08X}, the file says {value_text}."
             )
-            yield SuitabilityFinding(what, found, f"0x{wanted:08X}", Grade.REFUSED, sentence)
+            yield SuitabilityFinding(
+                object_text, found_text, f"0x{wanted_text:08X}", Grade.REFUSED, sentence
+            )
 
     def _bit_rate_findings(self) -> Iterator[SuitabilityFinding]:
         """Yield the finding on the bit rates that the drive supports."""
-        rates = self._eds.bit_rates_bit_s
-        found = ", ".join(f"{rate // 1000}" for rate in rates)
-        found = f"{found} kbit/s" if rates else "not stated"
+        supported_rates = self._eds.bit_rates_bit_s
+        found = ", ".join(f"{profile_rate // 1000}" for profile_rate in supported_rates)
+        found = f"{found} kbit/s" if supported_rates else "not stated"
         if self._rig is None or self._rig.can is None:
             yield SuitabilityFinding("bit rates", found, "", Grade.FITS)
             return
-        rate = self._rig.can.bitrate_bit_s
-        wanted = f"{rate / 1000:g} kbit/s"
-        if not rates or rate in rates:
-            yield SuitabilityFinding("bit rates", found, wanted, Grade.FITS)
+        profile_rate = self._rig.can.bitrate_bit_s
+        wanted_text = f"{profile_rate / 1000:g} kbit/s"
+        if not supported_rates or profile_rate in supported_rates:
+            yield SuitabilityFinding("bit rates", found, wanted_text, Grade.FITS)
             return
         sentence = (
-            f"The drive has no bit rate of {wanted} (can.bitrate_bit_s); choose one of {found}."
+            f"The drive has no bit rate of {wanted_text} (can.bitrate_bit_s); "
+            f"choose one of {found}."
         )
-        yield SuitabilityFinding("bit rates", found, wanted, Grade.REFUSED, sentence)
+        yield SuitabilityFinding("bit rates", found, wanted_text, Grade.REFUSED, sentence)
 
     def _torque_mode_finding(self) -> SuitabilityFinding:
         """Return the finding on the cyclic synchronous torque mode."""
-        what, wanted = (
+        object_text, wanted_text = (
             f"{objects.SUPPORTED_MODES:04X} Supported drive modes",
             "bit 9 (cyclic torque)",
         )
-        modes = self._eds.get(objects.SUPPORTED_MODES)
-        address = f"object {objects.SUPPORTED_MODES:04X}"
-        if modes is None:
-            sentence = f"No cyclic synchronous torque mode: {address} is missing."
-            return SuitabilityFinding(what, "absent", wanted, Grade.REFUSED, sentence)
-        if modes.default:
-            value_text = f"0x{modes.default:X}"
-            if modes.default & objects.SUPPORTS_CYCLIC_TORQUE:
-                return SuitabilityFinding(what, value_text, wanted, Grade.FITS)
+        modes_entry = self._eds.get(objects.SUPPORTED_MODES)
+        object_address = f"object {objects.SUPPORTED_MODES:04X}"
+        if modes_entry is None:
+            sentence = f"No cyclic synchronous torque mode: {object_address} is missing."
+            return SuitabilityFinding(object_text, "absent", wanted_text, Grade.REFUSED, sentence)
+        if modes_entry.default:
+            value_text = f"0x{modes_entry.default:X}"
+            if modes_entry.default & objects.SUPPORTS_CYCLIC_TORQUE:
+                return SuitabilityFinding(object_text, value_text, wanted_text, Grade.FITS)
             sentence = (
-                f"No cyclic synchronous torque mode: {address} = {value_text} lacks bit 9; this "
-                "drive or its firmware cannot be used."
+                f"No cyclic synchronous torque mode: {object_address} = {value_text} lacks bit 9; "
+                "this drive or its firmware cannot be used."
             )
-            return SuitabilityFinding(what, value_text, wanted, Grade.REFUSED, sentence)
+            return SuitabilityFinding(object_text, value_text, wanted_text, Grade.REFUSED, sentence)
         return SuitabilityFinding(
-            what, "the file does not state it; the drive will be asked", wanted, Grade.ASK
+            object_text,
+            "the file does not state it; the drive will be asked",
+            wanted_text,
+            Grade.ASK,
         )
 
     def _watchdog_finding(self) -> SuitabilityFinding:
         """Return the finding on the watchdog that removes the torque if this computer is silent."""
-        found = self._expected_watchdog()
-        what, wanted = "watchdog", "one of three"
-        if found is Watchdog.HEARTBEAT:
-            return SuitabilityFinding(what, found.value, wanted, Grade.FITS)
-        if found is not Watchdog.NONE:
+        found_watchdog = self._expected_watchdog()
+        checked_item, wanted_text = "watchdog", "one of three"
+        if found_watchdog is Watchdog.HEARTBEAT:
+            return SuitabilityFinding(checked_item, found_watchdog.value, wanted_text, Grade.FITS)
+        if found_watchdog is not Watchdog.NONE:
             return SuitabilityFinding(
-                what, f"1016:1 absent; {found.value}", wanted, Grade.SUBSTITUTED
+                checked_item,
+                f"1016:1 absent; {found_watchdog.value}",
+                wanted_text,
+                Grade.SUBSTITUTED,
             )
         return self._missing_unless_accepted(
-            requirement(objects.HEARTBEAT_CONSUMER, 1), what, "absent", wanted
+            requirement(objects.HEARTBEAT_CONSUMER, 1), checked_item, "absent", wanted_text
         )
 
     def _expected_watchdog(self) -> Watchdog:
-        """Return the kind of watchdog that the drive will use, according to file and profile."""
-        heartbeat = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
-        deadline = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
+        """Return the kind of watchdog that the drive will use, by EDS file and profile."""
+        heartbeat_entry = self._eds.get(objects.HEARTBEAT_CONSUMER, 1)
+        deadline_entry = self._eds.get(objects.RPDO_COMMUNICATION, objects.EVENT_TIMER)
         return watchdog(
-            heartbeat=heartbeat is not None and heartbeat.writable,
-            rpdo_deadline=deadline is not None and deadline.writable,
+            heartbeat=heartbeat_entry is not None and heartbeat_entry.writable,
+            rpdo_deadline=deadline_entry is not None and deadline_entry.writable,
             own=self._settings is not None and self._settings.own_watchdog_s > 0,
         )
 
     def _absent_object(self, row: Requirement) -> SuitabilityFinding:
-        """Return the finding on a required object that the file does not contain."""
-        what = f"{row.address} {row.name}"
+        """Return the finding on a required object that the EDS file does not contain."""
+        object_text = f"{row.address} {row.name}"
         if row.core:
             return SuitabilityFinding(
-                what, "absent", "core", Grade.REFUSED, _capitalise(row.refusal_reason())
+                object_text, "absent", "core", Grade.REFUSED, _capitalise(row.refusal_reason())
             )
         if (
             row.index == objects.ABORT_OPTION
             and self._expected_watchdog() in _UNCONFIGURED_WATCHDOGS
         ):
-            found = "absent; in its place: the manufacturer's own watchdog"
-            return SuitabilityFinding(what, found, "", Grade.SUBSTITUTED)
+            found_text = "absent; in its place: the manufacturer's own watchdog"
+            return SuitabilityFinding(object_text, found_text, "", Grade.SUBSTITUTED)
         if row.accept:
-            return self._missing_unless_accepted(row, what, "absent", "")
+            return self._missing_unless_accepted(row, object_text, "absent", "")
         if self._is_set_by_profile(row):
             sentence = f"it has no object {row.address} ({row.name}). {row.sentence}"
-            return SuitabilityFinding(what, "absent", "", Grade.REFUSED, _capitalise(sentence))
+            return SuitabilityFinding(
+                object_text, "absent", "", Grade.REFUSED, _capitalise(sentence)
+            )
         stand_in = f"; in its place: {row.stand_in}" if row.stand_in.strip("–") else ""
-        return SuitabilityFinding(what, f"absent{stand_in}", "", Grade.SUBSTITUTED)
+        return SuitabilityFinding(object_text, f"absent{stand_in}", "", Grade.SUBSTITUTED)
 
     def _missing_unless_accepted(
-        self, row: Requirement, what: str, found: str, wanted: str
+        self, row: Requirement, object_text: str, found_text: str, wanted_text: str
     ) -> SuitabilityFinding:
         """Return the finding on a missing object that the profile may accept by name."""
         stand_in = f" In its place: {row.stand_in}." if row.stand_in else ""
         if self._settings is not None and row.accept in self._settings.accept_without:
-            found = f"{found}, accepted by the profile"
-            sentence = f"{what}: {found}.{stand_in}"
-            return SuitabilityFinding(what, found, wanted, Grade.ACCEPTED, sentence, row.accept)
+            found_text = f"{found_text}, accepted by the profile"
+            sentence = f"{object_text}: {found_text}.{stand_in}"
+            return SuitabilityFinding(
+                object_text, found_text, wanted_text, Grade.ACCEPTED, sentence, row.accept
+            )
         sentence = _capitalise(row.refusal_reason()) + stand_in
         # Without a profile, nobody could accept the missing object yet.
         grade = Grade.DOUBT if self._settings is None else Grade.REFUSED
-        return SuitabilityFinding(what, found, wanted, grade, sentence, row.accept)
+        return SuitabilityFinding(object_text, found_text, wanted_text, grade, sentence, row.accept)
 
     def _is_set_by_profile(self, row: Requirement) -> bool:
         """Return whether the profile needs this object, because nothing else can do its work."""
@@ -269,46 +289,50 @@ class _SuitabilityCheck:
             (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option > 0,
         }.get((row.index, row.sub), False)
 
-    def _present_object(self, row: Requirement, entry: EdsEntry) -> SuitabilityFinding:
-        """Return the finding on a required object that the file contains."""
-        what = f"{row.address} {row.name}"
-        wanted = self._required_values.get((row.index, row.sub))
-        wanted_text = "" if wanted is None else _format_value(row, wanted)
-        default = "" if entry.default is None else f", {_format_value(row, entry.default)}"
-        found = f"{entry.access}{default}"
+    def _present_object(self, row: Requirement, eds_entry: EdsEntry) -> SuitabilityFinding:
+        """Return the finding on a required object that the EDS file contains."""
+        object_text = f"{row.address} {row.name}"
+        wanted_value = self._required_values.get((row.index, row.sub))
+        wanted_text = "" if wanted_value is None else _format_value(row, wanted_value)
+        default_text = (
+            "" if eds_entry.default is None else f", {_format_value(row, eds_entry.default)}"
+        )
+        found_text = f"{eds_entry.access}{default_text}"
 
-        def objection(text: str, *, doubt: bool = False) -> SuitabilityFinding:
-            sentence = _capitalise(f"its object {row.address} ({row.name}) {text}")
+        def objection(objection_text: str, *, doubt: bool = False) -> SuitabilityFinding:
+            sentence = _capitalise(f"its object {row.address} ({row.name}) {objection_text}")
             grade = Grade.DOUBT if doubt else Grade.REFUSED
-            return SuitabilityFinding(what, found, wanted_text, grade, sentence)
+            return SuitabilityFinding(object_text, found_text, wanted_text, grade, sentence)
 
         if row.access & (ObjectAccess.SENT | ObjectAccess.RECEIVED):
-            mapping_obstacle = self._describe_mapping_obstacle(entry)
+            mapping_obstacle = self._describe_mapping_obstacle(eds_entry)
             if mapping_obstacle and row.accept:
                 return self._missing_unless_accepted(
-                    row, what, f"{found}, {mapping_obstacle}", wanted_text
+                    row, object_text, f"{found_text}, {mapping_obstacle}", wanted_text
                 )
             if mapping_obstacle:
                 return objection(f"{mapping_obstacle}. {row.sentence}")
-        if ObjectAccess.WRITE in row.access and not entry.writable:
-            return self._read_only_object(row, entry, found, wanted)
-        if ObjectAccess.READ in row.access and entry.access == "wo":
+        if ObjectAccess.WRITE in row.access and not eds_entry.writable:
+            return self._read_only_object(row, eds_entry, found_text, wanted_value)
+        if ObjectAccess.READ in row.access and eds_entry.access == "wo":
             return objection(
                 f"is write-only: what it holds cannot be checked. {row.sentence}".rstrip(),
                 doubt=row.index in MAY_BE_WRITE_ONLY,
             )
-        if wanted is not None and not _is_within_limits(entry, wanted):
-            limits = f"{_format_limit(row, entry.low)} to {_format_limit(row, entry.high)}"
-            return objection(
-                f"takes {limits}, not {wanted_text}. {row.sentence}", doubt=not row.core
+        if wanted_value is not None and not _is_within_limits(eds_entry, wanted_value):
+            limits_text = (
+                f"{_format_limit(row, eds_entry.low)} to {_format_limit(row, eds_entry.high)}"
             )
-        return SuitabilityFinding(what, found, wanted_text, Grade.FITS)
+            return objection(
+                f"takes {limits_text}, not {wanted_text}. {row.sentence}", doubt=not row.core
+            )
+        return SuitabilityFinding(object_text, found_text, wanted_text, Grade.FITS)
 
     def _read_only_object(
-        self, row: Requirement, entry: EdsEntry, found: str, wanted: int | None
+        self, row: Requirement, eds_entry: EdsEntry, found_text: str, wanted: int | None
     ) -> SuitabilityFinding:
         """Return the finding on a read-only object, whose fixed value may be acceptable."""
-        what = f"{row.address} {row.name}"
+        object_text = f"{row.address} {row.name}"
         if row.value_rule is AllowedValue.AT_LEAST:
             wanted_text = f"at least {wanted or 'motor.peak_torque_nm'}"
         else:
@@ -318,77 +342,84 @@ class _SuitabilityCheck:
             is_acceptable = (
                 None if None in default_entries else default_entries == _PDO_ENTRIES[row.index]
             )
-        elif wanted is None or entry.default is None:
+        elif wanted is None or eds_entry.default is None:
             is_acceptable = None
         elif (row.index, row.sub) in _COB_ID_ADDRESSES:
             # Drives are free to set the bit that forbids remote requests.
-            is_acceptable = (entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
-            mapping = row.index + 0x200
+            is_acceptable = (eds_entry.default ^ wanted) & ~objects.NO_REMOTE_REQUEST == 0
+            mapping_index = row.index + 0x200
             if (
                 is_acceptable
-                and mapping in _PDO_ENTRIES
-                and self._default_mapping(mapping) != _PDO_ENTRIES[mapping]
+                and mapping_index in _PDO_ENTRIES
+                and self._default_mapping(mapping_index) != _PDO_ENTRIES[mapping_index]
             ):
                 sentence = (
                     f"its object {row.address} ({row.name}) is read-only, so that the PDO "
                     f"cannot be switched off to be remapped. {row.sentence}"
                 )
                 return SuitabilityFinding(
-                    what, found, wanted_text, Grade.REFUSED, _capitalise(sentence)
+                    object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(sentence)
                 )
         else:
-            is_acceptable = row.value_rule.allows(entry.default, wanted)
+            is_acceptable = row.value_rule.allows(eds_entry.default, wanted)
         if is_acceptable:
-            return SuitabilityFinding(what, f"{found}: it does", wanted_text, Grade.FITS)
+            return SuitabilityFinding(
+                object_text, f"{found_text}: it does", wanted_text, Grade.FITS
+            )
         if is_acceptable is None and row.index != objects.CONTROLWORD:
             return SuitabilityFinding(
-                what, f"{found}: the drive will be asked", wanted_text, Grade.ASK
+                object_text, f"{found_text}: the drive will be asked", wanted_text, Grade.ASK
             )
         sentence = (
             f"its object {row.address} ({row.name}) is read-only and does not hold what is "
             f"needed{f' ({wanted_text})' if wanted_text else ''}. {row.sentence}"
         )
-        return SuitabilityFinding(what, found, wanted_text, Grade.REFUSED, _capitalise(sentence))
+        return SuitabilityFinding(
+            object_text, found_text, wanted_text, Grade.REFUSED, _capitalise(sentence)
+        )
 
-    def _describe_mapping_obstacle(self, entry: EdsEntry) -> str:
+    def _describe_mapping_obstacle(self, eds_entry: EdsEntry) -> str:
         """Return why an object cannot be mapped into its PDO, or an empty text if it can."""
-        bits = _PDO_LENGTHS_BIT[entry.index]
-        if entry.bits not in (None, bits):
-            return f"has {entry.bits} bits, not {bits}"
+        length_bit = _PDO_LENGTHS_BIT[eds_entry.index]
+        if eds_entry.bits not in (None, length_bit):
+            return f"has {eds_entry.bits} bits, not {length_bit}"
         mapped_indices = {
             mapping_entry >> 16
             for index in _PDO_ENTRIES
             for mapping_entry in self._default_mapping(index)
             if mapping_entry
         }
-        if not entry.mappable and entry.index not in mapped_indices:
+        if not eds_entry.mappable and eds_entry.index not in mapped_indices:
             return "cannot be mapped into a PDO"
         return ""
 
-    def _default_mapping(self, mapping: int) -> tuple[int | None, ...]:
-        """Return the default mapping entries of a PDO in the file; None for a missing default."""
-        count = self._eds.get(mapping, 0)
+    def _default_mapping(self, mapping_index: int) -> tuple[int | None, ...]:
+        """Return the default mapping entries of a PDO in the EDS file; None for one without."""
+        count_entry = self._eds.get(mapping_index, 0)
         default_entries = [
-            self._eds.get(mapping, sub) for sub in range(1, 1 + min(_default_value(count) or 0, 64))
+            self._eds.get(mapping_index, sub)
+            for sub in range(1, 1 + min(_default_value(count_entry) or 0, 64))
         ]
         return (
             tuple(map(_default_value, default_entries))
-            if _default_value(count) is not None
+            if _default_value(count_entry) is not None
             else (None,)
         )
 
 
-def _default_value(entry: EdsEntry | None) -> int | None:
-    """Return the default value of an entry, or None if entry or default are missing."""
-    return None if entry is None else entry.default
+def _default_value(eds_entry: EdsEntry | None) -> int | None:
+    """Return the default value of an EDS entry, or None if entry or default is missing."""
+    return None if eds_entry is None else eds_entry.default
 
 
-def _is_within_limits(entry: EdsEntry, value: int) -> bool:
+def _is_within_limits(eds_entry: EdsEntry, value: int) -> bool:
     """Return whether a value is within the limits of an object; inconsistent limits are ignored."""
-    low, high = entry.low, entry.high
-    if low is not None and high is not None and low > high:
+    lower_limit, upper_limit = eds_entry.low, eds_entry.high
+    if lower_limit is not None and upper_limit is not None and lower_limit > upper_limit:
         return True
-    return (low is None or low <= value) and (high is None or value <= high)
+    return (lower_limit is None or lower_limit <= value) and (
+        upper_limit is None or value <= upper_limit
+    )
 
 
 def _format_value(row: Requirement, value: int) -> str:
@@ -402,6 +433,6 @@ def _format_limit(row: Requirement, value: int | None) -> str:
     return "anything" if value is None else _format_value(row, value)
 
 
-def _capitalise(text: str) -> str:
+def _capitalise(sentence: str) -> str:
     """Capitalise the first letter of a text that was meant to follow the name of a drive."""
-    return text[0].upper() + text[1:]
+    return sentence[0].upper() + sentence[1:]

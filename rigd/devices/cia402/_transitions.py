@@ -33,7 +33,7 @@ _CHECK_BUS_ADVICE: Final = "check the bus cable, its termination, and what else 
 # Why a drive has left operation
 
 
-def operation_left_error(name: str, statusword: int) -> DeviceError:
+def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
     """Return the error for a drive that has left operation enabled without a command.
 
     Parameters
@@ -43,28 +43,30 @@ def operation_left_error(name: str, statusword: int) -> DeviceError:
     statusword
         Last statusword, which shows no fault; no emergency message explains it either.
     """
-    state = drive_state(statusword)
-    transition = (
-        f'it has left "{DriveState.OPERATION_ENABLED.value}" for "{state.value}" '
+    present_state = drive_state(statusword)
+    transition_text = (
+        f'it has left "{DriveState.OPERATION_ENABLED.value}" for "{present_state.value}" '
         f"(statusword 0x{statusword:04X})"
     )
-    if state is DriveState.SWITCH_ON_DISABLED:
+    if present_state is DriveState.SWITCH_ON_DISABLED:
         # The usual cause is a lost motor supply; a bus command would leave the supply on.
-        supplied = bool(statusword & VOLTAGE_ENABLED)
+        is_supplied = bool(statusword & VOLTAGE_ENABLED)
         supply_hint = (
             ", and its bit 4 says that the supply is there, which indicates such a command"
         )
         sto_error = wired_stop_dropped(
-            name,
-            f", or the motor's supply failed, or {_OTHER_SENDER}: {transition}"
-            f"{supply_hint if supplied else ''}",
+            drive_name,
+            f", or the motor's supply failed, or {_OTHER_SENDER}: {transition_text}"
+            f"{supply_hint if is_supplied else ''}",
         )
         return DeviceError(f"{sto_error} If nobody pressed it, {_CHECK_BUS_ADVICE}.")
-    if state in (DriveState.READY, DriveState.SWITCHED_ON):
-        return DeviceError(f"{name}: {transition}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}.")
+    if present_state in (DriveState.READY, DriveState.SWITCHED_ON):
+        return DeviceError(
+            f"{drive_name}: {transition_text}: {_OTHER_SENDER}; {_CHECK_BUS_ADVICE}."
+        )
     return DeviceError(
-        f"{name}: {transition}, by itself or because {_OTHER_SENDER}; check STO, supply and its "
-        f"own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
+        f"{drive_name}: {transition_text}, by itself or because {_OTHER_SENDER}; check STO, supply "
+        f"and its own diagnosis. If these show nothing, {_CHECK_BUS_ADVICE}."
     )
 
 
@@ -115,12 +117,12 @@ class TorqueFollowingCheck:
         self._previous_per_mille = 0.0
         self._deviating_ticks = 0
 
-    def command(self, per_mille: int) -> None:
+    def command(self, torque_per_mille: int) -> None:
         """Register the commanded torque of this tick, in 1/1000 of the rated torque."""
-        self._commanded_per_mille = per_mille
+        self._commanded_per_mille = torque_per_mille
         previous_per_mille = self._previous_per_mille = self._last_per_mille
         self._last_per_mille = previous_per_mille + self._step_fraction * (
-            per_mille - previous_per_mille
+            torque_per_mille - previous_per_mille
         )
 
     def compare(self, actual_per_mille: int) -> None:
@@ -131,11 +133,11 @@ class TorqueFollowingCheck:
         DeviceError
             If the torque has differed from the commands for too many consecutive ticks.
         """
-        tolerance = self._tolerance_per_mille
+        tolerance_per_mille = self._tolerance_per_mille
         if (
-            abs(actual_per_mille - self._last_per_mille) <= tolerance
-            or abs(actual_per_mille - self._previous_per_mille) <= tolerance
-            or not tolerance
+            abs(actual_per_mille - self._last_per_mille) <= tolerance_per_mille
+            or abs(actual_per_mille - self._previous_per_mille) <= tolerance_per_mille
+            or not tolerance_per_mille
             or not self.is_active
         ):
             self._deviating_ticks = 0
@@ -221,7 +223,7 @@ def enable_operation(node: Node, stop: Callable[[], bool]) -> None:
 
 
 def switch_off(node: Node) -> bool:
-    """Zero the torque and disable the drive; never raises.
+    """Zero the torque and disable the drive; return whether it is off. Never raises.
 
     Returns
     -------
@@ -243,7 +245,7 @@ def switch_off(node: Node) -> bool:
 
 def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None:
     """Check that the enabled drive is in cyclic torque mode; some drives show it only then."""
-    inbox, frames, send = node.inbox, node.frames, node.exchange.send
+    inbox, node_frames, send_frame = node.inbox, node.frames, node.exchange.send
     mode: int | None = None
 
     def in_cyclic_torque() -> bool:
@@ -253,11 +255,11 @@ def _check_mode(node: Node, sync_grid_ns: int, stop: Callable[[], bool]) -> None
             return False
         mode, inbox.sdo_reply = mode_read, b""
         if mode != CYCLIC_TORQUE:
-            send(frames.read_mode_request)
+            send_frame(node_frames.read_mode_request)
         return mode == CYCLIC_TORQUE
 
     inbox.sdo_reply = b""
-    send(frames.read_mode_request)
+    send_frame(node_frames.read_mode_request)
     _send_controlword_until(
         node,
         ENABLE_OPERATION,
@@ -280,14 +282,16 @@ def _send_controlword_until(
     stop: Callable[[], bool],
 ) -> None:
     """Send a controlword with zero torque once a period until `is_reached` returns True."""
-    frame = node.frames.rpdo(controlword, 0)
+    rpdo_frame = node.frames.rpdo(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
-    limit = _MOST_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MOST_UNANSWERED_SYNCS
+    most_unanswered = (
+        _MOST_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MOST_UNANSWERED_SYNCS
+    )
     unanswered_syncs = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
         if stop():
             raise StopRequestedError
-        node.exchange.send(frame)
+        node.exchange.send(rpdo_frame)
         node.sleep_until_next_period(sync_grid_ns)
         node.now_ns += node.period_ns
         node.send_sync()
@@ -297,7 +301,7 @@ def _send_controlword_until(
         if is_answered and is_reached():
             return
         unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
-        if unanswered_syncs >= limit:
+        if unanswered_syncs >= most_unanswered:
             raise DeviceError(
                 f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
                 "and the cable."

@@ -650,22 +650,22 @@ def required_values(rig: "RigParameters") -> dict[tuple[int, int], int]:
     assert settings is not None
     at_sync = settings.torque_delivery == "at_sync"
     period_us = sync_period_us(rig.rate_hz)
-    value, exponent = interpolation_time(rig.rate_hz)
-    unknown = unknown_values(rig)
+    interpolation_value, exponent = interpolation_time(rig.rate_hz)
+    unknown_keys = unknown_values(rig)
     required_value = profile_independent_values(settings.node_id) | {
         (objects.RPDO_COMMUNICATION, 2): objects.AT_EVERY_SYNC if at_sync else objects.ON_ARRIVAL,
         (objects.SYNC_PERIOD_US, 0): period_us,
-        (objects.INTERPOLATION_TIME, 1): value,
+        (objects.INTERPOLATION_TIME, 1): interpolation_value,
         (objects.INTERPOLATION_TIME, 2): exponent,
         (objects.ABORT_OPTION, 0): settings.abort_option,
         (objects.COMMUNICATION_ERROR, 1): settings.communication_error_option,
         (objects.HEARTBEAT_PRODUCER_MS, 0): round(settings.drive_heartbeat_period_s * 1000),
     }
-    if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown):
+    if not {"motor.peak_torque_nm", "motor.rated_torque_nm"}.intersection(unknown_keys):
         limit_per_mille = torque_limit_per_mille(rig)
         limit_indices = (objects.MAX_TORQUE, *objects.TORQUE_LIMITS)
         required_value |= {(index, 0): limit_per_mille for index in limit_indices}
-    if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown:
+    if settings.max_speed_rad_s > 0 and "cia402.gear_ratio" not in unknown_keys:
         required_value[objects.MAX_SPEED_RPM, 0] = max_speed_rpm(settings)
     return required_value
 
@@ -700,9 +700,12 @@ def interpolation_time(rate_hz: float) -> tuple[int, int]:
         If no such pair represents the period.
     """
     for exponent in (-3, -4, -5, -6, -2, -1, 0):
-        value = 10.0**-exponent / rate_hz
-        if 0.5 < value < 255.5 and abs(value - round(value)) <= _ROUNDING_TOLERANCE * value:
-            return round(value), exponent
+        unit_count = 10.0**-exponent / rate_hz
+        if (
+            0.5 < unit_count < 255.5
+            and abs(unit_count - round(unit_count)) <= _ROUNDING_TOLERANCE * unit_count
+        ):
+            return round(unit_count), exponent
     from rigd.devices.contracts import DeviceError
 
     raise DeviceError(

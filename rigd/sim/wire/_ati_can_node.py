@@ -160,15 +160,15 @@ class AtiCanNode:
         """Process a received CAN frame: answer a valid request."""
         if can_id >> 4 != self._base or self.frozen:
             return
-        request = self._requests.get(can_id & 0xF)
-        if request is not None and len(data) == request[0]:
-            request[1](data)
+        request_handler = self._requests.get(can_id & 0xF)
+        if request_handler is not None and len(data) == request_handler[0]:
+            request_handler[1](data)
 
     def tick(self, now_s: float) -> None:
-        """Do nothing: the box only answers requests."""
+        """Do nothing: the NETCANOEM box only answers requests."""
 
     def reset(self) -> None:
-        """Restart the box, by its watchdog or on request."""
+        """Restart the NETCANOEM box, by its watchdog or on request."""
         self._active_calibration = 0
         self._was_reset = True
         self._log("sensor", "reset")
@@ -187,25 +187,25 @@ class AtiCanNode:
     def _read_gauges(self, _: bytes) -> None:
         """Answer a poll with two frames: status word and gauges."""
         g0, g1, g2, g3, g4, g5 = self.gauges.read((self._measure(),), self.saturate)[0].tolist()
-        status = self.status_bits & 0xFFFF
+        status_word = self.status_bits & 0xFFFF
         if self._was_reset:
-            status |= _WATCHDOG_RESET_BIT
+            status_word |= _WATCHDOG_RESET_BIT
         if self._active_calibration not in self._calibrations:
-            status |= _BAD_CALIBRATION_BIT
-        if status:
-            status |= _ANY_ERROR_BIT
-        self._reply(0x0, _pack_status_and_even_gauges(status, g0, g2, g4))
+            status_word |= _BAD_CALIBRATION_BIT
+        if status_word:
+            status_word |= _ANY_ERROR_BIT
+        self._reply(0x0, _pack_status_and_even_gauges(status_word, g0, g2, g4))
         self._reply(0x1, _pack_odd_gauges(g1, g3, g5))
 
     def _read_matrix_row(self, data: bytes) -> None:
         """Answer a request for a row of the calibration matrix with three frames."""
-        axis = data[0]
-        if axis > 5:
+        axis_index = data[0]
+        if axis_index > 5:
             return
         is_known = self._active_calibration in self._calibrations
-        row = self.gauges.matrix[axis].tolist() if is_known else _ERASED_ROW
-        for opcode, first in ((0x2, 0), (0x3, 2), (0x4, 4)):
-            self._reply(opcode, _pack_matrix_entries(row[first], row[first + 1]))
+        row = self.gauges.matrix[axis_index].tolist() if is_known else _ERASED_ROW
+        for opcode, first_entry in ((0x2, 0), (0x3, 2), (0x4, 4)):
+            self._reply(opcode, _pack_matrix_entries(row[first_entry], row[first_entry + 1]))
 
     def _read_serial_number(self, _: bytes) -> None:
         """Answer a request for the serial number."""
@@ -213,11 +213,16 @@ class AtiCanNode:
 
     def _set_calibration(self, data: bytes) -> None:
         """Select a calibration by its index, and confirm it."""
-        index = data[0]
-        if index > 15:
+        calibration_index = data[0]
+        if calibration_index > 15:
             return
-        self._active_calibration = index
-        self._log("sensor", "calibration set", index=index, present=index in self._calibrations)
+        self._active_calibration = calibration_index
+        self._log(
+            "sensor",
+            "calibration set",
+            index=calibration_index,
+            present=calibration_index in self._calibrations,
+        )
         self._reply(0x6, data)
 
     def _read_counts_per_unit(self, _: bytes) -> None:

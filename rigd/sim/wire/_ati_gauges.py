@@ -74,17 +74,25 @@ class AtiGauges:
         self, sensor: WrenchSensorSettings, counts_per_unit: tuple[int, int] = COUNTS_PER_UNIT
     ) -> None:
         self.counts_per_unit = counts_per_unit
-        counts = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
-        full_range = counts * np.array(sensor.range)
-        self.matrix = np.linalg.inv(np.array(_COUNTS_AT_FULL_RANGE) / full_range).astype(np.float32)
-        matrix = self.matrix.astype(np.float64)
-        self.quantisation: NDArray[np.float64] = 0.5 * np.abs(matrix).sum(axis=1) / counts
+        counts_by_axis = np.repeat(np.array(counts_per_unit, dtype=np.float64), 3)
+        range_counts = counts_by_axis * np.array(sensor.range)
+        self.matrix = np.linalg.inv(np.array(_COUNTS_AT_FULL_RANGE) / range_counts).astype(
+            np.float32
+        )
+        calibration_matrix = self.matrix.astype(np.float64)
+        self.quantisation: NDArray[np.float64] = (
+            0.5 * np.abs(calibration_matrix).sum(axis=1) / counts_by_axis
+        )
         # For wrenches in rows.
-        self._counts_per_wrench = np.ascontiguousarray((np.linalg.inv(matrix) * counts).T)
+        self._counts_per_wrench = np.ascontiguousarray(
+            (np.linalg.inv(calibration_matrix) * counts_by_axis).T
+        )
         self.stuck: tuple[int, StuckReadings] | None = None
         self._bias = np.array(_BIAS_COUNTS, dtype=np.float64)
 
-    def read(self, wrenches: Sequence[Wrench], saturated: int | None = None) -> NDArray[np.int16]:
+    def read(
+        self, wrenches: Sequence[Wrench], saturated_gauge: int | None = None
+    ) -> NDArray[np.int16]:
         """Return the counts of gauges 0 to 5 under each wrench.
 
         Parameters
@@ -98,14 +106,18 @@ class AtiGauges:
         -------
         (n, 6) int16
         """
-        gauges: NDArray[np.float64] = np.array(wrenches) @ self._counts_per_wrench
-        np.rint(gauges, out=gauges)
-        gauges += self._bias
-        np.minimum(gauges, _HIGHEST_COUNTS, out=gauges)
-        np.maximum(gauges, _LOWEST_COUNTS, out=gauges)
-        if saturated is not None:
-            gauges[:, saturated] = np.copysign(_SATURATED_COUNTS, gauges[:, saturated])
+        gauge_counts: NDArray[np.float64] = np.array(wrenches) @ self._counts_per_wrench
+        np.rint(gauge_counts, out=gauge_counts)
+        gauge_counts += self._bias
+        np.minimum(gauge_counts, _HIGHEST_COUNTS, out=gauge_counts)
+        np.maximum(gauge_counts, _LOWEST_COUNTS, out=gauge_counts)
+        if saturated_gauge is not None:
+            gauge_counts[:, saturated_gauge] = np.copysign(
+                _SATURATED_COUNTS, gauge_counts[:, saturated_gauge]
+            )
         if self.stuck is not None:
-            number, stuck = self.stuck
-            gauges[:, number] = [stuck(value) for value in gauges[:, number].tolist()]
-        return gauges.astype(np.int16)
+            stuck_gauge, stuck_readings = self.stuck
+            gauge_counts[:, stuck_gauge] = [
+                stuck_readings(gauge_count) for gauge_count in gauge_counts[:, stuck_gauge].tolist()
+            ]
+        return gauge_counts.astype(np.int16)

@@ -176,18 +176,18 @@ class AtiSerialDevice:
         if self.frozen:
             return
         self._has_received = True
-        received = self._incomplete_request + data
-        while received and not self.streaming:
-            request, remaining = _next_request(received)
-            if request is None:
-                self._incomplete_request = remaining
+        received_bytes = self._incomplete_request + data
+        while received_bytes and not self.streaming:
+            modbus_request, remaining_bytes = _next_request(received_bytes)
+            if modbus_request is None:
+                self._incomplete_request = remaining_bytes
                 return
-            self._answer(request)
-            received = remaining
+            self._answer(modbus_request)
+            received_bytes = remaining_bytes
         self._incomplete_request = b""
         if not self.streaming:
             return
-        self._bytes_while_streaming += len(received)
+        self._bytes_while_streaming += len(received_bytes)
         if self._bytes_while_streaming >= _STOP_BYTE_COUNT:
             self.streaming = False
             self._log("sensor", "stream stopped")
@@ -214,92 +214,109 @@ class AtiSerialDevice:
             self._incomplete_request = b""
 
     def emit(self) -> None:
-        """Write the records of the past period in one block, if the sensor streams."""
+        """Write the gauge records of the past period to the serial line, if the sensor streams."""
         if not self.streaming or self.frozen:
             return
         wrenches = self._newest_wrenches()
         if not wrenches:
             return
-        gauges = self._read_gauges(wrenches).take(WIRE_ORDER, axis=1)
-        records = np.empty((len(wrenches), _RECORD_SIZE), dtype=np.uint8)
-        records[:, :12] = gauges.astype(">i2").view(np.uint8)
-        checksums = records[:, :12].sum(axis=1, dtype=np.uint8) & 0x7F
-        records[:, 12] = checksums | _RECORD_ERROR_BIT if self.status_bits else checksums
-        self._write(records.tobytes())
+        gauge_counts = self._read_gauges(wrenches).take(WIRE_ORDER, axis=1)
+        stream_records = np.empty((len(wrenches), _RECORD_SIZE), dtype=np.uint8)
+        stream_records[:, :12] = gauge_counts.astype(">i2").view(np.uint8)
+        checksums = stream_records[:, :12].sum(axis=1, dtype=np.uint8) & 0x7F
+        stream_records[:, 12] = checksums | _RECORD_ERROR_BIT if self.status_bits else checksums
+        self._write(stream_records.tobytes())
 
     def _newest_wrenches(self) -> list[Wrench]:
-        """Return the wrenches of the past period: the newest readings, or a new one per period."""
+        """Return the wrenches of the past period, in N and N·m.
+
+        They are the newest readings of a streaming sensor, or one new reading.
+        """
         if self._records_per_period == 1:
             return [self._sensor.measure()]
         return list(self._sensor.records)[-self._records_per_period :]
 
     def _read_gauges(self, wrenches: list[Wrench]) -> NDArray[np.int16]:
         """Return the gauge counts under wrenches; unset gauges read the end of their range."""
-        gauges = self.gauges.read(wrenches, self.saturate)
+        gauge_counts = self.gauges.read(wrenches, self.saturate)
         if self._unset_gauges:
-            gauges[:, self._unset_gauges] = _UNSET_GAUGE_COUNTS
-        return gauges
+            gauge_counts[:, self._unset_gauges] = _UNSET_GAUGE_COUNTS
+        return gauge_counts
 
     def _answer(self, request: bytes) -> None:
         """Answer a complete request, by the requested data or an exception response."""
-        function, body = request[1], request[2:-2]
+        function_code, request_content = request[1], request[2:-2]
         answer_request = {
             _READ_HOLDING_FUNCTION: self._read_holding,
             _READ_INPUT_FUNCTION: self._read_input,
             _WRITE_FUNCTION: self._write_registers,
             _STREAM_FUNCTION: self._start_stream,
             _LOCK_FUNCTION: self._set_lock,
-        }.get(function)
-        answer = _ILLEGAL_FUNCTION if answer_request is None else answer_request(body)
-        if isinstance(answer, int):
-            function, answer = function | _EXCEPTION_BIT, bytes((answer,))
-        frame = bytes((_ADDRESS, function)) + answer
-        self._write(frame + _checksum(frame).to_bytes(2, "little"))
+        }.get(function_code)
+        reply_content = (
+            _ILLEGAL_FUNCTION if answer_request is None else answer_request(request_content)
+        )
+        if isinstance(reply_content, int):
+            function_code, reply_content = function_code | _EXCEPTION_BIT, bytes((reply_content,))
+        reply_frame = bytes((_ADDRESS, function_code)) + reply_content
+        self._write(reply_frame + _checksum(reply_frame).to_bytes(2, "little"))
 
-    def _read_holding(self, body: bytes) -> bytes | int:
-        """Return the answer to a request for holding registers, or an exception code."""
+    def _read_holding(self, request_content: bytes) -> bytes | int:
+        """Return the reply content to a request for holding registers, or an exception code."""
         self._holding_registers[_STATUS_REGISTER] = self.status_bits & 0xFFFF
-        return _answer_with_registers(self._holding_registers, body)
+        return _answer_with_registers(self._holding_registers, request_content)
 
-    def _read_input(self, body: bytes) -> bytes | int:
-        """Return the answer to a request for input registers, or an exception code."""
-        inputs = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS_REGISTER))
-        first, _ = _unpack_register_range(body)
-        if first < _POLLED_GAUGES:
-            newest = self._newest_wrenches()[-1:] or [self._sensor.measure()]
-            inputs.update(enumerate(self._read_gauges(newest)[0].astype(np.uint16).tolist()))
-        return _answer_with_registers(inputs, body)
+    def _read_input(self, request_content: bytes) -> bytes | int:
+        """Return the reply content to a request for input registers, or an exception code."""
+        input_registers = dict(enumerate(_DIAGNOSTIC_VALUES, start=_DIAGNOSTICS_REGISTER))
+        first_register, _ = _unpack_register_range(request_content)
+        if first_register < _POLLED_GAUGES:
+            newest_wrenches = self._newest_wrenches()[-1:] or [self._sensor.measure()]
+            input_registers.update(
+                enumerate(self._read_gauges(newest_wrenches)[0].astype(np.uint16).tolist())
+            )
+        return _answer_with_registers(input_registers, request_content)
 
-    def _write_registers(self, body: bytes) -> bytes | int:
+    def _write_registers(self, request_content: bytes) -> bytes | int:
         """Write registers; return the content of the answer, or an exception code."""
-        first, count = _unpack_register_range(body[:4])
-        data = body[5:]
-        if not 1 <= count <= _MOST_REGISTERS_WRITTEN or len(data) != 2 * count:
-            return _ILLEGAL_VALUE
-        values = dict(enumerate(np.frombuffer(data, ">u2").tolist(), start=first))
-        writable = {_SESSION_ID_REGISTER, _BAUD_IS_STORED_REGISTER, _BAUD_REGISTER}
-        if self._unlocked:
-            writable.update(_GAIN_REGISTERS, _OFFSET_REGISTERS)
-        if not values.keys() <= writable:
-            return _ILLEGAL_ADDRESS
+        first_register, register_count = _unpack_register_range(request_content[:4])
+        register_bytes = request_content[5:]
         if (
-            values.get(_BAUD_REGISTER, 0) >= len(_BAUD_RATES_BIT_S)
-            or values.get(_BAUD_IS_STORED_REGISTER, 0) > 1
+            not 1 <= register_count <= _MOST_REGISTERS_WRITTEN
+            or len(register_bytes) != 2 * register_count
         ):
             return _ILLEGAL_VALUE
-        self._holding_registers.update(values)
+        written_values = dict(
+            enumerate(np.frombuffer(register_bytes, ">u2").tolist(), start=first_register)
+        )
+        writable_registers = {_SESSION_ID_REGISTER, _BAUD_IS_STORED_REGISTER, _BAUD_REGISTER}
+        if self._unlocked:
+            writable_registers.update(_GAIN_REGISTERS, _OFFSET_REGISTERS)
+        if not written_values.keys() <= writable_registers:
+            return _ILLEGAL_ADDRESS
+        if (
+            written_values.get(_BAUD_REGISTER, 0) >= len(_BAUD_RATES_BIT_S)
+            or written_values.get(_BAUD_IS_STORED_REGISTER, 0) > 1
+        ):
+            return _ILLEGAL_VALUE
+        self._holding_registers.update(written_values)
         self._unset_gauges = [
             gauge
             for gauge in range(6)
             if self._holding_registers[_GAIN_REGISTERS[gauge]] != _GAUGE_GAINS[gauge]
             or self._holding_registers[_OFFSET_REGISTERS[gauge]] != _GAUGE_OFFSETS[gauge]
         ]
-        self._log("sensor", "registers written", first=first, values=list(values.values()))
-        return body[:4]
+        self._log(
+            "sensor",
+            "registers written",
+            first=first_register,
+            values=list(written_values.values()),
+        )
+        return request_content[:4]
 
-    def _start_stream(self, body: bytes) -> bytes | int:
+    def _start_stream(self, request_content: bytes) -> bytes | int:
         """Start the stream of records; return the content of the answer."""
-        if body[0] != _START_STREAM_PARAMETER:
+        if request_content[0] != _START_STREAM_PARAMETER:
             return b"\x00"
         self.streaming = True
         self._bytes_while_streaming = 0
@@ -308,11 +325,11 @@ class AtiSerialDevice:
             self._log("sensor", "gains and offsets not loaded", gauges=self._unset_gauges)
         return b"\x01"
 
-    def _set_lock(self, body: bytes) -> bytes | int:
+    def _set_lock(self, request_content: bytes) -> bytes | int:
         """Lock or unlock the sensor's storage; return the content of the answer."""
-        if body[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
+        if request_content[0] not in (_UNLOCK_PARAMETER, _LOCK_PARAMETER):
             return b"\x00"
-        self._unlocked = body[0] == _UNLOCK_PARAMETER
+        self._unlocked = request_content[0] == _UNLOCK_PARAMETER
         self._log("sensor", "storage unlocked" if self._unlocked else "storage locked")
         return b"\x01"
 
@@ -321,7 +338,7 @@ def _holding_registers_at_power_up(
     settings: AtiSerial, gauges: AtiGauges, ratings: tuple[float, ...]
 ) -> dict[int, int]:
     """Return the values of the holding registers after power-up, by address."""
-    holding = dict.fromkeys(
+    holding_registers = dict.fromkeys(
         (
             *_GAIN_REGISTERS,
             *_OFFSET_REGISTERS,
@@ -331,16 +348,16 @@ def _holding_registers_at_power_up(
         ),
         0,
     )
-    holding[_BAUD_REGISTER] = (
+    holding_registers[_BAUD_REGISTER] = (
         _BAUD_RATES_BIT_S.index(settings.baud) if settings.baud in _BAUD_RATES_BIT_S else 0
     )
-    size = _CALIBRATION_SIZE * _CALIBRATION_COUNT
-    holding.update(
+    register_count = _CALIBRATION_SIZE * _CALIBRATION_COUNT
+    holding_registers.update(
         dict.fromkeys(
-            range(_CALIBRATIONS_REGISTER, _CALIBRATIONS_REGISTER + size), _ERASED_REGISTER
+            range(_CALIBRATIONS_REGISTER, _CALIBRATIONS_REGISTER + register_count), _ERASED_REGISTER
         )
     )
-    content = _CALIBRATION_LAYOUT.pack(
+    calibration_bytes = _CALIBRATION_LAYOUT.pack(
         (settings.serial_number or SERIAL_NUMBER).encode("ascii", "replace"),
         PART_NUMBER.encode("ascii"),
         b"",
@@ -354,19 +371,27 @@ def _holding_registers_at_power_up(
         *_GAUGE_OFFSETS,
     ).ljust(2 * _CALIBRATION_SIZE, b"\0")
     block_register = _CALIBRATIONS_REGISTER + (settings.calibration - 1) * _CALIBRATION_SIZE
-    holding.update(enumerate(np.frombuffer(content, ">u2").tolist(), start=block_register))
-    return holding
+    holding_registers.update(
+        enumerate(np.frombuffer(calibration_bytes, ">u2").tolist(), start=block_register)
+    )
+    return holding_registers
 
 
-def _answer_with_registers(registers: dict[int, int], body: bytes) -> bytes | int:
-    """Return the answer to a request for registers, or an exception code."""
-    first, count = _unpack_register_range(body)
-    if not 1 <= count <= _MOST_REGISTERS_READ:
+def _answer_with_registers(
+    registers_by_address: dict[int, int], request_content: bytes
+) -> bytes | int:
+    """Return the content of the reply to a Modbus read request, or an exception code."""
+    first_register, register_count = _unpack_register_range(request_content)
+    if not 1 <= register_count <= _MOST_REGISTERS_READ:
         return _ILLEGAL_VALUE
-    addresses = range(first, first + count)
-    if not all(map(registers.__contains__, addresses)):
+    addresses = range(first_register, first_register + register_count)
+    if not all(map(registers_by_address.__contains__, addresses)):
         return _ILLEGAL_ADDRESS
-    return pack_struct(f">B{count}H", 2 * count, *map(registers.__getitem__, addresses))
+    return pack_struct(
+        f">B{register_count}H",
+        2 * register_count,
+        *map(registers_by_address.__getitem__, addresses),
+    )
 
 
 def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
@@ -382,47 +407,54 @@ def _next_request(received: bytes) -> tuple[bytes | None, bytes]:
         first position at which a request may have begun.
     """
     possible_start = len(received)
-    start = received.find(_ADDRESS)
-    while start >= 0:
-        available = len(received) - start
-        length = _request_length(received, start)
-        if length <= available:
-            if _checksum(received[start : start + length]) == 0:
-                return received[start : start + length], received[start + length :]
-        elif available < _LONGEST_FRAME:
-            possible_start = min(possible_start, start)
-        start = received.find(_ADDRESS, start + 1)
+    request_start = received.find(_ADDRESS)
+    while request_start >= 0:
+        available_bytes = len(received) - request_start
+        request_length = _request_length(received, request_start)
+        if request_length <= available_bytes:
+            if _checksum(received[request_start : request_start + request_length]) == 0:
+                return received[request_start : request_start + request_length], received[
+                    request_start + request_length :
+                ]
+        elif available_bytes < _LONGEST_FRAME:
+            possible_start = min(possible_start, request_start)
+        request_start = received.find(_ADDRESS, request_start + 1)
     return None, received[possible_start:]
 
 
 def _request_length(received: bytes, start: int) -> int:
-    """Return the length of the request at `start`; if unknown, a length that exceeds the data."""
-    available = len(received) - start
-    unknown_length = available + 1
-    if available < 4:
+    """Return the length in bytes of the request at `start`.
+
+    If the length is unknown, a length is returned that exceeds the data.
+    """
+    available_bytes = len(received) - start
+    unknown_length = available_bytes + 1
+    if available_bytes < 4:
         return unknown_length
-    function = received[start + 1]
-    if function in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
+    function_code = received[start + 1]
+    if function_code in (_READ_HOLDING_FUNCTION, _READ_INPUT_FUNCTION):
         return 8
-    if function in (_STREAM_FUNCTION, _LOCK_FUNCTION):
+    if function_code in (_STREAM_FUNCTION, _LOCK_FUNCTION):
         return 5
-    if function == _WRITE_FUNCTION:
-        return 9 + received[start + 6] if available > 6 else unknown_length
+    if function_code == _WRITE_FUNCTION:
+        return 9 + received[start + 6] if available_bytes > 6 else unknown_length
     # A request with an unknown function ends where its checksum holds.
     return (
-        unknown_length if available > _LONGEST_FRAME or _checksum(received[start:]) else available
+        unknown_length
+        if available_bytes > _LONGEST_FRAME or _checksum(received[start:])
+        else available_bytes
     )
 
 
 def _checksum_table() -> tuple[int, ...]:
     """Return the Modbus checksums of all bytes."""
-    table = []
-    for byte in range(256):
-        crc = byte
+    checksum_table = []
+    for byte_value in range(256):
+        crc = byte_value
         for _ in range(8):
             crc = crc >> 1 ^ 0xA001 if crc & 1 else crc >> 1
-        table.append(crc)
-    return tuple(table)
+        checksum_table.append(crc)
+    return tuple(checksum_table)
 
 
 _CHECKSUM_TABLE = _checksum_table()
@@ -432,6 +464,6 @@ _CHECKSUM_TABLE = _checksum_table()
 def _checksum(frame: bytes) -> int:
     """Return the Modbus RTU checksum of a frame; it is 0 for a frame with a valid checksum."""
     crc = 0xFFFF
-    for byte in frame:
-        crc = crc >> 8 ^ _CHECKSUM_TABLE[(crc ^ byte) & 0xFF]
+    for data_byte in frame:
+        crc = crc >> 8 ^ _CHECKSUM_TABLE[(crc ^ data_byte) & 0xFF]
     return crc

@@ -83,14 +83,14 @@ class WallClock:
 
     def sync(self, now_ns: float) -> int:
         """Process a SYNC received at `now_ns`; return the number of elapsed periods, normally 1."""
-        elapsed = (now_ns - self._origin_ns) / self._period_ns
-        nearest = round(elapsed)
-        if nearest - self._last_sync > _NEW_PHASE_PERIODS:
+        elapsed_periods = (now_ns - self._origin_ns) / self._period_ns
+        nearest_tick = round(elapsed_periods)
+        if nearest_tick - self._last_sync > _NEW_PHASE_PERIODS:
             self._averaged_syncs = 0
         self._averaged_syncs = min(self._averaged_syncs + 1, _AVERAGED_SYNCS)
-        self._last_sync = nearest
-        self._origin_ns += (elapsed - nearest) * self._period_ns / self._averaged_syncs
-        return self._advance_to(nearest)
+        self._last_sync = nearest_tick
+        self._origin_ns += (elapsed_periods - nearest_tick) * self._period_ns / self._averaged_syncs
+        return self._advance_to(nearest_tick)
 
     def elapse(self, now_ns: int) -> int:
         """Return the number of periods that have elapsed until `now_ns` without a SYNC in time."""
@@ -126,7 +126,7 @@ class LockStep:
 
     @property
     def due_ns(self) -> int:
-        """Time in nanoseconds at which the next period elapses without a SYNC."""
+        """Time in ns (``time.monotonic_ns``) at which the next period elapses without a SYNC."""
         return round(self._waiting_until_ns + self._period_ns)
 
     def sync(self, now_ns: float) -> int:
@@ -189,7 +189,7 @@ class SimulatedNode(Protocol):
 
 
 class SerialDevice(Protocol):
-    """Device at the end of a simulated serial line."""
+    """Simulated device, such as a sensor, at the end of a simulated serial line."""
 
     frozen: bool
     """Whether the device neither sends nor receives."""
@@ -312,7 +312,7 @@ class BusSimulation:
         return self.periods * self._period_s
 
     def wait_s(self, now_ns: int, longest_s: float) -> float:
-        """Return the time in seconds until something is due without input, at most `longest_s`."""
+        """Return the time in s until something is due without input, at most `longest_s`."""
         due_ns = float("inf") if self.clock.is_idle else float(self.clock.due_ns)
         if self._delayed_deliveries and not self._lock_step:
             due_ns = min(due_ns, self._delayed_deliveries[0][0])
@@ -321,7 +321,9 @@ class BusSimulation:
     @property
     def disturbed(self) -> list[str]:
         """Names of the senders whose next frames a fault may affect."""
-        return [sender for sender, line in self._lines.items() if line.disturbed]
+        return [
+            sender_name for sender_name, faulty_line in self._lines.items() if faulty_line.disturbed
+        ]
 
     def can_sender(self, sender: str) -> Callable[[int, bytes], None]:
         """Return the function by which a node sends frames on the simulated CAN bus."""
@@ -331,9 +333,9 @@ class BusSimulation:
         """Return the function by which a sensor writes to the serial line."""
         return self._write_serial
 
-    def add_node(self, name: str, node: SimulatedNode) -> None:
+    def add_node(self, node_name: str, simulated_node: SimulatedNode) -> None:
         """Connect a node to the simulated CAN bus."""
-        self._nodes[name] = node
+        self._nodes[node_name] = simulated_node
 
     def add_serial_device(self, device: SerialDevice) -> None:
         """Connect the simulated sensor to the simulated serial line."""
@@ -343,7 +345,7 @@ class BusSimulation:
         )
 
     def step(self) -> None:
-        """Advance the rig by the period of a SYNC, which the drive reports as received."""
+        """Advance the simulated rig by the period of a SYNC that the drive has received."""
         if self._advance_is_due:
             self._advance_is_due = False
             self._advance_rig()
@@ -355,12 +357,12 @@ class BusSimulation:
         process there may be several SYNCs, which were sent a period apart.
         """
         self._now_ns = now_ns
-        syncs = sum(frame.startswith(_SYNC_ID_BYTES) for frame in frames)
-        if not syncs and self.clock.is_idle:
+        sync_count = sum(can_frame.startswith(_SYNC_ID_BYTES) for can_frame in frames)
+        if not sync_count and self.clock.is_idle:
             self.elapse(now_ns)
-        sent_ns = now_ns - (syncs - 1) * self._period_ns
-        for frame in frames:
-            can_id, data = unpack_frame(frame)
+        sent_ns = now_ns - (sync_count - 1) * self._period_ns
+        for can_frame in frames:
+            can_id, data = unpack_frame(can_frame)
             if can_id == _SYNC_ID:
                 self._sync(data, origin, sent_ns)
                 sent_ns += self._period_ns
@@ -386,7 +388,7 @@ class BusSimulation:
             self.clock.stop_waiting(now_ns)
 
     def inject(self, fault: Fault) -> None:
-        """Begin a fault now, or schedule it for its time.
+        """Begin a fault now, or schedule the fault if it has a start time.
 
         Raises
         ------
@@ -404,13 +406,13 @@ class BusSimulation:
     def _sync(self, data: bytes, origin: object, now_ns: float) -> None:
         """Process a SYNC: advance clock, rig and nodes, and deliver the SYNC."""
         self.syncs += 1
-        periods = self.clock.sync(now_ns)
-        for _ in range(periods - 1):
+        elapsed_periods = self.clock.sync(now_ns)
+        for _ in range(elapsed_periods - 1):
             self._run_period()
-        self._advance_is_due = periods > 0
+        self._advance_is_due = elapsed_periods > 0
         self._lines["host"].send(_SYNC_ID, data, origin)
         self.step()  # the rig advances even if the drive has not received the SYNC
-        if periods:
+        if elapsed_periods:
             self._run_nodes()
 
     def _run_period(self) -> None:
@@ -439,13 +441,13 @@ class BusSimulation:
         """Run the due actions of the nodes, and begin or end the due faults."""
         if self._serial_device is not None:
             self._serial_device.tick(self.now_s)
-        for node in self._nodes.values():
-            node.tick(self.now_s)
+        for simulated_node in self._nodes.values():
+            simulated_node.tick(self.now_s)
         self._deliver_to_nodes()
         if self._enabled_s is None and self._simulated_rig.plant.enabled:
             self._enabled_s = self.now_s
-            for fault in self._faults_after_enabling:
-                self.inject(fault)
+            for due_fault in self._faults_after_enabling:
+                self.inject(due_fault)
         if self._scheduled_actions:
             self._run_due(self._scheduled_actions, self.now_s)
         if self._delayed_deliveries and self._lock_step:
@@ -458,8 +460,8 @@ class BusSimulation:
         if self.bus_off:
             return
         self._send_to_hosts(pack_frame(can_id, data), origin)
-        for node in self._nodes.values():
-            node.receive(can_id, data)
+        for simulated_node in self._nodes.values():
+            simulated_node.receive(can_id, data)
         self._deliver_to_nodes()
 
     def _deliver_from_node(self, sender: str, can_id: int, data: bytes, _: object) -> None:
@@ -472,53 +474,57 @@ class BusSimulation:
         """Deliver queued frames of nodes to the other nodes, after their present actions."""
         while self._undelivered_frames:
             sender, can_id, data = self._undelivered_frames.popleft()
-            for name, node in self._nodes.items():
-                if name != sender:
-                    node.receive(can_id, data)
+            for node_name, simulated_node in self._nodes.items():
+                if node_name != sender:
+                    simulated_node.receive(can_id, data)
 
     def _write_serial(self, data: bytes) -> None:
         """Send bytes of the sensor over the serial line, record by record if a fault acts on it."""
-        line = self._lines["sensor"]
-        if self._is_streaming and line.disturbed:  # record by record
-            for offset in range(0, len(data), _RECORD_SIZE):
-                line.send(SERIAL, data[offset : offset + _RECORD_SIZE])
+        serial_line = self._lines["sensor"]
+        if self._is_streaming and serial_line.disturbed:  # record by record
+            for record_offset in range(0, len(data), _RECORD_SIZE):
+                serial_line.send(SERIAL, data[record_offset : record_offset + _RECORD_SIZE])
         else:
-            line.send(SERIAL, data)
+            serial_line.send(SERIAL, data)
 
     def _deliver_to_serial_host(self, _: int, data: bytes, __: object) -> None:
-        """Pass bytes of the simulated sensor that the line has not dropped to the host."""
+        """Pass bytes of the simulated sensor to the host, unless the line has dropped them."""
         self._write_to_host(data)
 
     # Faults.
 
     def _check_fault(self, fault: Fault) -> None:
         """Raise if a fault is not possible on this rig."""
-        values = fault.values
-        device = values.get("device", values.get("from", "drive"))
-        if fault.kind in ("saturate", "status") or values.get("what") in ("sensor", "gauge"):
-            device = "sensor"
-        on_serial = self._serial_device is not None and device == "sensor"
-        if device in ("drive", "sensor") and device not in self._nodes and not on_serial:
-            raise FaultError(f"Fault '{fault}': this rig has no {device} on its lines.")
-        if fault.kind == "cut" and device == "sensor" and not on_serial:
+        fault_values = fault.values
+        device_name = fault_values.get("device", fault_values.get("from", "drive"))
+        if fault.kind in ("saturate", "status") or fault_values.get("what") in ("sensor", "gauge"):
+            device_name = "sensor"
+        is_on_serial = self._serial_device is not None and device_name == "sensor"
+        if (
+            device_name in ("drive", "sensor")
+            and device_name not in self._nodes
+            and not is_on_serial
+        ):
+            raise FaultError(f"Fault '{fault}': this rig has no {device_name} on its lines.")
+        if fault.kind == "cut" and device_name == "sensor" and not is_on_serial:
             raise FaultError(
                 f"Fault '{fault}': this rig's sensor has no serial line; use "
                 "freeze,device=sensor, or cut for the whole bus."
             )
-        for key in _CAN_ONLY_KEYS if on_serial else _SERIAL_ONLY_KEYS:
-            if key in values:
+        for key in _CAN_ONLY_KEYS if is_on_serial else _SERIAL_ONLY_KEYS:
+            if key in fault_values:
                 raise FaultError(
                     f"Fault '{fault}': {key} is for a sensor on "
-                    f"{'CAN' if on_serial else 'a serial line'}, which this one is not."
+                    f"{'CAN' if is_on_serial else 'a serial line'}, which this one is not."
                 )
         if (
             fault.kind == "corrupt"
-            and not on_serial
-            and int(values["byte"]) >= _MOST_CAN_DATA_BYTES
+            and not is_on_serial
+            and int(fault_values["byte"]) >= _MOST_CAN_DATA_BYTES
         ):
             raise FaultError(
-                f"Fault '{fault}': byte={values['byte']} has no effect; a CAN frame has at most "
-                f"the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
+                f"Fault '{fault}': byte={fault_values['byte']} has no effect; a CAN frame has at "
+                f"most the bytes 0 to {_MOST_CAN_DATA_BYTES - 1}."
             )
 
         if fault.kind in DISTURBANCE_KINDS:
@@ -530,39 +536,44 @@ class BusSimulation:
     def _begin_fault(self, fault: Fault) -> None:
         """Begin an injected fault now: change the device, line or rig that it concerns."""
         self._log("simulator", "fault", fault=str(fault))
-        values: dict[str, Any] = dict(fault.values)
-        sensor: Any = self._serial_device or self._nodes.get("sensor")
-        drive: Any = self._nodes.get("drive")
+        fault_values: dict[str, Any] = dict(fault.values)
+        sensor_device: Any = self._serial_device or self._nodes.get("sensor")
+        drive_node: Any = self._nodes.get("drive")
         if fault.kind in LINE_KINDS:
-            self._lines[values["from"]].add(fault)
+            self._lines[fault_values["from"]].add(fault)
         elif fault.kind == "freeze":
             self._override_attribute(
-                fault, drive if values["device"] == "drive" else sensor, "frozen", True
+                fault,
+                drive_node if fault_values["device"] == "drive" else sensor_device,
+                "frozen",
+                True,
             )
         elif fault.kind == "saturate":
-            self._override_attribute(fault, sensor, "saturate", values["gauge"])
+            self._override_attribute(fault, sensor_device, "saturate", fault_values["gauge"])
         elif fault.kind == "stuck":
-            self._begin_stuck_readings(fault, sensor)
+            self._begin_stuck_readings(fault, sensor_device)
         elif fault.kind == "status":
-            self._override_attribute(fault, sensor, "status_bits", values["bits"])
+            self._override_attribute(fault, sensor_device, "status_bits", fault_values["bits"])
         elif fault.kind == "emcy":
-            drive.emergency(values["code"], values["register"], bytes(5))
+            drive_node.emergency(fault_values["code"], fault_values["register"], bytes(5))
         elif fault.kind == "sto":
-            self._override_attribute(fault, drive, "sto_dropped", True)
+            self._override_attribute(fault, drive_node, "sto_dropped", True)
         elif fault.kind == "busoff":
             self._send_to_hosts(BUS_OFF_FRAME, None)
             self._override_attribute(fault, self, "bus_off", True)
         elif fault.kind == "jump":
-            drive.angle_offset_counts += values["counts"]
+            drive_node.angle_offset_counts += fault_values["counts"]
         elif fault.kind == "object":
-            drive.override_object(values["index"], values["sub"], values.get("value"))
+            drive_node.override_object(
+                fault_values["index"], fault_values["sub"], fault_values.get("value")
+            )
         elif fault.kind in ("restart", "power_cycle"):
-            device = drive if values["device"] == "drive" else sensor
-            (device.reset if fault.kind == "restart" else device.power_cycle)()
+            fault_device = drive_node if fault_values["device"] == "drive" else sensor_device
+            (fault_device.reset if fault.kind == "restart" else fault_device.power_cycle)()
         elif fault.kind == "lag":
-            self._override_attribute(fault, drive, "torque_lag_s", 1e-3 * values["ms"])
+            self._override_attribute(fault, drive_node, "torque_lag_s", 1e-3 * fault_values["ms"])
         elif fault.kind in _DRIVE_ATTRIBUTES:
-            self._override_attribute(fault, drive, _DRIVE_ATTRIBUTES[fault.kind], True)
+            self._override_attribute(fault, drive_node, _DRIVE_ATTRIBUTES[fault.kind], True)
         elif fault.kind in DISTURBANCE_KINDS:
             now_s = self._simulated_rig.plant.elapsed_s + (
                 0.0 if self._lock_step else _OBSTACLE_LEAD_TIME_S
@@ -572,27 +583,27 @@ class BusSimulation:
             if isinstance(disturbance, Obstacle):
                 self._obstacles.append((fault, disturbance))
         elif fault.kind == "end":
-            self._end_faults(values.get("fault"))
+            self._end_faults(fault_values.get("fault"))
         else:
-            self._cut_lines[values["device"]] = fault
-            self._interrupt(values["device"])
+            self._cut_lines[fault_values["device"]] = fault
+            self._interrupt(fault_values["device"])
         self._deliver_to_nodes()
 
     def _begin_stuck_readings(self, fault: Fault, sensor: Any) -> None:  # noqa: ANN401
         """Make the encoder, the sensor or one gauge repeat its readings."""
-        stuck = StuckReadings(int(fault.values.get("every", 0)))
+        stuck_readings = StuckReadings(int(fault.values.get("every", 0)))
         stuck_device = fault.values["what"]
         if stuck_device == "encoder":
-            self._override_attribute(fault, self._simulated_rig, "stuck_encoder", stuck)
+            self._override_attribute(fault, self._simulated_rig, "stuck_encoder", stuck_readings)
         elif stuck_device == "sensor":
-            self._override_attribute(fault, self._simulated_rig.sensor, "stuck", stuck)
+            self._override_attribute(fault, self._simulated_rig.sensor, "stuck", stuck_readings)
         else:
             self._override_attribute(
-                fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck)
+                fault, sensor.gauges, "stuck", (int(fault.values["gauge"]), stuck_readings)
             )
 
     def _override_attribute(self, fault: Fault, device: Any, attribute: str, value: object) -> None:  # noqa: ANN401
-        """Let a fault override an attribute of a device until the fault ends."""
+        """Let a fault give an attribute of a device another value until the fault ends."""
         other_overrides = [
             s for s in self._overrides if (s.device, s.attribute) == (device, attribute)
         ]
@@ -607,33 +618,39 @@ class BusSimulation:
             self._schedule(end_s, partial(self._end_override, override))
 
     def _end_override(self, override: "_AttributeOverride") -> None:
-        """End an overriding fault: restore the value of the latest remaining one, or the normal."""
+        """End a fault that overrides an attribute of a device.
+
+        The attribute gets the value of the latest remaining fault on it, or its normal value.
+        """
         if override not in self._overrides:  # it was ended before its scheduled end
             return
         self._overrides.remove(override)
-        value = override.normal_value
-        for other in self._overrides:
-            if (other.device, other.attribute) == (override.device, override.attribute):
-                value = other.value
-        setattr(override.device, override.attribute, value)
+        restored_value = override.normal_value
+        for other_override in self._overrides:
+            if (other_override.device, other_override.attribute) == (
+                override.device,
+                override.attribute,
+            ):
+                restored_value = other_override.value
+        setattr(override.device, override.attribute, restored_value)
         self._log("simulator", "fault over", fault=str(override.fault))
 
-    def _end_faults(self, kind: str | None) -> None:
+    def _end_faults(self, fault_kind: str | None) -> None:
         """End all faults of a kind, or all faults if it is None."""
-        for line in self._lines.values():
-            for ended_kind in line.end(kind):
+        for faulty_line in self._lines.values():
+            for ended_kind in faulty_line.end(fault_kind):
                 self._log("simulator", "fault over", fault=ended_kind)
-        for override in [s for s in self._overrides if kind in (None, s.fault.kind)]:
+        for override in [s for s in self._overrides if fault_kind in (None, s.fault.kind)]:
             self._end_override(override)
-        if kind in (None, "obstacle"):
-            obstacles, self._obstacles = self._obstacles, []
-            for fault, obstacle in obstacles:
+        if fault_kind in (None, "obstacle"):
+            active_obstacles, self._obstacles = self._obstacles, []
+            for fault, obstacle in active_obstacles:
                 self._simulated_rig.remove_obstacle(obstacle)
                 self._log("simulator", "fault over", fault=str(fault))
-        if kind in (None, "cut"):
-            cut, self._cut_lines = self._cut_lines, {}
-            for device, fault in cut.items():
-                self._reconnect(device)
+        if fault_kind in (None, "cut"):
+            cut_lines, self._cut_lines = self._cut_lines, {}
+            for device_name, fault in cut_lines.items():
+                self._reconnect(device_name)
                 self._log("simulator", "fault over", fault=str(fault))
 
     def _schedule(self, when_s: float, action: Callable[[], None]) -> None:
@@ -653,7 +670,7 @@ class BusSimulation:
         )
 
     def _run_due(self, queue: list[tuple[float, int, Callable[[], None]]], now: float) -> None:
-        """Run the actions of a queue that are due at a time, and deliver the nodes' frames."""
+        """Run the actions of a queue that are due at time `now`, and deliver the nodes' frames."""
         while queue and queue[0][0] <= now:
             heapq.heappop(queue)[2]()
         self._deliver_to_nodes()

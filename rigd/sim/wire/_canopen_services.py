@@ -48,10 +48,10 @@ class Emergencies:
         self.active: dict[int, int] = {}
         self._history: list[int] = []
         objects.add(0x1001, Entry("B", access="ro", mapping="t", read_value=self._register))
-        count = Entry(
+        count_entry = Entry(
             "B", read_value=lambda: len(self._history), high=0, after_write=self._history.clear
         )
-        objects.add(0x1003, count)
+        objects.add(0x1003, count_entry)
         for sub in range(1, _HISTORY_LENGTH + 1):
             objects.add(0x1003, Entry("I", access="ro", read_value=self._history_reader(sub)), sub)
         self._cob_id = objects.add(0x1014, Entry("I", 0x80 + node_id, check=self._check_cob_id))
@@ -61,8 +61,8 @@ class Emergencies:
         self.active.clear()
         self._history.clear()
 
-    def report(self, code: int, register: int, vendor: bytes = b"") -> bool:
-        """Register an error and send its message, unless the error is active already.
+    def report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> bool:
+        """Register an error and send its emergency message, unless the error is active already.
 
         Parameters
         ----------
@@ -78,32 +78,34 @@ class Emergencies:
         bool
             Whether the error was not active before.
         """
-        if code in self.active:
+        if error_code in self.active:
             return False
-        self.active[code] = register | _GENERIC_ERROR_BIT
-        self._history.insert(0, code)
+        self.active[error_code] = register_bits | _GENERIC_ERROR_BIT
+        self._history.insert(0, error_code)
         del self._history[_HISTORY_LENGTH:]
-        self._transmit(code, vendor)
+        self._transmit(error_code, vendor_bytes)
         return True
 
     def clear(self, *codes: int) -> None:
-        """Clear error codes, and send an emergency message if any of them was active."""
-        cleared = [code for code in codes if self.active.pop(code, None) is not None]
-        if cleared:
+        """Remove errors from the active ones, and send an emergency message if any was active."""
+        cleared_codes = [
+            error_code for error_code in codes if self.active.pop(error_code, None) is not None
+        ]
+        if cleared_codes:
             self._transmit(0, b"")
 
-    def _transmit(self, code: int, vendor: bytes) -> None:
-        """Send an emergency message, unless object 1014 disables it."""
+    def _transmit(self, error_code: int, vendor_bytes: bytes) -> None:
+        """Send an emergency message of the node, unless object 1014 disables such messages."""
         if not self._cob_id.value & COB_ID_DISABLED:
-            frame = _EMERGENCY_LAYOUT.pack(code, self._register(), vendor[:5])
-            self._send(self._cob_id.value & 0x7FF, frame)
+            message_bytes = _EMERGENCY_LAYOUT.pack(error_code, self._register(), vendor_bytes[:5])
+            self._send(self._cob_id.value & 0x7FF, message_bytes)
 
     def _register(self) -> int:
         """Return the error register: the bits of all active errors."""
-        register = 0
-        for bits in self.active.values():
-            register |= bits
-        return register
+        error_register = 0
+        for error_bits in self.active.values():
+            error_register |= error_bits
+        return error_register
 
     def _history_reader(self, sub: int) -> Callable[[], int]:
         """Return the function that reads an entry of the error history."""
@@ -115,12 +117,15 @@ class Emergencies:
 
         return read
 
-    def _check_cob_id(self, value: int) -> None:
+    def _check_cob_id(self, new_cob_id: int) -> None:
         """Raise `Abort` if object 1014 may not be set to a value now."""
         present_value = self._cob_id.value
-        if value & 0x7FFF_F800 or not is_free_id(value & 0x7FF):
+        if new_cob_id & 0x7FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if not (present_value | value) & COB_ID_DISABLED and (present_value ^ value) & 0x7FF:
+        if (
+            not (present_value | new_cob_id) & COB_ID_DISABLED
+            and (present_value ^ new_cob_id) & 0x7FF
+        ):
             raise Abort(AbortCode.STATE)
 
 
@@ -191,13 +196,13 @@ class HeartbeatMonitor:
         return self.lost
 
 
-def _monitored_node(value: int) -> int:
+def _monitored_node(monitor_value: int) -> int:
     """Return the number of the monitored node in a value of object 1016; 0 for none."""
-    return value >> 16 & 0x7F if value & 0xFFFF else 0
+    return monitor_value >> 16 & 0x7F if monitor_value & 0xFFFF else 0
 
 
 def add_heartbeat_monitors(
-    objects: ObjectDictionary, count: int, on_restart: Callable[[], None]
+    objects: ObjectDictionary, monitor_count: int, on_restart: Callable[[], None]
 ) -> list[HeartbeatMonitor]:
     """Add object 1016 to a dictionary, and return the heartbeat monitors of its entries.
 
@@ -210,14 +215,16 @@ def add_heartbeat_monitors(
     on_restart
         Function that is called after an entry was set, which restarts its monitoring.
     """
-    entries = {sub: Entry("I") for sub in range(1, count + 1)}
-    monitors = [HeartbeatMonitor(entry) for entry in entries.values()]
+    monitor_entries = {sub: Entry("I") for sub in range(1, monitor_count + 1)}
+    monitors = [HeartbeatMonitor(monitor_entry) for monitor_entry in monitor_entries.values()]
 
-    def check(entry: Entry, value: int) -> None:
+    def check(monitor_entry: Entry, value: int) -> None:
         if value >> 24 or value >> 16 > 0x7F:
             raise Abort(AbortCode.VALUE)
         other_nodes = {
-            _monitored_node(other.value) for other in entries.values() if other is not entry
+            _monitored_node(other_entry.value)
+            for other_entry in monitor_entries.values()
+            if other_entry is not monitor_entry
         }
         if _monitored_node(value) and _monitored_node(value) in other_nodes:
             raise Abort(AbortCode.INCOMPATIBLE)
@@ -226,11 +233,11 @@ def add_heartbeat_monitors(
         monitor.restart()
         on_restart()
 
-    for entry, monitor in zip(entries.values(), monitors, strict=True):
-        entry.check = partial(check, entry)
-        entry.after_write = partial(restart, monitor)
-    if entries:
-        objects.add_record(0x1016, entries)
+    for monitor_entry, monitor in zip(monitor_entries.values(), monitors, strict=True):
+        monitor_entry.check = partial(check, monitor_entry)
+        monitor_entry.after_write = partial(restart, monitor)
+    if monitor_entries:
+        objects.add_record(0x1016, monitor_entries)
     return monitors
 
 
@@ -317,8 +324,8 @@ class Pdo:
         )
         objects.add(mapping, self._count)
         self._slots = [
-            objects.add(mapping, Entry("I", value, check=self._check_slot), sub)
-            for sub, value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
+            objects.add(mapping, Entry("I", mapping_value, check=self._check_slot), sub)
+            for sub, mapping_value in enumerate((default_mapping + (0,) * slots)[:slots], 1)
         ]
         self.can_id = -1
         self.size = 0
@@ -328,9 +335,9 @@ class Pdo:
 
     def compile(self) -> None:
         """Rebuild the PDO's mapping from the object dictionary."""
-        slots = self._slots[: self._count.value]
+        used_slots = self._slots[: self._count.value]
         try:
-            self.entries = [self._mapped_entry(slot.value) for slot in slots]
+            self.entries = [self._mapped_entry(mapping_slot.value) for mapping_slot in used_slots]
         except Abort:  # a device's file may map objects at power-on that it declares unmappable
             self.entries = []
         self._struct = Struct("<" + "".join(entry.kind for entry in self.entries))
@@ -340,7 +347,7 @@ class Pdo:
         self.reset_exchange()
 
     def reset_exchange(self) -> None:
-        """Reset the state: nothing has been received or sent yet."""
+        """Reset the state of the PDO: nothing has been received or sent yet."""
         raise NotImplementedError
 
     @property
@@ -353,7 +360,7 @@ class Pdo:
         self.compile()
         self._changed()
 
-    def _mapped_entry(self, value: int) -> Entry:
+    def _mapped_entry(self, mapping_value: int) -> Entry:
         """Return the entry of the dictionary that a mapping entry names.
 
         Raises
@@ -361,39 +368,46 @@ class Pdo:
         Abort
             If the object does not exist, cannot be mapped into this PDO, or has another length.
         """
-        entry = self._objects.find(value >> 16, value >> 8 & 0xFF)
-        if self.direction not in entry.mapping or entry.bits != value & 0xFF:
+        mapped_entry = self._objects.find(mapping_value >> 16, mapping_value >> 8 & 0xFF)
+        if self.direction not in mapped_entry.mapping or mapped_entry.bits != mapping_value & 0xFF:
             raise Abort(AbortCode.NOT_MAPPABLE)
-        return entry
+        return mapped_entry
 
-    def _check_cob_id(self, value: int) -> None:
-        """Raise `Abort` if the COB-ID may not be set to a value now."""
+    def _check_cob_id(self, new_cob_id: int) -> None:
+        """Raise `Abort` if the PDO's COB-ID may not be set to a value now."""
         was_enabled = not self._cob_id.value & COB_ID_DISABLED
-        if value & 0x3FFF_F800 or not is_free_id(value & 0x7FF):
+        if new_cob_id & 0x3FFF_F800 or not is_free_id(new_cob_id & 0x7FF):
             raise Abort(AbortCode.VALUE)
-        if was_enabled and not value & COB_ID_DISABLED and (value ^ self._cob_id.value) & 0x7FF:
+        if (
+            was_enabled
+            and not new_cob_id & COB_ID_DISABLED
+            and (new_cob_id ^ self._cob_id.value) & 0x7FF
+        ):
             raise Abort(AbortCode.STATE)
 
-    def _check_inhibit(self, value: int) -> None:  # noqa: ARG002
-        """Raise `Abort` if the inhibit time may not be set now."""
+    def _check_inhibit(self, new_time: int) -> None:  # noqa: ARG002
+        """Raise `Abort` if the PDO's inhibit time may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
 
-    def _check_slot(self, value: int) -> None:
-        """Raise `Abort` if a mapping entry may not be set to a value now."""
+    def _check_slot(self, new_entry: int) -> None:
+        """Raise `Abort` if a mapping entry of the PDO may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED or self._count.value:
             raise Abort(AbortCode.STATE)
-        if value:
-            self._mapped_entry(value)
+        if new_entry:
+            self._mapped_entry(new_entry)
 
-    def _check_count(self, value: int) -> None:
+    def _check_count(self, new_count: int) -> None:
         """Raise `Abort` if the number of mapped objects may not be set to a value now."""
         if not self._cob_id.value & COB_ID_DISABLED:
             raise Abort(AbortCode.STATE)
-        if value > len(self._slots):
+        if new_count > len(self._slots):
             raise Abort(AbortCode.PDO_LENGTH)
         if (
-            sum(self._mapped_entry(slot.value).bits for slot in self._slots[:value])
+            sum(
+                self._mapped_entry(mapping_slot.value).bits
+                for mapping_slot in self._slots[:new_count]
+            )
             > _MOST_PDO_BITS
         ):
             raise Abort(AbortCode.PDO_LENGTH)
@@ -427,13 +441,15 @@ class ReceivePdo(Pdo):
 
     def apply(self, data: bytes) -> None:
         """Store all values of a received PDO, then run their effects; skip values out of range."""
-        for entry, value in zip(self.entries, self._struct.unpack(data), strict=True):
+        for mapped_entry, received_value in zip(
+            self.entries, self._struct.unpack(data), strict=True
+        ):
             with suppress(Abort):
-                entry.store_integer(value)
+                mapped_entry.store_integer(received_value)
         self.applied = True
-        for entry in self.entries:
-            if entry.after_write is not None:
-                entry.after_write()
+        for mapped_entry in self.entries:
+            if mapped_entry.after_write is not None:
+                mapped_entry.after_write()
 
 
 class TransmitPdo(Pdo):
@@ -449,7 +465,7 @@ class TransmitPdo(Pdo):
         ]
 
     def reset_exchange(self) -> None:
-        """Reset the state as on entering operational: the next event sends the PDO."""
+        """Reset what was sent, as on entering operational, so that the next event sends the PDO."""
         self._syncs = 0
         self._last: bytes | None = None
         self._sent_s = -math.inf
@@ -467,21 +483,21 @@ class TransmitPdo(Pdo):
         if self._inhibit.value:
             if now_s - self._sent_s < 1e-4 * self._inhibit.value + 1e-9:
                 return None
-            data = self._data_by_transmission_type()
-            if data is not None:
+            pdo_data = self._data_by_transmission_type()
+            if pdo_data is not None:
                 self._sent_s = now_s
-            return data
+            return pdo_data
         return self._data_by_transmission_type()
 
     def _data_by_transmission_type(self) -> bytes | None:
-        """Return the data to send at a SYNC by the transmission type, or None."""
+        """Return the data to send at a SYNC by the PDO's transmission type, or None for no PDO."""
         transmission_type = self._type.value
         if transmission_type == 1:
             return self.build()
         if transmission_type == 0:
-            data = self.build()
-            changed, self._last = data != self._last, data
-            return data if changed else None
+            pdo_data = self.build()
+            has_changed, self._last = pdo_data != self._last, pdo_data
+            return pdo_data if has_changed else None
         self._syncs += 1
         if self._syncs < transmission_type:
             return None
@@ -490,19 +506,19 @@ class TransmitPdo(Pdo):
 
     def data_at_event(self, now_s: float) -> bytes | None:
         """Return the data to send because values have changed or the timer has expired, or None."""
-        data = self.build()
+        pdo_data = self.build()
         age_s = now_s - self._sent_s
         timer_s = 1e-3 * self._timer.value
         is_due = timer_s > 0 and age_s >= timer_s - 1e-9
         is_inhibited = age_s < 1e-4 * self._inhibit.value - 1e-9
-        if self._last is not None and not is_due and (data == self._last or is_inhibited):
+        if self._last is not None and not is_due and (pdo_data == self._last or is_inhibited):
             return None
-        self._last = data
+        self._last = pdo_data
         self._sent_s = now_s
-        return data
+        return pdo_data
 
 
-def _check_transmission_type(value: int) -> None:
-    """Raise `Abort` if a transmission type is not supported."""
-    if value > _LAST_SYNC_TYPE and value not in _EVENT_TYPES:
+def _check_transmission_type(new_type: int) -> None:
+    """Raise `Abort` if a value is not a supported transmission type of a PDO."""
+    if new_type > _LAST_SYNC_TYPE and new_type not in _EVENT_TYPES:
         raise Abort(AbortCode.VALUE)

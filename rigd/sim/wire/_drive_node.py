@@ -205,54 +205,56 @@ class DriveNode:
         self._mode = NO_MODE
         self._is_limited = self._follows_target = self._is_too_fast = False
 
-        objects = self._objects = ObjectDictionary()
-        entries = self._entries = add_drive_objects(
-            objects, rig.motor, rig.cia402, rig.rate_hz, rig.encoder.resolution_rad
+        object_dictionary = self._objects = ObjectDictionary()
+        drive_entries = self._entries = add_drive_objects(
+            object_dictionary, rig.motor, rig.cia402, rig.rate_hz, rig.encoder.resolution_rad
         )
-        self._emergencies = Emergencies(objects, node_id, self._send_emergency)
-        self._producer = HeartbeatProducer(objects)
+        self._emergencies = Emergencies(object_dictionary, node_id, self._send_emergency)
+        self._producer = HeartbeatProducer(object_dictionary)
         monitor_count = DEFAULT_MONITOR_COUNT if file is None else file.sub_index_count(0x1016)
         self._heartbeat_monitors = add_heartbeat_monitors(
-            objects, monitor_count, self._clear_heartbeat_error
+            object_dictionary, monitor_count, self._clear_heartbeat_error
         )
         self._receive_pdos = [
-            ReceivePdo(objects, *pdo, self._rebuild_tables)
+            ReceivePdo(object_dictionary, *pdo, self._rebuild_tables)
             for pdo in _pdo_parameters(0x1400, 0x200 + node_id, 0x6040, file)
         ]
         self._transmit_pdos = [
-            TransmitPdo(objects, *pdo, self._rebuild_tables)
+            TransmitPdo(object_dictionary, *pdo, self._rebuild_tables)
             for pdo in _pdo_parameters(0x1800, 0x180 + node_id, 0x6041, file)
         ]
         self._sdo = SdoServer(
-            objects, partial(self._transmit, 0x580 + node_id), self._log_sdo_write
+            object_dictionary, partial(self._transmit, 0x580 + node_id), self._log_sdo_write
         )
 
-        entries.sync_cob_id.after_write = entries.sync_overflow.after_write = self._rebuild_tables
-        entries.controlword.after_write = self._on_controlword
-        entries.statusword.read_value = self._statusword
-        entries.mode.after_write = self._on_mode
-        entries.mode_display.read_value = entries.mode.get
-        entries.position.read_value = self._position
-        entries.velocity.read_value = self._velocity
-        entries.actual_torque.read_value = self._actual_torque
-        for entry in (
-            entries.target_torque,
-            entries.torque_offset,
-            entries.max_torque,
-            entries.positive_limit,
-            entries.negative_limit,
+        drive_entries.sync_cob_id.after_write = drive_entries.sync_overflow.after_write = (
+            self._rebuild_tables
+        )
+        drive_entries.controlword.after_write = self._on_controlword
+        drive_entries.statusword.read_value = self._statusword
+        drive_entries.mode.after_write = self._on_mode
+        drive_entries.mode_display.read_value = drive_entries.mode.get
+        drive_entries.position.read_value = self._position
+        drive_entries.velocity.read_value = self._velocity
+        drive_entries.actual_torque.read_value = self._actual_torque
+        for torque_entry in (
+            drive_entries.target_torque,
+            drive_entries.torque_offset,
+            drive_entries.max_torque,
+            drive_entries.positive_limit,
+            drive_entries.negative_limit,
         ):
-            entry.after_write = self._refresh_torque
+            torque_entry.after_write = self._refresh_torque
         self._state_machine = PdsStateMachine(
-            entries.quick_stop_option,
-            entries.fault_option,
+            drive_entries.quick_stop_option,
+            drive_entries.fault_option,
             on_state_change=self._on_state_change,
             may_switch_on=lambda: self._has_all_heartbeats() and not self._sto_dropped,
             may_enable=lambda: self._nmt is Nmt.OPERATIONAL and self._has_all_heartbeats(),
             may_reset=self._may_reset,
         )
         if file is not None:
-            adopt_device_file(objects, file)
+            adopt_device_file(object_dictionary, file)
         self._rebuild_pdos()
 
     def receive(self, can_id: int, data: bytes) -> None:
@@ -262,12 +264,12 @@ class DriveNode:
         if can_id == self._sync_id:
             self._on_sync(data)
         elif not self.frozen:
-            handler = self._handlers.get(can_id)
-            if handler is not None:
-                handler(data)
+            frame_handler = self._handlers.get(can_id)
+            if frame_handler is not None:
+                frame_handler(data)
 
     def tick(self, now_s: float) -> None:
-        """Advance the drive to a simulated time: watchdogs, heartbeat, ramps, event-driven PDOs.
+        """Advance the simulated drive in time: watchdogs, heartbeat, ramps, event-driven PDOs.
 
         Parameters
         ----------
@@ -286,13 +288,16 @@ class DriveNode:
             self._transmit(0x700 + self._node_id, bytes([self._nmt]))
         if self._nmt is Nmt.OPERATIONAL and not self.frozen:
             for pdo in self._event_tpdos:
-                data = pdo.data_at_event(now_s)
-                if data is not None:
-                    self._transmit(pdo.can_id, data)
+                tpdo_data = pdo.data_at_event(now_s)
+                if tpdo_data is not None:
+                    self._transmit(pdo.can_id, tpdo_data)
 
-    def emergency(self, code: int, register: int, vendor: bytes) -> None:
-        """Bring the drive to fault with error code, bits of the error register, vendor's bytes."""
-        self._fail(code, register, vendor)
+    def emergency(self, error_code: int, register_bits: int, vendor_bytes: bytes) -> None:
+        """Bring the simulated drive to fault, and report an error by an emergency message.
+
+        The message contains error code, bits of the error register and vendor's bytes.
+        """
+        self._fail(error_code, register_bits, vendor_bytes)
 
     def reset(self) -> None:
         """Restart the drive as by its own watchdog, with the values at power-on."""
@@ -324,20 +329,20 @@ class DriveNode:
 
     # NMT ---------------------------------------------------------------------------------------
 
-    def _boot(self, last: int = _LAST_INDEX) -> None:
-        """Start the node: set objects up to index `last` to their values at power-on."""
+    def _boot(self, last_index: int = _LAST_INDEX) -> None:
+        """Start the node: set objects up to index `last_index` to their values at power-on."""
         self._log("nmt", state="initialising")
-        if last == _LAST_INDEX:
+        if last_index == _LAST_INDEX:
             self._emergencies.reset()
             self._state_machine.start()
         self._nmt = Nmt.INITIALISING
         self._sync_alive = False
-        self._objects.reset(last)
+        self._objects.reset(last_index)
         self._on_mode()
         self._rebuild_pdos()
         self._sdo.reset()
-        for monitor in self._heartbeat_monitors:
-            monitor.restart()
+        for heartbeat_monitor in self._heartbeat_monitors:
+            heartbeat_monitor.restart()
         self._transmit(0x700 + self._node_id, bytes([Nmt.INITIALISING]))
         self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
@@ -345,39 +350,39 @@ class DriveNode:
         """Process an NMT command: start, stop, pre-operational or reset."""
         if len(data) != 2 or data[1] not in (0, self._node_id):
             return
-        command = data[0]
-        if command == 128 and self.stays_operational:
+        nmt_command = data[0]
+        if nmt_command == 128 and self.stays_operational:
             return
-        if command == 1:
+        if nmt_command == 1:
             self._enter_nmt(Nmt.OPERATIONAL)
-        elif command in (2, 128):
+        elif nmt_command in (2, 128):
             self._end_connection()
-            self._enter_nmt(Nmt.STOPPED if command == 2 else Nmt.PRE_OPERATIONAL)
-        elif command == 129:
+            self._enter_nmt(Nmt.STOPPED if nmt_command == 2 else Nmt.PRE_OPERATIONAL)
+        elif nmt_command == 129:
             self._boot()
-        elif command == 130:
+        elif nmt_command == 130:
             self._end_connection()
             self._boot(_LAST_COMMUNICATION_INDEX)
 
-    def _enter_nmt(self, state: Nmt) -> None:
+    def _enter_nmt(self, new_state: Nmt) -> None:
         """Change the NMT state, and discard pending transfers and PDOs."""
-        if state is self._nmt:
+        if new_state is self._nmt:
             return
-        self._nmt = state
+        self._nmt = new_state
         self._sync_alive = False
         self._sdo.reset()
         for pdo in (*self._receive_pdos, *self._transmit_pdos):
             pdo.reset_exchange()
-        self._log("nmt", state=state.name.lower().replace("_", "-"))
+        self._log("nmt", state=new_state.name.lower().replace("_", "-"))
 
     def _end_connection(self) -> None:
         """Leave operation enabled before the NMT state changes, as the abort option says."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
-        option = self._entries.abort_option.value
-        if option == 1:
+        abort_option = self._entries.abort_option.value
+        if abort_option == 1:
             self._fail(_CONNECTION_ENDED_CODE, _COMMUNICATION_ERROR_BIT)
-        elif option == 3:
+        elif abort_option == 3:
             self._state_machine.quick_stop()
         else:
             self._state_machine.disable_voltage()
@@ -397,10 +402,10 @@ class DriveNode:
             self._last_sync_s = self._now_s
             is_first_sync, self._sync_alive = not self._sync_alive, True
             for rpdo in self._sync_rpdos:
-                pending = rpdo.pending
-                if pending is not None:
+                pending_data = rpdo.pending
+                if pending_data is not None:
                     rpdo.pending = None
-                    rpdo.apply(pending)
+                    rpdo.apply(pending_data)
             if is_first_sync:
                 self._refresh_torque()
         self._advance()
@@ -422,11 +427,11 @@ class DriveNode:
         if self._nmt is not Nmt.OPERATIONAL:
             return
         if len(data) < pdo.size:
-            vendor = bytes([len(data), pdo.size])
+            vendor_bytes = bytes([len(data), pdo.size])
             if self._state_machine.state is PdsState.OPERATION_ENABLED:
-                self._fail(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
+                self._fail(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor_bytes)
             else:
-                self._report(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor)
+                self._report(_PDO_TOO_SHORT_CODE, _COMMUNICATION_ERROR_BIT, vendor_bytes)
             return
         if len(data) > pdo.size:  # the first bytes are used (CiA 301)
             self._report(_PDO_TOO_LONG_CODE, _COMMUNICATION_ERROR_BIT, bytes([len(data), pdo.size]))
@@ -448,9 +453,9 @@ class DriveNode:
         """Process the heartbeat of another node."""
         if len(data) != 1 or data[0] & 0x7F == Nmt.INITIALISING:  # a boot-up is not a heartbeat
             return
-        for monitor in self._heartbeat_monitors:
-            if monitor.node_id == node_id:
-                monitor.register_heartbeat(self._now_s)
+        for heartbeat_monitor in self._heartbeat_monitors:
+            if heartbeat_monitor.node_id == node_id:
+                heartbeat_monitor.register_heartbeat(self._now_s)
         if self._emergencies.active:
             self._clear_heartbeat_error()
 
@@ -482,35 +487,37 @@ class DriveNode:
         active_tpdos = [pdo for pdo in self._transmit_pdos if pdo.can_id >= 0]
         self._sync_tpdos = [pdo for pdo in active_tpdos if pdo.is_synchronous]
         self._event_tpdos = [pdo for pdo in active_tpdos if not pdo.is_synchronous]
-        handlers: dict[int, Callable[[bytes], None]] = {
+        frame_handlers: dict[int, Callable[[bytes], None]] = {
             0x700 + node_id: partial(self._on_heartbeat, node_id) for node_id in range(1, 128)
         }
-        handlers.update({pdo.can_id: partial(self._on_rpdo, pdo) for pdo in active_rpdos})
-        handlers[0x600 + self._node_id] = self._on_sdo
-        handlers[0x000] = self._on_nmt
-        self._handlers = handlers
+        frame_handlers.update({pdo.can_id: partial(self._on_rpdo, pdo) for pdo in active_rpdos})
+        frame_handlers[0x600 + self._node_id] = self._on_sdo
+        frame_handlers[0x000] = self._on_nmt
+        self._handlers = frame_handlers
 
     # Watchdogs and errors ----------------------------------------------------------------------
 
     def _check_heartbeats(self, now_s: float) -> None:
         """React to heartbeats that have just been lost, as the options in the dictionary say."""
-        for monitor in self._heartbeat_monitors:
-            if not monitor.check(now_s):
+        for heartbeat_monitor in self._heartbeat_monitors:
+            if not heartbeat_monitor.check(now_s):
                 continue
-            option, state = self._entries.abort_option.value, self._state_machine.state
-            if option == 1 and state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
+            error_option, pds_state = self._entries.abort_option.value, self._state_machine.state
+            if error_option == 1 and pds_state not in (PdsState.READY, PdsState.SWITCH_ON_DISABLED):
                 self._state_machine.fail()
-            elif option == 3:
+            elif error_option == 3:
                 self._state_machine.quick_stop()
-            elif option:
+            elif error_option:
                 self._state_machine.disable_voltage()
-            self._log("heartbeat lost", node_id=monitor.node_id)
-            self._report(_HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([monitor.node_id]))
-            reaction = self._entries.communication_error.value
-            if reaction == 2:
+            self._log("heartbeat lost", node_id=heartbeat_monitor.node_id)
+            self._report(
+                _HEARTBEAT_LOST_CODE, _COMMUNICATION_ERROR_BIT, bytes([heartbeat_monitor.node_id])
+            )
+            communication_option = self._entries.communication_error.value
+            if communication_option == 2:
                 self._end_connection()
                 self._enter_nmt(Nmt.STOPPED)
-            elif reaction == 0 and self._nmt is Nmt.OPERATIONAL:
+            elif communication_option == 0 and self._nmt is Nmt.OPERATIONAL:
                 self._end_connection()
                 self._enter_nmt(Nmt.PRE_OPERATIONAL)
 
@@ -529,61 +536,61 @@ class DriveNode:
         """Go to fault if an RPDO has missed its deadline in operation enabled."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
-        for number, pdo in enumerate(self._receive_pdos, 1):
+        for pdo_number, pdo in enumerate(self._receive_pdos, 1):
             deadline_s = pdo.deadline_s
             if (
                 deadline_s
                 and pdo.received_s is not None
                 and now_s - pdo.received_s > deadline_s + _TIME_TOLERANCE_S
             ):
-                self._fail(_RPDO_TIMEOUT_CODE, _COMMUNICATION_ERROR_BIT, bytes([number]))
-                self._log("rpdo lost", number=number, deadline_s=deadline_s)
+                self._fail(_RPDO_TIMEOUT_CODE, _COMMUNICATION_ERROR_BIT, bytes([pdo_number]))
+                self._log("rpdo lost", number=pdo_number, deadline_s=deadline_s)
                 return
 
     def _clear_heartbeat_error(self) -> None:
         """Clear the heartbeat error if no monitored heartbeat is missing any more."""
-        if not any(monitor.lost for monitor in self._heartbeat_monitors):
+        if not any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors):
             self._clear(_HEARTBEAT_LOST_CODE)
 
     def _has_all_heartbeats(self) -> bool:
         """Return whether no missing heartbeat forbids operation."""
         return not (
             self._entries.abort_option.value
-            and any(monitor.lost for monitor in self._heartbeat_monitors)
+            and any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors)
         )
 
     def _may_reset(self) -> bool:
         """Return whether a fault may be reset, and log the attempt."""
-        allowed = self._has_all_heartbeats() and not self._sto_dropped
-        self._log("fault reset", accepted=allowed)
-        return allowed
+        is_allowed = self._has_all_heartbeats() and not self._sto_dropped
+        self._log("fault reset", accepted=is_allowed)
+        return is_allowed
 
-    def _fail(self, code: int, register: int, vendor: bytes = b"") -> None:
+    def _fail(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> None:
         """Bring the simulated drive to fault, and report an error code by an emergency message."""
         self._state_machine.fail()
-        self._report(code, register, vendor)
+        self._report(error_code, register_bits, vendor_bytes)
 
-    def _report(self, code: int, register: int, vendor: bytes = b"") -> None:
+    def _report(self, error_code: int, register_bits: int, vendor_bytes: bytes = b"") -> None:
         """Report an error by an emergency message, unless it is active already."""
-        if self._emergencies.report(code, register, vendor):
-            self._entries.error_code.value = code
+        if self._emergencies.report(error_code, register_bits, vendor_bytes):
+            self._entries.error_code.value = error_code
 
     def _clear(self, *codes: int) -> None:
-        """Clear errors whose cause has ended; errors of a fault remain until its reset."""
+        """Clear active errors whose cause has ended; errors of a fault remain until its reset."""
         if self._state_machine.state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             self._emergencies.clear(*codes)
 
     def _send_emergency(self, can_id: int, data: bytes) -> None:
         """Log an emergency message, and send it if the NMT state allows."""
-        sent = self._nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL) and not self.frozen
+        is_sent = self._nmt in (Nmt.OPERATIONAL, Nmt.PRE_OPERATIONAL) and not self.frozen
         self._log(
             "emcy",
             code=int.from_bytes(data[:2], "little"),
             register=data[2],
             vendor=data[3:].hex(),
-            sent=sent,
+            sent=is_sent,
         )
-        if sent:
+        if is_sent:
             self._send(can_id, data)
 
     # Drive -------------------------------------------------------------------------------------
@@ -591,10 +598,10 @@ class DriveNode:
     def _on_controlword(self) -> None:
         """Process a changed controlword."""
         controlword = self._entries.controlword.value
-        mask, unchanged_value = _UNCHANGED_OPERATION
+        operation_mask, unchanged_value = _UNCHANGED_OPERATION
         if (
             self._state_machine.state is not PdsState.OPERATION_ENABLED
-            or controlword & mask != unchanged_value
+            or controlword & operation_mask != unchanged_value
         ):
             self._state_machine.control(controlword)
         self._refresh_torque()
@@ -608,73 +615,80 @@ class DriveNode:
 
     def _on_state_change(self, previous_state: PdsState) -> None:
         """Process a change of the drive's state: switch the plant on or off, and log it."""
-        state = self._state_machine.state
+        pds_state = self._state_machine.state
         if previous_state is PdsState.OPERATION_ENABLED:
             self._plant.disable()
             self._per_mille = 0
             self._is_limited = self._follows_target = False
             self._log("torque", torque_nm=0.0, enabled=False)
-        self._log("state", state=state.label)
-        if state is PdsState.OPERATION_ENABLED:
+        self._log("state", state=pds_state.label)
+        if pds_state is PdsState.OPERATION_ENABLED:
             self._plant.enable()
             self._log("torque", torque_nm=0.0, enabled=True)
             self._refresh_torque()
         elif previous_state is PdsState.FAULT:
             self._entries.error_code.value = 0
-            remaining = (
+            remaining_codes = (
                 {_HEARTBEAT_LOST_CODE}
-                if any(monitor.lost for monitor in self._heartbeat_monitors)
+                if any(heartbeat_monitor.lost for heartbeat_monitor in self._heartbeat_monitors)
                 else set()
             )
-            self._emergencies.clear(*(self._emergencies.active.keys() - remaining))
+            self._emergencies.clear(*(self._emergencies.active.keys() - remaining_codes))
 
     def _refresh_torque(self) -> None:
         """Pass the torque that follows from the dictionary to the plant, if it has changed."""
         if self._state_machine.state is not PdsState.OPERATION_ENABLED:
             return
-        entries = self._entries
+        drive_entries = self._entries
         self._follows_target = (
             self._sync_alive
-            and entries.mode.value == CYCLIC_SYNCHRONOUS_TORQUE
-            and not entries.controlword.value & _HALT_BIT
+            and drive_entries.mode.value == CYCLIC_SYNCHRONOUS_TORQUE
+            and not drive_entries.controlword.value & _HALT_BIT
             and (not self._target_pdos or any(pdo.applied for pdo in self._target_pdos))
         )
         target_per_mille = (
-            entries.target_torque.value + entries.torque_offset.value if self._follows_target else 0
+            drive_entries.target_torque.value + drive_entries.torque_offset.value
+            if self._follows_target
+            else 0
         )
-        limit_per_mille = min(entries.max_torque.value, self._peak_per_mille)
-        highest_per_mille = min(limit_per_mille, abs(entries.positive_limit.value))
+        limit_per_mille = min(drive_entries.max_torque.value, self._peak_per_mille)
+        highest_per_mille = min(limit_per_mille, abs(drive_entries.positive_limit.value))
         lowest_per_mille = -min(
-            limit_per_mille, abs(entries.negative_limit.value)
+            limit_per_mille, abs(drive_entries.negative_limit.value)
         )  # some drives state a negative limit
-        per_mille = (
+        torque_per_mille = (
             lowest_per_mille
             if target_per_mille < lowest_per_mille
             else min(target_per_mille, highest_per_mille)
         )
-        if self._is_too_fast and per_mille * self._direction * self._plant.velocity_rad_s > 0:
-            per_mille = 0
-        self._is_limited = per_mille != target_per_mille
-        if per_mille != self._per_mille:
-            self._per_mille = per_mille
-            torque_nm = per_mille * self._nm_per_mille
+        if (
+            self._is_too_fast
+            and torque_per_mille * self._direction * self._plant.velocity_rad_s > 0
+        ):
+            torque_per_mille = 0
+        self._is_limited = torque_per_mille != target_per_mille
+        if torque_per_mille != self._per_mille:
+            self._per_mille = torque_per_mille
+            torque_nm = torque_per_mille * self._nm_per_mille
             self._plant.command(torque_nm)
             self._log("torque", torque_nm=torque_nm, enabled=True)
 
     def _statusword(self) -> int:
         """Return the present statusword."""
-        state = self._state_machine.state
-        statusword = state.bits | (_REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS)
-        if state is PdsState.OPERATION_ENABLED:
+        pds_state = self._state_machine.state
+        statusword = pds_state.bits | (
+            _REMOTE_BIT if self._sto_dropped else _VOLTAGE_AND_REMOTE_BITS
+        )
+        if pds_state is PdsState.OPERATION_ENABLED:
             if self._follows_target:
                 statusword |= 0 if self.never_sets_bit_12 else _FOLLOWS_TARGET_BIT
             elif self._entries.controlword.value & _HALT_BIT and self._is_at_rest():
                 statusword |= _TARGET_REACHED_BIT
             if self._is_limited:
                 statusword |= _INTERNAL_LIMIT_BIT
-        elif state is PdsState.QUICK_STOP and self._is_at_rest():
+        elif pds_state is PdsState.QUICK_STOP and self._is_at_rest():
             statusword |= _TARGET_REACHED_BIT
-        if self._emergencies.active and state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
+        if self._emergencies.active and pds_state not in (PdsState.FAULT, PdsState.FAULT_REACTION):
             statusword |= _WARNING_BIT
         return statusword
 
@@ -684,24 +698,24 @@ class DriveNode:
 
     def _position(self) -> int:
         """Return the position in encoder counts as a 32-bit integer."""
-        steps = round(self._simulated_rig.read_angle() / self._resolution_rad)
-        counts = steps * self._direction + self.angle_offset_counts
-        return (counts + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
+        encoder_steps = round(self._simulated_rig.read_angle() / self._resolution_rad)
+        position_counts = encoder_steps * self._direction + self.angle_offset_counts
+        return (position_counts + 0x8000_0000) % 0x1_0000_0000 - 0x8000_0000
 
     def _measure_torque(self) -> None:
-        """Update the filtered torque that the drive reports as measured."""
+        """Update the torque that the drive reports as measured, by a first-order lag."""
         elapsed_s, self._measured_at_s = self._now_s - self._measured_at_s, self._now_s
-        fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
-        self._measured_per_mille += fraction * (self._per_mille - self._measured_per_mille)
+        lag_fraction = -math.expm1(-elapsed_s / self.torque_lag_s)
+        self._measured_per_mille += lag_fraction * (self._per_mille - self._measured_per_mille)
 
     def _actual_torque(self) -> int:
-        """Return the reported torque in 1/1000 of the rated torque."""
+        """Return the torque that the drive reports, in 1/1000 of the rated torque."""
         return round(self._measured_per_mille) if self.torque_lag_s else self._per_mille
 
     def _velocity(self) -> int:
         """Return the speed in encoder counts per second as a 32-bit integer."""
-        counts = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction
-        return max(-0x8000_0000, min(counts, 0x7FFF_FFFF))
+        counts_per_s = round(self._plant.velocity_rad_s / self._resolution_rad) * self._direction
+        return max(-0x8000_0000, min(counts_per_s, 0x7FFF_FFFF))
 
 
 def _pdo_parameters(
@@ -712,18 +726,18 @@ def _pdo_parameters(
     By default the first PDO carries one object of 16 bits, the others none. With a device file, the
     PDOs are those of the file. Only the first four have predefined identifiers.
     """
-    numbers: Iterable[int] = range(_DEFAULT_PDO_COUNT)
+    pdo_numbers: Iterable[int] = range(_DEFAULT_PDO_COUNT)
     if file is not None:
-        numbers = file.present_offsets(communication, communication + _LAST_PDO_OFFSET)
-    for number in numbers:
-        mapping = communication + 0x200 + number
-        slots = MAX_MAPPING_ENTRIES if file is None else file.sub_index_count(mapping)
-        default_cob_id = cob_id + 0x100 * number if number < _DEFAULT_PDO_COUNT else 0
-        default_mapping = () if number else (first_mapped_index << 16 | 16,)
+        pdo_numbers = file.present_offsets(communication, communication + _LAST_PDO_OFFSET)
+    for pdo_number in pdo_numbers:
+        mapping_index = communication + 0x200 + pdo_number
+        slot_count = MAX_MAPPING_ENTRIES if file is None else file.sub_index_count(mapping_index)
+        default_cob_id = cob_id + 0x100 * pdo_number if pdo_number < _DEFAULT_PDO_COUNT else 0
+        default_mapping = () if pdo_number else (first_mapped_index << 16 | 16,)
         yield (
-            communication + number,
-            mapping,
-            default_cob_id | (COB_ID_DISABLED if number else 0),
+            communication + pdo_number,
+            mapping_index,
+            default_cob_id | (COB_ID_DISABLED if pdo_number else 0),
             default_mapping,
-            slots,
+            slot_count,
         )

@@ -116,9 +116,9 @@ class PdsStateMachine:
     def control(self, controlword: int) -> None:
         """Process a controlword."""
         reset_bit = controlword & _FAULT_RESET_BIT
-        is_rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
+        is_reset_rising, self._reset_bit = reset_bit and not self._reset_bit, reset_bit
         if self.state is PdsState.FAULT:
-            if is_rising and self._may_reset():
+            if is_reset_rising and self._may_reset():
                 self._enter(PdsState.SWITCH_ON_DISABLED)
         elif not controlword & _ENABLE_VOLTAGE_BIT:
             self.disable_voltage()
@@ -142,7 +142,7 @@ class PdsStateMachine:
             self.disable_voltage()
 
     def fail(self) -> None:
-        """Change to the state fault, by the fault reaction."""
+        """Change to the state fault, by way of the state fault reaction active."""
         if self.state in (PdsState.FAULT, PdsState.FAULT_REACTION):
             return
         self._enter(PdsState.FAULT_REACTION)
@@ -163,7 +163,7 @@ class PdsStateMachine:
             self._enter(PdsState.SWITCH_ON_DISABLED)
 
     def _shut_down(self, reset_bit: int) -> None:
-        """Change to ready to switch on, if the present state allows that."""
+        """Process the command shutdown: change to ready to switch on if the state allows that."""
         if self.state is PdsState.SWITCH_ON_DISABLED:
             if not reset_bit and self._may_switch_on():
                 self._enter(PdsState.READY)
@@ -171,7 +171,10 @@ class PdsStateMachine:
             self._enter(PdsState.READY)
 
     def _switch_on(self, controlword: int, reset_bit: int) -> None:
-        """Switch on, enable operation or disable it; upwards only while bit 7 is 0."""
+        """Process the commands to switch on, and to enable or disable operation.
+
+        No transition to a higher state is made while bit 7 (fault reset) is set.
+        """
         enable_bit = controlword & _ENABLE_OPERATION_BIT
         if self.state is PdsState.OPERATION_ENABLED and not enable_bit:
             self._enter(PdsState.SWITCHED_ON)
@@ -190,11 +193,11 @@ class PdsStateMachine:
         ):
             self._enter(PdsState.OPERATION_ENABLED)
 
-    def _enter(self, state: PdsState) -> None:
+    def _enter(self, new_state: PdsState) -> None:
         """Change to a state of the power drive system, and report the change."""
-        previous_state, self.state = self.state, state
+        previous_state, self.state = self.state, new_state
         self._ramp_since_s = None
-        if previous_state is not state:
+        if previous_state is not new_state:
             self._on_state_change(previous_state)
 
 
@@ -276,14 +279,14 @@ def rated_torque_counts(motor: Motor, drive: ServoDrive) -> int:
         If the torque is less than one count, or has more than 32 bits.
     """
     unit_nm = drive.rated_torque_unit_nm or _TORQUE_UNIT_NM
-    counts = round(motor.rated_torque_nm / drive.gear_ratio / unit_nm)
-    if not 0 < counts < 1 << 32:
+    torque_counts = round(motor.rated_torque_nm / drive.gear_ratio / unit_nm)
+    if not 0 < torque_counts < 1 << 32:
         raise DeviceError(
             f"Simulated drive: a rated torque of {motor.rated_torque_nm:g} N·m behind a gear of "
             f"{drive.gear_ratio:g} does not fit into object 6076 in units of {unit_nm:g} N·m; "
             "check cia402.rated_torque_unit_nm."
         )
-    return counts
+    return torque_counts
 
 
 def peak_per_mille(motor: Motor) -> int:
@@ -300,20 +303,22 @@ def add_drive_objects(
 ) -> DriveObjects:
     """Add the drive's objects with their values at power-on; return those that the drive uses."""
 
-    def add(index: int, entry: Entry) -> Entry:
-        return objects.add(index, entry)
+    def add(object_index: int, entry: Entry) -> Entry:
+        return objects.add(object_index, entry)
 
     add(0x1000, Entry("I", _DEVICE_TYPE, "ro"))
     sync_cob_id = add(0x1005, Entry("I", 0x80, check=_check_sync_id))
     sync_period_us = add(0x1006, Entry("I"))
     add(0x1008, Entry("s", access="ro", text=_DEVICE_NAME))
     add(0x100A, Entry("s", access="ro", text=_SOFTWARE_VERSION))
-    identity = drive.vendor_id or _VENDOR_ID, drive.product_code or _PRODUCT_CODE
-    numbers = (*identity, _REVISION, _SERIAL_NUMBER)
-    objects.add_record(0x1018, {sub: Entry("I", n, "ro") for sub, n in enumerate(numbers, 1)})
+    vendor_and_product = drive.vendor_id or _VENDOR_ID, drive.product_code or _PRODUCT_CODE
+    identity_numbers = (*vendor_and_product, _REVISION, _SERIAL_NUMBER)
+    objects.add_record(
+        0x1018, {sub: Entry("I", n, "ro") for sub, n in enumerate(identity_numbers, 1)}
+    )
 
-    def check_overflow(value: int) -> None:
-        if value == 1 or value > 240:
+    def check_overflow(written_value: int) -> None:
+        if written_value == 1 or written_value > 240:
             raise Abort(AbortCode.VALUE)
         if sync_period_us.value:
             raise Abort(AbortCode.STATE)
@@ -328,22 +333,28 @@ def add_drive_objects(
     add(0x6076, Entry("I", rated_torque_counts(motor, drive), "ro"))
     supported_modes = add(_SUPPORTED_MODES_INDEX, Entry("I", _SUPPORTED_MODES, "ro"))
 
-    def check_mode(value: int) -> None:
-        if value != NO_MODE and not (value > 0 and supported_modes.value >> (value - 1) & 1):
+    def check_mode(written_value: int) -> None:
+        if written_value != NO_MODE and not (
+            written_value > 0 and supported_modes.value >> (written_value - 1) & 1
+        ):
             raise Abort(AbortCode.VALUE)
 
-    gear = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
-    increments = round(_ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio)
+    gear_ratio = Fraction(drive.gear_ratio).limit_denominator(_LARGEST_GEAR_REVOLUTIONS)
+    increments_per_turns = round(
+        _ENCODER_REVOLUTIONS * math.tau / resolution_rad / drive.gear_ratio
+    )
     ratios_by_index = {
-        0x608F: (increments, _ENCODER_REVOLUTIONS),
-        0x6091: (gear.numerator, gear.denominator),
+        0x608F: (increments_per_turns, _ENCODER_REVOLUTIONS),
+        0x6091: (gear_ratio.numerator, gear_ratio.denominator),
     }
-    for index, ratio in ratios_by_index.items():
-        objects.add_record(index, {sub: Entry("I", n, "ro") for sub, n in enumerate(ratio, 1)})
+    for object_index, object_ratio in ratios_by_index.items():
+        objects.add_record(
+            object_index, {sub: Entry("I", n, "ro") for sub, n in enumerate(object_ratio, 1)}
+        )
 
-    interpolation = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
-    interpolation[2] = Entry("b", -3, low=-6, high=0)
-    objects.add_record(0x60C2, interpolation)
+    interpolation_entries = {1: Entry("B", max(1, round(1e3 / rate_hz)), low=1)}
+    interpolation_entries[2] = Entry("b", -3, low=-6, high=0)
+    objects.add_record(0x60C2, interpolation_entries)
     return DriveObjects(
         sync_cob_id=sync_cob_id,
         sync_period_us=sync_period_us,
@@ -364,8 +375,8 @@ def add_drive_objects(
         actual_torque=add(0x6077, Entry("h", 0, "ro", "t")),
         max_speed_rpm=add(0x6080, Entry("I", _MAX_SPEED_RPM)),
         torque_offset=add(0x60B2, Entry("h", 0, mapping="rt")),
-        interpolation_value=interpolation[1],
-        interpolation_exponent=interpolation[2],
+        interpolation_value=interpolation_entries[1],
+        interpolation_exponent=interpolation_entries[2],
         positive_limit=add(0x60E0, Entry("H", peak_torque_per_mille, mapping="rt")),
         negative_limit=add(0x60E1, Entry("H", peak_torque_per_mille, mapping="rt")),
     )
@@ -386,9 +397,10 @@ def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
     rated_counts = objects[0x6076, 0].value
     unchanged_indices = set(_COMMISSIONED_INDICES)
     unchanged_indices |= {
-        index
-        for index in (*_LIMIT_INDICES, _SUPPORTED_MODES_INDEX)
-        if (description := file.entries.get((index, 0))) is not None and not description.default
+        object_index
+        for object_index in (*_LIMIT_INDICES, _SUPPORTED_MODES_INDEX)
+        if (object_description := file.entries.get((object_index, 0))) is not None
+        and not object_description.default
     }
     if not any(
         file.entries[key].default for key in file.entries if key[0] == _IDENTITY_INDEX and key[1]
@@ -407,14 +419,14 @@ def adopt_device_file(objects: ObjectDictionary, file: "DeviceFile") -> None:
         )
 
 
-def _check_sync_id(value: int) -> None:
+def _check_sync_id(sync_id: int) -> None:
     """Raise `Abort` if an identifier cannot be used for SYNC."""
     # Bit 30 would make the drive the producer of SYNC, bit 29 would mean an identifier of 29 bits.
-    if value > 0x7FF or not is_free_id(value):
+    if sync_id > 0x7FF or not is_free_id(sync_id):
         raise Abort(AbortCode.VALUE)
 
 
-def _check_quick_stop(value: int) -> None:
+def _check_quick_stop(stop_option: int) -> None:
     """Raise `Abort` if a quick stop option is not supported."""
-    if value not in _QUICK_STOP_OPTIONS:
+    if stop_option not in _QUICK_STOP_OPTIONS:
         raise Abort(AbortCode.VALUE)

@@ -56,10 +56,10 @@ def _integer_key(low: int, high: int, **key_options: Any) -> _FaultKey:  # noqa:
     """Return a key whose value is an integer from `low` to `high`."""
 
     def read(text: str) -> int:
-        number = int(text, 0)
-        if not low <= number <= high:
+        parsed_number = int(text, 0)
+        if not low <= parsed_number <= high:
             raise ValueError(text)
-        return number
+        return parsed_number
 
     return _FaultKey(read, f"a whole number from {low} to {high}", **key_options)
 
@@ -68,10 +68,10 @@ def _positive_number_key(**key_options: Any) -> _FaultKey:  # noqa: ANN401 - pas
     """Return a key whose value is a number above 0."""
 
     def read(text: str) -> float:
-        number = float(text)
-        if not 0 < number <= _LARGEST_TIME_S:
+        parsed_number = float(text)
+        if not 0 < parsed_number <= _LARGEST_TIME_S:
             raise ValueError(text)
-        return number
+        return parsed_number
 
     return _FaultKey(read, f"a number above 0, up to {_LARGEST_TIME_S:g}", **key_options)
 
@@ -183,7 +183,9 @@ class Fault:
     def __str__(self) -> str:
         """Return the text form of the fault, which `parse_fault` reads back."""
         assignments = [self.kind]
-        assignments += [f"{key}={_format_value(key, value)}" for key, value in self.values.items()]
+        assignments += [
+            f"{key}={_format_value(key, key_value)}" for key, key_value in self.values.items()
+        ]
         return ",".join(assignments) + ("" if self.after_s is None else f"@{self.after_s!r}")
 
 
@@ -201,35 +203,41 @@ def parse_fault(spec: str) -> Fault:
     >>> parse_fault("drop,from=drive,frames=3@10").kind
     'drop'
     """
-    fault_text, at, time = spec.partition("@")
-    kind, *assignments = (assignment.strip() for assignment in fault_text.split(","))
-    if kind not in KINDS:
-        raise FaultError(_error_message(spec, f"unknown fault '{kind}'; choose {', '.join(KINDS)}"))
-    keys = KINDS[kind]
-    values: dict[str, Value] = {}
+    fault_text, at, time_text = spec.partition("@")
+    fault_kind, *assignments = (assignment.strip() for assignment in fault_text.split(","))
+    if fault_kind not in KINDS:
+        raise FaultError(
+            _error_message(spec, f"unknown fault '{fault_kind}'; choose {', '.join(KINDS)}")
+        )
+    allowed_keys = KINDS[fault_kind]
+    fault_values: dict[str, Value] = {}
     for assignment in assignments:
-        key, _, text = assignment.partition("=")
-        if key not in keys:
+        key, _, value_text = assignment.partition("=")
+        if key not in allowed_keys:
             raise FaultError(
-                _error_message(spec, f"{kind} has no '{key}'; choose {', '.join(keys)}")
+                _error_message(
+                    spec, f"{fault_kind} has no '{key}'; choose {', '.join(allowed_keys)}"
+                )
             )
-        if key in values:
+        if key in fault_values:
             raise FaultError(_error_message(spec, f"'{key}' is given twice"))
         try:
-            values[key] = keys[key].read(text)
+            fault_values[key] = allowed_keys[key].read(value_text)
         except ValueError:
             raise FaultError(
-                _error_message(spec, f"{key}={text}: give {keys[key].allowed_text}")
+                _error_message(spec, f"{key}={value_text}: give {allowed_keys[key].allowed_text}")
             ) from None
-    if "bytes" in values and "frames" in values:
+    if "bytes" in fault_values and "frames" in fault_values:
         raise FaultError(_error_message(spec, "give frames or bytes, not both"))
-    for name, fault_key in keys.items():
-        if fault_key.is_required and name not in values:
-            raise FaultError(_error_message(spec, f"{kind} needs {name}: {fault_key.allowed_text}"))
-        if fault_key.default is not None and not (name == "frames" and "bytes" in values):
-            values.setdefault(name, fault_key.default)
-    fault = Fault(kind, values, _parse_start_time(spec, time) if at else None)
-    if kind in DISTURBANCE_KINDS:
+    for key_name, fault_key in allowed_keys.items():
+        if fault_key.is_required and key_name not in fault_values:
+            raise FaultError(
+                _error_message(spec, f"{fault_kind} needs {key_name}: {fault_key.allowed_text}")
+            )
+        if fault_key.default is not None and not (key_name == "frames" and "bytes" in fault_values):
+            fault_values.setdefault(key_name, fault_key.default)
+    fault = Fault(fault_kind, fault_values, _parse_start_time(spec, time_text) if at else None)
+    if fault_kind in DISTURBANCE_KINDS:
         try:
             disturbance_of(fault, 0.0)
         except ObstacleError as error:
@@ -249,7 +257,7 @@ def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
     now_s
         Time in seconds since the drive was first enabled.
     """
-    assignments = [f"{key}={value}" for key, value in fault.values.items() if key != "for"]
+    assignments = [f"{key}={key_value}" for key, key_value in fault.values.items() if key != "for"]
     if fault.kind == "knock":
         assignments.append(f"at={now_s!r}")
     else:
@@ -262,16 +270,16 @@ def disturbance_of(fault: Fault, now_s: float) -> Disturbance:
 def _parse_start_time(spec: str, text: str) -> float:
     """Parse the time after ``@`` in a fault, in seconds."""
     try:
-        seconds = float(text)
+        start_s = float(text)
     except ValueError:
-        seconds = -1.0
-    if not 0 <= seconds <= _LARGEST_TIME_S:
+        start_s = -1.0
+    if not 0 <= start_s <= _LARGEST_TIME_S:
         raise FaultError(
             _error_message(
                 spec, f"'@{text}': give the seconds after enabling, 0 to {_LARGEST_TIME_S:g}"
             )
         )
-    return seconds
+    return start_s
 
 
 def _format_value(key: str, value: Value) -> str:
@@ -279,9 +287,9 @@ def _format_value(key: str, value: Value) -> str:
     return f"{value:#x}" if key in ("id", "code", "bits") else f"{value}"
 
 
-def _error_message(spec: str, what: str) -> str:
-    """Return the message for a wrong text of a fault."""
-    return f"Fault '{spec}': {what}."
+def _error_message(spec: str, reason: str) -> str:
+    """Return the message for a wrong text of a fault: the text and what is wrong."""
+    return f"Fault '{spec}': {reason}."
 
 
 # Faults on a line
@@ -291,13 +299,13 @@ class _ActiveFault:
     """Active fault on a line, with the number of frames or bytes on which it still acts."""
 
     def __init__(self, fault: Fault) -> None:
-        values = fault.values
+        fault_values = fault.values
         self.kind = fault.kind
-        self.can_id = values.get("id")
-        self.in_bytes = "bytes" in values
-        self.remaining = int(values["bytes"] if self.in_bytes else values["frames"])
-        self.delay_s = float(values.get("ms", 0)) * 1e-3
-        self.byte = int(values.get("byte", 0))
+        self.can_id = fault_values.get("id")
+        self.in_bytes = "bytes" in fault_values
+        self.remaining = int(fault_values["bytes"] if self.in_bytes else fault_values["frames"])
+        self.delay_s = float(fault_values.get("ms", 0)) * 1e-3
+        self.byte = int(fault_values.get("byte", 0))
 
     def matches(self, can_id: int, data: bytes) -> bool:
         """Return whether the fault acts on a frame with this identifier and data."""
@@ -344,11 +352,11 @@ class FaultyLine:
         """Let a fault act on this line from now on."""
         self._active_faults.append(_ActiveFault(fault))
 
-    def end(self, kind: str | None) -> list[str]:
-        """End the line's faults of a kind, or all; return the kinds of the ended faults."""
-        ended = [fault for fault in self._active_faults if kind in (None, fault.kind)]
-        self._active_faults = [fault for fault in self._active_faults if fault not in ended]
-        return [fault.kind for fault in ended]
+    def end(self, fault_kind: str | None) -> list[str]:
+        """End the line's faults of a kind (None: of all kinds); return the ended faults' kinds."""
+        ended_faults = [fault for fault in self._active_faults if fault_kind in (None, fault.kind)]
+        self._active_faults = [fault for fault in self._active_faults if fault not in ended_faults]
+        return [fault.kind for fault in ended_faults]
 
     def send(self, can_id: int, data: bytes, origin: object = None) -> None:
         """Send a frame, or a record of a serial line, over this line."""
@@ -356,25 +364,34 @@ class FaultyLine:
             self._deliver(can_id, data, origin)
             return
         held_frames, self._held_frames = self._held_frames, []
-        fault = next((fault for fault in self._active_faults if fault.matches(can_id, data)), None)
-        if held_frames and fault is not None and fault.kind == "reorder":
-            fault = None  # this is the frame for which the held frame waits
-        if fault is None:
+        acting_fault = next(
+            (
+                acting_fault
+                for acting_fault in self._active_faults
+                if acting_fault.matches(can_id, data)
+            ),
+            None,
+        )
+        if held_frames and acting_fault is not None and acting_fault.kind == "reorder":
+            acting_fault = None  # this is the frame for which the held frame waits
+        if acting_fault is None:
             self._deliver(can_id, data, origin)
         else:
-            self._disturb(fault, can_id, data, origin)
+            self._disturb(acting_fault, can_id, data, origin)
         # A held frame follows the next frame, whatever happens to that frame.
-        for held in held_frames:
-            self._deliver(*held)
+        for held_frame in held_frames:
+            self._deliver(*held_frame)
 
     def _disturb(self, fault: _ActiveFault, can_id: int, data: bytes, origin: object) -> None:
         """Apply a fault to a frame: drop, delay, corrupt or hold it, and log it."""
-        bytes_hit = min(fault.remaining, len(data)) if fault.in_bytes else 1
-        fault.remaining -= bytes_hit
+        affected_bytes = min(fault.remaining, len(data)) if fault.in_bytes else 1
+        fault.remaining -= affected_bytes
         if fault.remaining == 0:
             self._active_faults.remove(fault)
-        identifier = {} if can_id == SERIAL else {"can_id": can_id}
-        self._log("simulator", fault.kind, sender=self._sender, data=data.hex(), **identifier)
+        logged_identifier = {} if can_id == SERIAL else {"can_id": can_id}
+        self._log(
+            "simulator", fault.kind, sender=self._sender, data=data.hex(), **logged_identifier
+        )
         if fault.kind == "delay":
             self._postpone(fault.delay_s, lambda: self._deliver(can_id, data, origin))
         elif fault.kind == "corrupt":
@@ -383,8 +400,8 @@ class FaultyLine:
             self._deliver(can_id, data, origin)
         elif fault.kind == "reorder":
             self._held_frames.append((can_id, data, origin))
-        elif fault.in_bytes and bytes_hit < len(data):
-            self._deliver(can_id, data[bytes_hit:], origin)
+        elif fault.in_bytes and affected_bytes < len(data):
+            self._deliver(can_id, data[affected_bytes:], origin)
 
 
 # Log of events
@@ -428,19 +445,19 @@ class EventLog:
     def __call__(self, device: str, what: str, **values: object) -> None:
         """Log an event of a device, with values by name."""
         if self._file is not None:
-            entry = {"t_s": round(self.time_s, 9), "device": device, "what": what, **values}
-            self._run_on_file(lambda file: file.write(json.dumps(entry) + "\n"))
+            log_entry = {"t_s": round(self.time_s, 9), "device": device, "what": what, **values}
+            self._run_on_file(lambda file: file.write(json.dumps(log_entry) + "\n"))
         if what not in _UNSHOWN_EVENTS:
             # States and faults must be in the file even if the process is killed.
             self._write_out()
-            details = "  ".join(f"{key} {value}" for key, value in values.items())
-            self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {details}".rstrip())
+            detail_text = "  ".join(f"{key} {event_value}" for key, event_value in values.items())
+            self.print_line(f"{self.time_s:10.3f} s  {device}: {what}  {detail_text}".rstrip())
 
-    def print_line(self, line: str) -> None:
+    def print_line(self, text_line: str) -> None:
         """Print a line for the operator, unless quiet; ignore a closed terminal."""
         if not self._quiet:
             with suppress(OSError, ValueError):
-                sys.stdout.write(f"{line}\n")
+                sys.stdout.write(f"{text_line}\n")
                 sys.stdout.flush()
 
     def flush(self) -> None:
@@ -450,10 +467,10 @@ class EventLog:
 
     def close(self) -> None:
         """Write the remaining events and close the log file."""
-        file, self._file = self._file, None
-        if file is not None:
+        log_file, self._file = self._file, None
+        if log_file is not None:
             with suppress(OSError):
-                file.close()
+                log_file.close()
 
     def discard(self) -> None:
         """Close and remove the log file, since nothing was simulated; a pipe or device remains."""
@@ -466,12 +483,12 @@ class EventLog:
         self._flushed_s = time.monotonic()
         self._run_on_file(lambda file: file.flush())
 
-    def _run_on_file(self, action: Callable[[TextIO], object]) -> None:
+    def _run_on_file(self, file_action: Callable[[TextIO], object]) -> None:
         """Run an action on the file; if the disk is full, close the log and continue."""
         if self._file is None:
             return
         try:
-            action(self._file)
+            file_action(self._file)
         except OSError as error:
             self.close()
             self.print_line(f"The log cannot be written any more ({error.strerror}).")

@@ -36,10 +36,10 @@ def without_transport_delay(rig: RigParameters) -> RigParameters:
     if rig.acquisition is None or rig.acquisition.mode == "same_tick":
         return rig
     period_s = 1 / rig.rate_hz
-    for name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):
+    for section_name, delay_s in (("encoder", rig.encoder.delay_s), ("sensor", rig.sensor.delay_s)):
         if delay_s < period_s * (1 - 1e-9):
             raise DeviceError(
-                f"The profile {rig.name} has {name}.delay_s = {delay_s:g} s, but with "
+                f"The profile {rig.name} has {section_name}.delay_s = {delay_s:g} s, but with "
                 f"acquisition.mode previous_tick values are at least one period old "
                 f"({period_s:g} s); correct one of the two."
             )
@@ -134,9 +134,9 @@ class VirtualBus:
 
     def send(self, frame: bytes, origin: object = None) -> None:
         """Send a frame to all clients except the one that sent it."""
-        for client in self._clients:
-            if client is not origin:
-                self._send(client, frame)
+        for other_client in self._clients:
+            if other_client is not origin:
+                self._send(other_client, frame)
 
     def close(self) -> None:
         """Close the socket and every connection; no client can connect any more."""
@@ -144,41 +144,41 @@ class VirtualBus:
             del self._handlers[self._listener.fileno()]
             self._listener.close()
             self._path.unlink(missing_ok=True)
-        for client in list(self._clients):
-            self._drop(client)
+        for open_client in list(self._clients):
+            self._drop(open_client)
 
     def _accept(self) -> None:
         """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
-            link, _ = self._listener.accept()
-            link.setblocking(False)
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_SIZE)
+            client_socket, _ = self._listener.accept()
+            client_socket.setblocking(False)
+            client_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, _SEND_BUFFER_SIZE)
             self._count += 1
-            client = _LinkConnection(link, self._count)
-            self._clients.append(client)
-            self._handlers[link.fileno()] = lambda: self._receive(client)
-            self._on_clients(f"client {client.number} connected", len(self._clients))
+            new_client = _LinkConnection(client_socket, self._count)
+            self._clients.append(new_client)
+            self._handlers[client_socket.fileno()] = lambda: self._receive(new_client)
+            self._on_clients(f"client {new_client.number} connected", len(self._clients))
 
     def _receive(self, client: _LinkConnection) -> None:
         """Receive frames of a client, and pass them on; drop a client that has closed."""
         try:
-            received = client.link.recv(_READ_SIZE)
+            received_bytes = client.link.recv(_READ_SIZE)
         except BlockingIOError:
             return
         except OSError:
-            received = b""
-        if not received:
+            received_bytes = b""
+        if not received_bytes:
             self._drop(client)
             return
-        data = client.received + received if client.received else received
-        complete_size = len(data) - len(data) % FRAME_SIZE
-        client.received = data[complete_size:]
+        pending_bytes = client.received + received_bytes if client.received else received_bytes
+        complete_size = len(pending_bytes) - len(pending_bytes) % FRAME_SIZE
+        client.received = pending_bytes[complete_size:]
         self._on_frames(
-            [data[i : i + FRAME_SIZE] for i in range(0, complete_size, FRAME_SIZE)], client
+            [pending_bytes[i : i + FRAME_SIZE] for i in range(0, complete_size, FRAME_SIZE)], client
         )
 
     def _send(self, client: _LinkConnection, frame: bytes) -> None:
-        """Send a frame to a client, after the unsent rest of the previous; count lost frames."""
+        """Send a frame to a client, after unsent bytes of the previous frame; count lost frames."""
         # The rest of a frame has to be sent before the next one, or all later frames are
         # misaligned.
         if client.unsent:
@@ -186,11 +186,11 @@ class VirtualBus:
             if client.unsent:
                 self.lost += 1
                 return
-        sent = _send_without_blocking(client.link, frame)
-        if sent == 0:
+        sent_bytes = _send_without_blocking(client.link, frame)
+        if sent_bytes == 0:
             self.lost += 1
-        elif sent < len(frame):
-            client.unsent = frame[sent:]
+        elif sent_bytes < len(frame):
+            client.unsent = frame[sent_bytes:]
 
     def _drop(self, client: _LinkConnection) -> None:
         """Close the connection of a client."""
@@ -232,28 +232,32 @@ class VirtualCan:
 
     def _bound_socket(self) -> socket.socket:
         """Return a new CAN socket bound to the interface, or raise."""
-        channel = self._channel
+        interface_name = self._channel
         try:
-            link = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
+            can_socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
         except (AttributeError, OSError):
-            raise DeviceError(f"CAN bus {channel}: this system has no CAN sockets.") from None
-        try:
-            link.bind((channel,))
-        except OSError as error:
-            link.close()
             raise DeviceError(
-                f"CAN bus {channel}: it cannot be opened ({error.strerror}); bring it up with: "
-                f"ip link set {channel} up"
+                f"CAN bus {interface_name}: this system has no CAN sockets."
             ) from None
-        return link
+        try:
+            can_socket.bind((interface_name,))
+        except OSError as error:
+            can_socket.close()
+            raise DeviceError(
+                f"CAN bus {interface_name}: it cannot be opened ({error.strerror}); bring it up "
+                f"with: ip link set {interface_name} up"
+            ) from None
+        return can_socket
 
-    def _use_socket(self, link: socket.socket, handlers: Handlers, on_frames: OnFrames) -> None:
+    def _use_socket(
+        self, can_socket: socket.socket, handlers: Handlers, on_frames: OnFrames
+    ) -> None:
         """Use a socket, and register its handler in the event loop."""
-        link.setblocking(False)
-        self._link = link
+        can_socket.setblocking(False)
+        self._link = can_socket
         self._handlers = handlers
         self._on_frames = on_frames
-        handlers[link.fileno()] = self._receive
+        handlers[can_socket.fileno()] = self._receive
 
     def send(self, frame: bytes, origin: object = None) -> None:
         """Send a frame of a node; frames of other senders (`origin`) are on the bus already."""
@@ -271,12 +275,12 @@ class VirtualCan:
 
     def _receive(self) -> None:
         """Receive frames from the kernel's CAN interface, and pass them to the simulation."""
-        frames: list[bytes] = []
+        received_frames: list[bytes] = []
         with suppress(OSError):
-            while len(frames) < _MOST_FRAMES_PER_READ:
-                frames.append(self._link.recv(FRAME_SIZE))
-        if frames:
-            self._on_frames(frames, self)
+            while len(received_frames) < _MOST_FRAMES_PER_READ:
+                received_frames.append(self._link.recv(FRAME_SIZE))
+        if received_frames:
+            self._on_frames(received_frames, self)
 
 
 def listen(path: Path) -> socket.socket:
@@ -287,22 +291,22 @@ def listen(path: Path) -> socket.socket:
     DeviceError
         If the socket cannot be created.
     """
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+    listening_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
     try:
         path.unlink(missing_ok=True)
-        listener.bind(os.fspath(path))
-        listener.listen()
+        listening_socket.bind(os.fspath(path))
+        listening_socket.listen()
     except OSError as error:
-        listener.close()
+        listening_socket.close()
         raise DeviceError(
             f"The simulated rig cannot make its socket {path} ({error.strerror or error}); set "
             "XDG_RUNTIME_DIR to a folder with a short name that is yours."
         ) from None
-    listener.setblocking(False)
-    return listener
+    listening_socket.setblocking(False)
+    return listening_socket
 
 
-def is_virtual(channel: str) -> bool:
+def is_virtual(interface_name: str) -> bool:
     """Return whether a network interface is a CAN bus without hardware.
 
     Raises
@@ -310,15 +314,15 @@ def is_virtual(channel: str) -> bool:
     DeviceError
         If the interface exists, but is not a virtual CAN bus.
     """
-    if not Path(f"/sys/class/net/{channel}").exists():
+    if not Path(f"/sys/class/net/{interface_name}").exists():
         return False
-    kind = interface_kind(channel)
-    if kind in _VIRTUAL_KINDS:
+    kernel_kind = interface_kind(interface_name)
+    if kernel_kind in _VIRTUAL_KINDS:
         return True
     raise DeviceError(
-        f"CAN bus {channel}: this is not a virtual bus here, and a simulated drive must not answer "
-        "together with real ones; simulate with a copy of the profile that has another name and "
-        "another can.channel."
+        f"CAN bus {interface_name}: this is not a virtual bus here, and a simulated drive must not "
+        "answer together with real ones; simulate with a copy of the profile that has another "
+        "name and another can.channel."
     )
 
 
@@ -329,39 +333,44 @@ def interface_kind(name: str) -> str:
     ``IFLA_INFO_KIND`` is used.
     """
     try:
-        index = socket.if_nametoindex(name)
-        with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as kernel:
-            body = _LINK_HEADER.pack(socket.AF_UNSPEC, 0, index, 0, 0)
-            header = struct.pack("=IHHII", 16 + len(body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0)
-            kernel.send(header + body)
-            reply = kernel.recv(_READ_SIZE)
+        interface_index = socket.if_nametoindex(name)
+        with socket.socket(socket.AF_NETLINK, socket.SOCK_RAW, 0) as netlink_socket:
+            request_body = _LINK_HEADER.pack(socket.AF_UNSPEC, 0, interface_index, 0, 0)
+            request_header = struct.pack(
+                "=IHHII", 16 + len(request_body), _RTM_GETLINK, _NLM_F_REQUEST, 1, 0
+            )
+            netlink_socket.send(request_header + request_body)
+            kernel_reply = netlink_socket.recv(_READ_SIZE)
     except OSError:
         return ""
-    return kind_in_reply(reply)
+    return kind_in_reply(kernel_reply)
 
 
 def kind_in_reply(reply: bytes) -> str:
     """Return the kind of interface in a netlink message RTM_NEWLINK, or an empty text."""
     if len(reply) < 32 or struct.unpack_from("=H", reply, 4)[0] != _RTM_NEWLINK:
         return ""
-    length = struct.unpack_from("=I", reply)[0]
-    for link_type, link_value in _attributes(reply[16 + _LINK_HEADER.size : length]):
+    message_length = struct.unpack_from("=I", reply)[0]
+    for link_type, link_value in _attributes(reply[16 + _LINK_HEADER.size : message_length]):
         if link_type == _IFLA_LINKINFO:
-            for info_type, value in _attributes(link_value):
+            for info_type, info_value in _attributes(link_value):
                 if info_type == _IFLA_INFO_KIND:
-                    return value.rstrip(b"\0").decode()
+                    return info_value.rstrip(b"\0").decode()
     return ""
 
 
 def _attributes(data: bytes) -> Iterable[tuple[int, bytes]]:
     """Yield type and value of the netlink attributes in a message."""
-    at = 0
-    while at + 4 <= len(data):
-        length, kind = struct.unpack_from("=HH", data, at)
-        if length < 4:
+    byte_offset = 0
+    while byte_offset + 4 <= len(data):
+        attribute_length, attribute_type = struct.unpack_from("=HH", data, byte_offset)
+        if attribute_length < 4:
             return
-        yield kind & _ATTRIBUTE_MASK, data[at + 4 : at + length]
-        at += (length + 3) & ~3
+        yield (
+            attribute_type & _ATTRIBUTE_MASK,
+            data[byte_offset + 4 : byte_offset + attribute_length],
+        )
+        byte_offset += (attribute_length + 3) & ~3
 
 
 def _send_without_blocking(link: socket.socket, data: bytes) -> int:
@@ -424,11 +433,11 @@ class PtyLine:
 
     def write(self, data: bytes) -> None:
         """Send bytes; bytes that the host does not accept are lost."""
-        sent = 0
+        sent_bytes = 0
         if self._is_open:
             with suppress(OSError):
-                sent = os.write(self._simulator_end, data)
-            self.lost += len(data) - sent
+                sent_bytes = os.write(self._simulator_end, data)
+            self.lost += len(data) - sent_bytes
 
     def poll(self) -> None:
         """Check whether the host has opened or closed the port."""
@@ -445,9 +454,9 @@ class PtyLine:
 
     def _receive(self) -> None:
         """Read bytes of the host, and register whether the host has the port open."""
-        data = b""
+        received_bytes = b""
         try:
-            data = os.read(self._simulator_end, _LINE_READ_SIZE)
+            received_bytes = os.read(self._simulator_end, _LINE_READ_SIZE)
             is_open = True
         except BlockingIOError:
             is_open = True
@@ -460,5 +469,5 @@ class PtyLine:
         if is_open != self._is_open:
             self._is_open = is_open
             self._on_open(is_open)
-        if data:
-            self._on_bytes(data)
+        if received_bytes:
+            self._on_bytes(received_bytes)

@@ -142,7 +142,9 @@ class Entry:
         self._set_range(self.low, self.high)
 
     def adopt_description(self, description: Description, default: int | None) -> None:
-        """Adopt type, access, mapping and limits from a device's file; the function remains.
+        """Adopt type, access, mapping and limits from a device's file.
+
+        The functions that read, check and react to the value remain.
 
         Parameters
         ----------
@@ -161,26 +163,30 @@ class Entry:
             description.mapping,
         )
         # The capabilities of the simulated drive limit the range, too.
-        low = max((x for x in (self.low, description.low) if x is not None), default=None)
-        high = min((x for x in (self.high, description.high) if x is not None), default=None)
-        self._set_range(low, high)
+        lower_limit = max((x for x in (self.low, description.low) if x is not None), default=None)
+        upper_limit = min((x for x in (self.high, description.high) if x is not None), default=None)
+        self._set_range(lower_limit, upper_limit)
         if default is not None:
             self.default = default
-        lowest, largest = _type_range(self.kind)
-        self.value = self.default = min(max(self.default, lowest), largest)
+        type_minimum, type_maximum = _type_range(self.kind)
+        self.value = self.default = min(max(self.default, type_minimum), type_maximum)
 
     def _set_range(self, low: int | None, high: int | None) -> None:
         """Set the length in bits, and the range of values, by default that of the type."""
         self.bits = 0 if self.kind == "s" else 8 * _INTEGER_LAYOUTS[self.kind].size
-        lowest, largest = _type_range(self.kind)
-        self._low = lowest if low is None else low
-        self._high = largest if high is None else high
+        type_minimum, type_maximum = _type_range(self.kind)
+        self._low = type_minimum if low is None else low
+        self._high = type_maximum if high is None else high
 
-    def accepts_length(self, size: int) -> bool:
-        """Return whether a value of `size` bytes can be written to the entry."""
+    def accepts_length(self, byte_count: int) -> bool:
+        """Return whether a value of `byte_count` bytes can be written to the entry."""
         if self.kind != "s":
-            return 8 * size == self.bits
-        return size == len(self.text) if self.has_fixed_length else size <= _MOST_TEXT_BYTES
+            return 8 * byte_count == self.bits
+        return (
+            byte_count == len(self.text)
+            if self.has_fixed_length
+            else byte_count <= _MOST_TEXT_BYTES
+        )
 
     @property
     def most_bytes(self) -> int:
@@ -193,7 +199,7 @@ class Entry:
         """Return the present value of an integer entry."""
         return self.value if self.read_value is None else self.read_value()
 
-    def store_integer(self, value: int) -> None:
+    def store_integer(self, received_integer: int) -> None:
         """Store a received integer; the caller then has to call `after_write`.
 
         Raises
@@ -201,11 +207,11 @@ class Entry:
         Abort
             If the value is outside the range, or not allowed now.
         """
-        if not self._low <= value <= self._high:
+        if not self._low <= received_integer <= self._high:
             raise Abort(AbortCode.VALUE)
         if self.check is not None:
-            self.check(value)
-        self.value = value
+            self.check(received_integer)
+        self.value = received_integer
 
     def reset(self) -> None:
         """Restore the entry's value at power-on."""
@@ -229,17 +235,17 @@ class Entry:
         if self.kind == "s":
             self.text = data
             return data.hex()
-        number: int = _INTEGER_LAYOUTS[self.kind].unpack(data)[0]
-        self.store_integer(number)
-        return number
+        stored_integer: int = _INTEGER_LAYOUTS[self.kind].unpack(data)[0]
+        self.store_integer(stored_integer)
+        return stored_integer
 
 
-def _type_range(kind: str) -> tuple[int, int]:
+def _type_range(type_letter: str) -> tuple[int, int]:
     """Return the smallest and the largest value of a type."""
-    bits = 0 if kind == "s" else 8 * _INTEGER_LAYOUTS[kind].size
-    if kind == "s" or kind.isupper():
-        return 0, (1 << bits) - 1
-    return -(1 << (bits - 1)), (1 << (bits - 1)) - 1
+    length_bit = 0 if type_letter == "s" else 8 * _INTEGER_LAYOUTS[type_letter].size
+    if type_letter == "s" or type_letter.isupper():
+        return 0, (1 << length_bit) - 1
+    return -(1 << (length_bit - 1)), (1 << (length_bit - 1)) - 1
 
 
 def _clamped_value(read_value: Callable[[], int], lowest: int, largest: int) -> int:
@@ -266,8 +272,8 @@ class ObjectDictionary:
     def add_record(self, index: int, entries: dict[int, Entry]) -> None:
         """Add entries from sub-index 1 on, and the highest sub-index as sub-index 0."""
         self.add(index, Entry("B", max(entries), access="ro"))
-        for sub, entry in entries.items():
-            self.add(index, entry, sub)
+        for sub, sub_entry in entries.items():
+            self.add(index, sub_entry, sub)
 
     def adopt_file_entries(
         self, file: Mapping[tuple[int, int], Description], unchanged_indices: Container[int]
@@ -286,15 +292,16 @@ class ObjectDictionary:
         """
         previous_entries, self._entries = self._entries, {}
         self._indices.clear()
-        for (index, sub), description in file.items():
-            entry = previous_entries.get((index, sub))
-            if entry is None or "s" in (entry.kind, description.kind):
-                entry = description.entry()
+        for (index, sub), entry_description in file.items():
+            adopted_entry = previous_entries.get((index, sub))
+            if adopted_entry is None or "s" in (adopted_entry.kind, entry_description.kind):
+                adopted_entry = entry_description.entry()
             else:
-                entry.adopt_description(
-                    description, None if index in unchanged_indices else description.default
+                adopted_entry.adopt_description(
+                    entry_description,
+                    None if index in unchanged_indices else entry_description.default,
                 )
-            self.add(index, entry, sub)
+            self.add(index, adopted_entry, sub)
 
     def override_entry(self, index: int, sub: int, value: int | None) -> None:
         """Set the value of an entry, also at power-on; None removes the entry.
@@ -304,10 +311,10 @@ class ObjectDictionary:
         if value is None:
             self._entries.pop((index, sub), None)
             return
-        entry = self._entries.get((index, sub))
-        if entry is None:
-            entry = self.add(index, Entry("I"), sub)
-        entry.value = entry.default = value
+        overridden_entry = self._entries.get((index, sub))
+        if overridden_entry is None:
+            overridden_entry = self.add(index, Entry("I"), sub)
+        overridden_entry.value = overridden_entry.default = value
 
     def find(self, index: int, sub: int) -> Entry:
         """Return the entry of the dictionary at an index and sub-index.
@@ -317,9 +324,9 @@ class ObjectDictionary:
         Abort
             If there is no such entry.
         """
-        entry = self._entries.get((index, sub))
-        if entry is not None:
-            return entry
+        found_entry = self._entries.get((index, sub))
+        if found_entry is not None:
+            return found_entry
         raise Abort(AbortCode.NO_SUB_INDEX if index in self._indices else AbortCode.NO_OBJECT)
 
     def read(self, index: int, sub: int) -> bytes:
@@ -330,10 +337,10 @@ class ObjectDictionary:
         Abort
             If the entry does not exist or is write-only.
         """
-        entry = self.find(index, sub)
-        if entry.access == "wo":
+        read_entry = self.find(index, sub)
+        if read_entry.access == "wo":
             raise Abort(AbortCode.WRITE_ONLY)
-        return entry.encode()
+        return read_entry.encode()
 
     def find_writable(self, index: int, sub: int) -> Entry:
         """Return the entry that an SDO client is about to write.
@@ -343,10 +350,10 @@ class ObjectDictionary:
         Abort
             If the entry does not exist or is read-only.
         """
-        entry = self.find(index, sub)
-        if entry.access == "ro":
+        writable_entry = self.find(index, sub)
+        if writable_entry.access == "ro":
             raise Abort(AbortCode.READ_ONLY)
-        return entry
+        return writable_entry
 
     def write(self, index: int, sub: int, data: bytes) -> int | str:
         """Write the bytes of an SDO client, and return them as an integer or in hexadecimal.
@@ -356,17 +363,17 @@ class ObjectDictionary:
         Abort
             If the entry cannot be written, or the value is not allowed.
         """
-        entry = self.find_writable(index, sub)
-        value = entry.store_bytes(data)
-        if entry.after_write is not None:
-            entry.after_write()
-        return value
+        written_entry = self.find_writable(index, sub)
+        written_value = written_entry.store_bytes(data)
+        if written_entry.after_write is not None:
+            written_entry.after_write()
+        return written_value
 
-    def reset(self, last: int) -> None:
-        """Restore the values at power-on of all entries up to and including an index."""
-        for (index, _), entry in self._entries.items():
-            if index <= last:
-                entry.reset()
+    def reset(self, last_index: int) -> None:
+        """Restore the values at power-on of all entries up to and including index `last_index`."""
+        for (index, _), reset_entry in self._entries.items():
+            if index <= last_index:
+                reset_entry.reset()
 
 
 # SDO server
@@ -449,62 +456,68 @@ class SdoServer:
 
     def _start_download(self, data: bytes) -> None:
         """Process a write request: write an expedited value, or expect segments."""
-        command = data[0]
-        entry = self._objects.find_writable(self._index, self._sub)
-        if command & _EXPEDITED_BIT:
-            size = min(entry.most_bytes, _EXPEDITED_SIZE)
-            if command & _SIZE_STATED_BIT:
-                size = _EXPEDITED_SIZE - (command >> 2 & 0x03)
-            self._write(data[4 : 4 + size])
+        command_byte = data[0]
+        target_entry = self._objects.find_writable(self._index, self._sub)
+        if command_byte & _EXPEDITED_BIT:
+            data_size = min(target_entry.most_bytes, _EXPEDITED_SIZE)
+            if command_byte & _SIZE_STATED_BIT:
+                data_size = _EXPEDITED_SIZE - (command_byte >> 2 & 0x03)
+            self._write(data[4 : 4 + data_size])
         else:
             # An integer has one length, so the segments need not be compared with this length.
             stated_size = int.from_bytes(data[4:8], "little")
-            if command & _SIZE_STATED_BIT and not entry.accepts_length(stated_size):
+            if command_byte & _SIZE_STATED_BIT and not target_entry.accepts_length(stated_size):
                 raise Abort(AbortCode.LENGTH)
             self._expected_specifier = _DOWNLOAD_SEGMENT
         self._reply(_SDO_HEADER.pack(0x60, self._index, self._sub).ljust(8, b"\0"))
 
     def _start_upload(self) -> None:
         """Process a read request: reply with an expedited value, or offer segments."""
-        value = self._objects.read(self._index, self._sub)
-        size = len(value)
-        if 0 < size <= _EXPEDITED_SIZE:
-            header = _SDO_HEADER.pack(0x43 | (_EXPEDITED_SIZE - size) << 2, self._index, self._sub)
-            self._reply(header + value.ljust(_EXPEDITED_SIZE, b"\0"))
+        value_bytes = self._objects.read(self._index, self._sub)
+        value_size = len(value_bytes)
+        if 0 < value_size <= _EXPEDITED_SIZE:
+            reply_header = _SDO_HEADER.pack(
+                0x43 | (_EXPEDITED_SIZE - value_size) << 2, self._index, self._sub
+            )
+            self._reply(reply_header + value_bytes.ljust(_EXPEDITED_SIZE, b"\0"))
             return
         self._expected_specifier = _UPLOAD_SEGMENT
-        self._buffer = value
-        self._reply(_SDO_HEADER.pack(0x41, self._index, self._sub) + size.to_bytes(4, "little"))
+        self._buffer = value_bytes
+        self._reply(
+            _SDO_HEADER.pack(0x41, self._index, self._sub) + value_size.to_bytes(4, "little")
+        )
 
     def _process_segment(self, specifier: int, data: bytes) -> None:
         """Process the request for the next segment: store or send it."""
-        command = data[0]
+        command_byte = data[0]
         if specifier != self._expected_specifier:
             raise Abort(AbortCode.COMMAND)
-        if command & _TOGGLE_BIT != self._toggle:
+        if command_byte & _TOGGLE_BIT != self._toggle:
             raise Abort(AbortCode.TOGGLE)
-        toggle, self._toggle = self._toggle, self._toggle ^ _TOGGLE_BIT
+        toggle_bit, self._toggle = self._toggle, self._toggle ^ _TOGGLE_BIT
         if specifier == _UPLOAD_SEGMENT:
-            segment, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
+            segment_bytes, self._buffer = self._buffer[:_SEGMENT_SIZE], self._buffer[_SEGMENT_SIZE:]
             is_last = not self._buffer
-            header = (
-                toggle | (_SEGMENT_SIZE - len(segment)) << 1 | (_LAST_SEGMENT_BIT if is_last else 0)
+            reply_header = (
+                toggle_bit
+                | (_SEGMENT_SIZE - len(segment_bytes)) << 1
+                | (_LAST_SEGMENT_BIT if is_last else 0)
             )
-            self._reply(bytes([header]) + segment.ljust(_SEGMENT_SIZE, b"\0"))
+            self._reply(bytes([reply_header]) + segment_bytes.ljust(_SEGMENT_SIZE, b"\0"))
         else:
-            self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command >> 1 & 0x07)]
+            self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
             if len(self._buffer) > self._objects.find_writable(self._index, self._sub).most_bytes:
                 raise Abort(AbortCode.LENGTH)
-            is_last = bool(command & _LAST_SEGMENT_BIT)
+            is_last = bool(command_byte & _LAST_SEGMENT_BIT)
             if is_last:
                 self._write(self._buffer)
-            self._reply(bytes([0x20 | toggle]).ljust(8, b"\0"))
+            self._reply(bytes([0x20 | toggle_bit]).ljust(8, b"\0"))
         if is_last:
             self.reset()
 
     def _write(self, data: bytes) -> None:
-        """Write a complete value to the dictionary, and report the write."""
+        """Write a completely received value to the object dictionary, and report the write."""
         self._after_write(self._index, self._sub, self._objects.write(self._index, self._sub, data))
 
 
@@ -549,11 +562,11 @@ class DeviceFile:
     entries: Mapping[tuple[int, int], Description]
     """Descriptions by index and sub-index."""
 
-    def present_offsets(self, first: int, last: int) -> Iterator[int]:
-        """Yield the existing indices in a range, as offsets from `first`."""
-        for index in range(first, last + 1):
+    def present_offsets(self, first_index: int, last_index: int) -> Iterator[int]:
+        """Yield the existing indices in a range, as offsets from `first_index`."""
+        for index in range(first_index, last_index + 1):
             if any(key in self.entries for key in ((index, 0), (index, 1))):
-                yield index - first
+                yield index - first_index
 
     def sub_index_count(self, index: int) -> int:
         """Return the number of sub-indices of an object, counted from 1 on without a gap."""
@@ -575,60 +588,84 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
         eds = read_eds(path, node_id)
     except EdsError as error:
         raise DeviceError(f"The simulated drive cannot be made: {error}") from None
-    entries = {
-        key: _to_description(entry) for key, entry in eds.entries.items() if key[0] >= _FIRST_INDEX
+    descriptions = {
+        key: _to_description(eds_entry)
+        for key, eds_entry in eds.entries.items()
+        if key[0] >= _FIRST_INDEX
     }
-    for sub, number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
-        description = entries.get((_IDENTITY_INDEX, sub))
+    for sub, identity_number in enumerate((eds.vendor_id, eds.product_code, eds.revision), 1):
+        description = descriptions.get((_IDENTITY_INDEX, sub))
         if description is not None and not description.default:
-            entries[_IDENTITY_INDEX, sub] = replace(description, default=number)
-    highest: dict[int, int] = {}
-    for index, sub in entries:
-        highest[index] = max(sub, highest.get(index, 0))
-    for index, last in highest.items():
-        description = entries.get((index, 0))
+            descriptions[_IDENTITY_INDEX, sub] = replace(description, default=identity_number)
+    highest_subs: dict[int, int] = {}
+    for index, sub in descriptions:
+        highest_subs[index] = max(sub, highest_subs.get(index, 0))
+    for index, last_sub in highest_subs.items():
+        description = descriptions.get((index, 0))
         if (
-            last
+            last_sub
             and description is not None
             and description.default is None
             and description.kind == "B"
         ):
-            entries[index, 0] = replace(description, default=last)
-    return DeviceFile(path.name, entries)
+            descriptions[index, 0] = replace(description, default=last_sub)
+    return DeviceFile(path.name, descriptions)
 
 
-def _to_description(entry: EdsEntry) -> Description:
+def _to_description(eds_entry: EdsEntry) -> Description:
     """Convert the entry of an EDS file to a description for a simulated node."""
-    access = _SDO_ACCESS.get(entry.access, entry.access)
-    kind = _TYPE_LETTERS.get(entry.data_type)
-    if kind is None:
-        size = _TIME_TYPE_LENGTHS.get(entry.data_type) or (entry.bits or 0) // 8
+    sdo_access = _SDO_ACCESS.get(eds_entry.access, eds_entry.access)
+    type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
+    if type_letter is None:
+        size_bytes = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
         return Description(
-            "s", access, "", text=_default_bytes(entry, size), has_fixed_length=size > 0
+            "s",
+            sdo_access,
+            "",
+            text=_default_bytes(eds_entry, size_bytes),
+            has_fixed_length=size_bytes > 0,
         )
-    is_boolean = entry.data_type == _BOOLEAN_TYPE
+    is_boolean = eds_entry.data_type == _BOOLEAN_TYPE
     # A boolean takes one bit in a PDO, which is not needed here.
-    mappable = entry.mappable and not is_boolean
-    directions = _PDO_DIRECTIONS.get(entry.access, "rt") if mappable else ""
-    low, high = entry.low, 1 if is_boolean else entry.high
-    if low is not None and high is not None and low >= high:  # written by tools without limits
-        low = high = None
-    if entry.index == _HEARTBEAT_CONSUMER_INDEX and high is not None and high < _NODE_ID_UNIT:
-        low = high = None  # some files limit only the time in the lower half, without the node
-    default = None if entry.default is None else _to_type_range(entry.default, kind)
-    return Description(kind, access, directions, default, low, high)
+    is_mappable = eds_entry.mappable and not is_boolean
+    pdo_directions = _PDO_DIRECTIONS.get(eds_entry.access, "rt") if is_mappable else ""
+    lower_limit, upper_limit = eds_entry.low, 1 if is_boolean else eds_entry.high
+    if (
+        lower_limit is not None and upper_limit is not None and lower_limit >= upper_limit
+    ):  # written by tools without limits
+        lower_limit = upper_limit = None
+    if (
+        eds_entry.index == _HEARTBEAT_CONSUMER_INDEX
+        and upper_limit is not None
+        and upper_limit < _NODE_ID_UNIT
+    ):
+        lower_limit = upper_limit = (
+            None  # some files limit only the time in the lower half, without the node
+        )
+    default_value = (
+        None if eds_entry.default is None else _to_type_range(eds_entry.default, type_letter)
+    )
+    return Description(
+        type_letter, sdo_access, pdo_directions, default_value, lower_limit, upper_limit
+    )
 
 
-def _to_type_range(value: int, kind: str) -> int:
+def _to_type_range(file_value: int, type_letter: str) -> int:
     """Convert a value to the range of its type; files may state negative values as unsigned."""
-    bits = 8 * calcsize("<" + kind)
-    value &= (1 << bits) - 1
-    return value - (1 << bits) if kind.islower() and value >> (bits - 1) else value
+    length_bit = 8 * calcsize("<" + type_letter)
+    file_value &= (1 << length_bit) - 1
+    return (
+        file_value - (1 << length_bit)
+        if type_letter.islower() and file_value >> (length_bit - 1)
+        else file_value
+    )
 
 
-def _default_bytes(entry: EdsEntry, size: int) -> bytes:
-    """Return the default of an entry as `size` bytes or, if that is 0, as its own bytes."""
-    data = entry.content
-    if entry.default is not None and size:
-        data = (entry.default & (1 << 8 * size) - 1).to_bytes(size, "little")
-    return data[:size].ljust(size, b"\0") if size else data
+def _default_bytes(eds_entry: EdsEntry, byte_count: int) -> bytes:
+    """Return the default of an entry as `byte_count` bytes or, if that is 0, as its own bytes."""
+    default_bytes = eds_entry.content
+    if eds_entry.default is not None and byte_count:
+        default_bytes = (eds_entry.default & (1 << 8 * byte_count) - 1).to_bytes(
+            byte_count, "little"
+        )
+    return default_bytes[:byte_count].ljust(byte_count, b"\0") if byte_count else default_bytes

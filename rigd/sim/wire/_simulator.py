@@ -70,18 +70,18 @@ _STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 @contextmanager
 def reserve_rig_name(rig_name: str) -> Iterator[None]:
     """Reserve the rig's name within this context, or raise if another simulator uses it."""
-    folder = runtime_folder()
+    lock_folder = runtime_folder()
     try:
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        lock = (folder / f"{rig_name}.lock").open("w")
+        lock_folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+        lock_file = (lock_folder / f"{rig_name}.lock").open("w")
     except OSError as error:
         raise DeviceError(
-            f"The simulated rig cannot use the folder {folder} ({error.strerror}); set "
+            f"The simulated rig cannot use the folder {lock_folder} ({error.strerror}); set "
             "XDG_RUNTIME_DIR to one that is yours."
         ) from None
-    with lock:
+    with lock_file:
         try:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             running_simulator = find_simulator(rig_name)
             process_text = (
@@ -99,9 +99,9 @@ def reserve_rig_name(rig_name: str) -> Iterator[None]:
 @contextmanager
 def socket_folder(rig_name: str) -> Iterator[Path]:
     """Yield a folder for the sockets whose name is short enough; it may be temporary."""
-    folder = runtime_folder()
-    if len(os.fsencode(folder / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
-        yield folder
+    runtime_path = runtime_folder()
+    if len(os.fsencode(runtime_path / f"{rig_name}.control")) <= _LONGEST_SOCKET_NAME:
+        yield runtime_path
         return
     with tempfile.TemporaryDirectory(prefix="rigd-", dir="/tmp") as short_folder:
         yield Path(short_folder)
@@ -113,18 +113,24 @@ def stop_requested() -> Iterator[Callable[[], bool]]:
 
     Signals that the process ignores remain ignored.
     """
-    requested: list[int] = []
-    previous_handlers = {number: signal.getsignal(number) for number in _STOP_SIGNALS}
+    received_signals: list[int] = []
+    previous_handlers = {
+        signal_number: signal.getsignal(signal_number) for signal_number in _STOP_SIGNALS
+    }
     handled_signals = [
-        number for number, handler in previous_handlers.items() if handler != signal.SIG_IGN
+        signal_number
+        for signal_number, signal_handler in previous_handlers.items()
+        if signal_handler != signal.SIG_IGN
     ]
-    for number in handled_signals:
-        signal.signal(number, lambda number_received, _: requested.append(number_received))
+    for signal_number in handled_signals:
+        signal.signal(
+            signal_number, lambda number_received, _: received_signals.append(number_received)
+        )
     try:
-        yield lambda: bool(requested)
+        yield lambda: bool(received_signals)
     finally:
-        for number in handled_signals:
-            signal.signal(number, previous_handlers[number])
+        for signal_number in handled_signals:
+            signal.signal(signal_number, previous_handlers[signal_number])
 
 
 # Control socket
@@ -159,8 +165,8 @@ class ControlSocket:
 
     def close(self) -> None:
         """Close the control socket and the connections of all clients."""
-        for link in list(self._links):
-            self._drop(link)
+        for client_socket in list(self._links):
+            self._drop(client_socket)
         del self._handlers[self._listener.fileno()]
         self._listener.close()
         self._path.unlink(missing_ok=True)
@@ -168,43 +174,45 @@ class ControlSocket:
     def _accept(self) -> None:
         """Accept the connection of a client, and register it in the event loop."""
         with suppress(OSError):
-            link, _ = self._listener.accept()
-            link.setblocking(False)
-            self._links[link] = b""
-            self._handlers[link.fileno()] = lambda: self._receive(link)
+            client_socket, _ = self._listener.accept()
+            client_socket.setblocking(False)
+            self._links[client_socket] = b""
+            self._handlers[client_socket.fileno()] = lambda: self._receive(client_socket)
 
-    def _receive(self, link: socket.socket) -> None:
+    def _receive(self, client_socket: socket.socket) -> None:
         """Receive bytes of a client, and reply to each complete line with a request."""
         try:
-            received = link.recv(_LONGEST_REQUEST)
+            received_bytes = client_socket.recv(_LONGEST_REQUEST)
         except BlockingIOError:
             return
         except OSError:
-            received = b""
-        *lines, incomplete = (self._links[link] + received).split(b"\n")
-        if not received or len(incomplete) > _LONGEST_REQUEST:
-            self._drop(link)
+            received_bytes = b""
+        *complete_lines, incomplete_line = (self._links[client_socket] + received_bytes).split(
+            b"\n"
+        )
+        if not received_bytes or len(incomplete_line) > _LONGEST_REQUEST:
+            self._drop(client_socket)
             return
-        self._links[link] = incomplete
-        for line in lines:
+        self._links[client_socket] = incomplete_line
+        for request_line in complete_lines:
             with suppress(OSError):  # a client that does not read gets no reply
-                link.send(json.dumps(self._reply(line)).encode() + b"\n")
+                client_socket.send(json.dumps(self._reply(request_line)).encode() + b"\n")
 
-    def _reply(self, line: bytes) -> dict[str, Any]:
+    def _reply(self, request_line: bytes) -> dict[str, Any]:
         """Return the reply to one line with a JSON request."""
         try:
-            request = json.loads(line)
+            parsed_request = json.loads(request_line)
         except ValueError:
-            request = None
-        if not isinstance(request, dict):
+            parsed_request = None
+        if not isinstance(parsed_request, dict):
             return {"error": "A request is one line with one JSON object."}
-        return self._answer(request)
+        return self._answer(parsed_request)
 
-    def _drop(self, link: socket.socket) -> None:
+    def _drop(self, client_socket: socket.socket) -> None:
         """Close the connection of a client."""
-        del self._links[link]
-        del self._handlers[link.fileno()]
-        link.close()
+        del self._links[client_socket]
+        del self._handlers[client_socket.fileno()]
+        client_socket.close()
 
 
 # The process
@@ -273,17 +281,17 @@ def run_simulator(rig: RigParameters, options: SimulatorOptions) -> int:
         raise WrongUseError(unknown_text)
     if rig.devices.sensor != "ati_serial":
         rig = replace(rig, ati_serial=None)  # a profile may describe a sensor that it does not use
-    with ExitStack() as stack:
-        stack.enter_context(reserve_rig_name(rig.name))
+    with ExitStack() as exit_stack:
+        exit_stack.enter_context(reserve_rig_name(rig.name))
         log = EventLog(options.log, quiet=options.quiet)
-        stack.callback(log.close)
-        startup_stack = stack.enter_context(ExitStack())
+        exit_stack.callback(log.close)
+        startup_stack = exit_stack.enter_context(ExitStack())
         startup_stack.callback(log.discard)
-        process = _SimulatorProcess(rig, options, log, stack)
-        stop = stack.enter_context(stop_requested())
-        process.start()
+        simulator_process = _SimulatorProcess(rig, options, log, exit_stack)
+        is_stop_requested = exit_stack.enter_context(stop_requested())
+        simulator_process.start()
         startup_stack.pop_all()
-        process.serve(stop)
+        simulator_process.serve(is_stop_requested)
     return 0
 
 
@@ -310,8 +318,8 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     WrongUseError
         If a fault has a syntax error; then no fault is injected.
     """
-    address = find_simulator(rig_name)
-    if address is None:
+    simulator_address = find_simulator(rig_name)
+    if simulator_address is None:
         raise DeviceError(
             f"No simulated rig of the profile {rig_name} runs; start it with: rigd simulate "
             f"--profile {rig_name}"
@@ -319,27 +327,32 @@ def inject(rig_name: str, specs: list[str]) -> list[str]:
     faults = [parse_fault(spec) for spec in specs]  # all of them, before the first one happens
     if not specs:
         return [
-            f"{name}: {value}" for name, value in ask_simulator(address, {"status": True}).items()
+            f"{value_name}: {injected_value}"
+            for value_name, injected_value in ask_simulator(
+                simulator_address, {"status": True}
+            ).items()
         ]
-    lines = []
+    report_lines = []
     for fault, spec in zip(faults, specs, strict=True):
-        injected = str(ask_simulator(address, {"inject": spec})["injected"])
+        injected_fault = str(ask_simulator(simulator_address, {"inject": spec})["injected"])
         end = f"rigd inject --profile {rig_name} end,fault={fault.kind}"
-        lines.append(f"{injected}; it lasts until: {end}" if fault.is_persistent else injected)
-    return lines
+        report_lines.append(
+            f"{injected_fault}; it lasts until: {end}" if fault.is_persistent else injected_fault
+        )
+    return report_lines
 
 
 class _SimulatorProcess:
     """Process of a simulated rig: its connections, and the event loop that serves them."""
 
     def __init__(
-        self, rig: RigParameters, options: SimulatorOptions, log: EventLog, stack: ExitStack
+        self, rig: RigParameters, options: SimulatorOptions, log: EventLog, exit_stack: ExitStack
     ) -> None:
         assert rig.can is not None
         self._rig = rig
         self._options = options
         self._log = log
-        self._exit_stack = stack
+        self._exit_stack = exit_stack
         self._handlers: Handlers = {}
         self._device_file: DeviceFile | None = None
         assert rig.cia402 is not None
@@ -348,30 +361,32 @@ class _SimulatorProcess:
             from rigd.sim.wire._object_dictionary import read_device
 
             self._device_file = read_device(eds, rig.cia402.node_id)
-        folder = stack.enter_context(socket_folder(rig.name))
+        socket_path = exit_stack.enter_context(socket_folder(rig.name))
         self._bus: VirtualBus | VirtualCan
         can_socket = ""
         if rig.can.interface == "socketcan" and is_virtual(rig.can.channel):
             self._bus = VirtualCan(rig.can.channel, self._handlers, self._on_frames)
         else:
-            can_socket = str(folder / f"{rig.name}.can")
+            can_socket = str(socket_path / f"{rig.name}.can")
             self._bus = VirtualBus(
                 Path(can_socket), self._handlers, self._on_frames, self._on_clients
             )
-        stack.callback(self._bus.close)
+        exit_stack.callback(self._bus.close)
         self._serial_line: PtyLine | None = None
         if rig.ati_serial is not None:
             self._serial_line = PtyLine(self._handlers, self._on_bytes, self._on_port)
-            stack.callback(self._serial_line.close)
+            exit_stack.callback(self._serial_line.close)
         stated_seed = None if rig.simulation is None else rig.simulation.seed
         self._seed = fresh_seed() if stated_seed is None else stated_seed
         self._sessions = 0
         self._bus_simulation = self._make_bus_simulation()
-        control = ControlSocket(folder / f"{rig.name}.control", self._handlers, self._answer)
-        stack.callback(control.close)
+        control_socket = ControlSocket(
+            socket_path / f"{rig.name}.control", self._handlers, self._answer
+        )
+        exit_stack.callback(control_socket.close)
         self._address = SimulatorAddress(
             pid=os.getpid(),
-            control_socket=str(folder / f"{rig.name}.control"),
+            control_socket=str(socket_path / f"{rig.name}.control"),
             can_socket=can_socket,
             serial_port=self._port,
             lock_step=options.lock_step,
@@ -380,8 +395,8 @@ class _SimulatorProcess:
 
     def start(self) -> None:
         """Inject the initial faults, print the rig's addresses, and write the address file."""
-        for fault in self._options.faults:
-            self._bus_simulation.inject(fault)
+        for initial_fault in self._options.faults:
+            self._bus_simulation.inject(initial_fault)
         start_values = {} if self._options.lock_step else {"monotonic_ns": time.monotonic_ns()}
         self._log(
             "simulator",
@@ -391,8 +406,8 @@ class _SimulatorProcess:
             **({} if self._device_file is None else {"eds": self._device_file.name}),
             **start_values,
         )
-        for line in self._start_messages():
-            self._log.print_line(line)
+        for start_line in self._start_messages():
+            self._log.print_line(start_line)
         announce(self._rig.name, self._address)
         self._exit_stack.callback(forget, self._rig.name)
         # Set-up leaves objects that are never freed: exclude them from garbage collection.
@@ -408,7 +423,7 @@ class _SimulatorProcess:
 
     def serve(self, stop: Callable[[], bool]) -> None:
         """Run the simulator's event loop until a stop is requested."""
-        handlers, bus_simulation, line, log = (
+        event_handlers, bus_simulation, serial_line, log = (
             self._handlers,
             self._bus_simulation,
             self._serial_line,
@@ -417,20 +432,20 @@ class _SimulatorProcess:
         now_ns = time.monotonic_ns
         poll_ns = 0
         while not stop():
-            ready, _, _ = select.select(
-                handlers, (), (), bus_simulation.wait_s(now_ns(), _LONGEST_WAIT_S)
+            ready_descriptors, _, _ = select.select(
+                event_handlers, (), (), bus_simulation.wait_s(now_ns(), _LONGEST_WAIT_S)
             )
-            for descriptor in ready:
-                handler = handlers.get(descriptor)
-                if handler is not None:  # not closed by one of the others
-                    handler()
+            for descriptor in ready_descriptors:
+                event_handler = event_handlers.get(descriptor)
+                if event_handler is not None:  # not closed by one of the others
+                    event_handler()
             now = now_ns()
             bus_simulation.elapse(now)
             if now > poll_ns:
                 poll_ns = now + round(_LONGEST_WAIT_S * 1e9)
                 log.flush()
-                if line is not None:
-                    line.poll()
+                if serial_line is not None:
+                    serial_line.poll()
         self._log("simulator", "ended")
 
     def _make_bus_simulation(self) -> BusSimulation:
@@ -440,20 +455,20 @@ class _SimulatorProcess:
 
         rig = self._rig
         simulated_rig = self._simulated_rig = SimulatedRig(without_transport_delay(rig))
-        line = self._serial_line
+        serial_line = self._serial_line
         bus_simulation = BusSimulation(
             rig,
             simulated_rig,
             lock_step=self._options.lock_step,
             now_ns=time.monotonic_ns(),
             send=self._bus.send,
-            write=_discard_output if line is None else line.write,
+            write=_discard_output if serial_line is None else serial_line.write,
             cut=self._interrupt,
             mend=self._reconnect,
             log=self._log,
         )
         assert rig.cia402 is not None
-        drive = DriveNode(
+        drive_node = DriveNode(
             rig,
             simulated_rig,
             bus_simulation.step,
@@ -462,7 +477,7 @@ class _SimulatorProcess:
             sync_timeout_s=self._sync_timeout_s(),
             file=self._device_file,
         )
-        bus_simulation.add_node("drive", drive)
+        bus_simulation.add_node("drive", drive_node)
         if rig.ati_serial is not None:
             from rigd.sim.wire._ati_serial_device import AtiSerialDevice
 
@@ -480,28 +495,30 @@ class _SimulatorProcess:
 
     def _sync_timeout_s(self) -> float:
         """Return the time in seconds without SYNC after which the drive goes to fault."""
-        drive = self._rig.cia402
-        assert drive is not None
-        if drive.own_watchdog_s:
-            return drive.own_watchdog_s
+        drive_settings = self._rig.cia402
+        assert drive_settings is not None
+        if drive_settings.own_watchdog_s:
+            return drive_settings.own_watchdog_s
         if self._device_file is not None and (0x1006, 0) not in self._device_file.entries:
             return math.inf  # no period is configured
         # The tolerance of other drives is not known: use the heartbeat timeout.
-        return drive.heartbeat_timeout_s
+        return drive_settings.heartbeat_timeout_s
 
     def _start_messages(self) -> Iterator[str]:
         """Yield the lines for the operator at the start: addresses, and commands to try."""
-        address, rig = self._address, self._rig
+        simulator_address, rig = self._address, self._rig
         assert rig.can is not None
-        mode = "one period per SYNC (lock-step)" if address.lock_step else "by wall time"
-        yield f"Simulated rig {rig.name}, {rig.rate_hz:g} Hz, {mode}; Ctrl-C ends it."
-        yield f"  CAN      {address.can_socket or f'{rig.can.channel} (virtual)'}"
-        if address.serial_port:
-            yield f"  serial   {address.serial_port}"
+        clock_text = (
+            "one period per SYNC (lock-step)" if simulator_address.lock_step else "by wall time"
+        )
+        yield f"Simulated rig {rig.name}, {rig.rate_hz:g} Hz, {clock_text}; Ctrl-C ends it."
+        yield f"  CAN      {simulator_address.can_socket or f'{rig.can.channel} (virtual)'}"
+        if simulator_address.serial_port:
+            yield f"  serial   {simulator_address.serial_port}"
         if self._device_file is not None:
-            objects = len({index for index, _ in self._device_file.entries})
-            yield f"  drive    as {self._device_file.name} has it, {objects} objects"
-        fast_option = " --fast" if address.lock_step else ""
+            object_count = len({object_index for object_index, _ in self._device_file.entries})
+            yield f"  drive    as {self._device_file.name} has it, {object_count} objects"
+        fast_option = " --fast" if simulator_address.lock_step else ""
         yield f"  session  rigd run chirp --profile {rig.name}{fast_option}"
         yield f"  fault    rigd inject --profile {rig.name} freeze,device=drive,for=0.5"
 
@@ -546,19 +563,22 @@ class _SimulatorProcess:
         return "" if self._serial_line is None else self._serial_line.port
 
     def _answer(self, request: dict[str, Any]) -> dict[str, Any]:
-        """Return the reply to a request on the control socket."""
+        """Return the reply to a request on the control socket.
+
+        A request injects a fault, reads the simulator's status, or renews the noise.
+        """
         if "inject" in request:
             try:
-                fault = parse_fault(str(request["inject"]))
-                self._bus_simulation.inject(fault)
+                injected_fault = parse_fault(str(request["inject"]))
+                self._bus_simulation.inject(injected_fault)
             except (FaultError, DeviceError) as error:
                 return {"error": str(error)}
-            return {"injected": str(fault)}
+            return {"injected": str(injected_fault)}
         if "renew_noise" in request:
-            seed = request["renew_noise"]
-            if seed is not None and not (type(seed) is int and seed >= 0):
+            new_seed = request["renew_noise"]
+            if new_seed is not None and not (type(new_seed) is int and new_seed >= 0):
                 return {"error": "The seed has to be a whole number from 0 on, or null."}
-            return {"seed": self._renew_noise(seed)}
+            return {"seed": self._renew_noise(new_seed)}
         if "status" in request:
             return {
                 "rig": self._rig.name,
