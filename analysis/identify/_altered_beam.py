@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 GRAVITY_M_S2: Final = 9.81
 """Acceleration of gravity, in m/s²."""
 
-_BASIS_MODES: Final = 14
+_BASIS_MODE_COUNT: Final = 14
 """Number of modes of the uniform beam in the basis."""
 
-_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODES + 1)[-1])
+_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODE_COUNT + 1)[-1])
 """Eigenvalue k L of the first mode of the uniform beam that is not in the basis."""
 
-_POINTS_PER_HALF: Final = 32
+_QUADRATURE_POINTS_PER_HALF: Final = 32
 """Number of quadrature points in each half of the beam."""
 
 _SLOPE_STEP: Final = 1e-5
@@ -233,7 +233,7 @@ _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[
 
 def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the N shapes of the basis modes at positions relative to the length, (N, …)."""
-    return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODES + 1)])
+    return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODE_COUNT + 1)])
 
 
 @lru_cache(maxsize=32)
@@ -248,11 +248,11 @@ def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
 @lru_cache(maxsize=1)
 def _basis() -> _Basis:
     """Return the cached basis: the first modes of the uniform beam, with their integrals."""
-    quadrature_nodes, weights = np.polynomial.legendre.leggauss(_POINTS_PER_HALF)
+    quadrature_nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS_PER_HALF)
     x = np.concatenate([0.25 * (quadrature_nodes + 1), 0.25 * (quadrature_nodes + 3)])
     weights = np.tile(weights / 4, 2)
-    z = clamped_free_eigenvalues(_BASIS_MODES)
-    signs = (-1.0) ** np.arange(_BASIS_MODES)
+    z = clamped_free_eigenvalues(_BASIS_MODE_COUNT)
+    signs = (-1.0) ** np.arange(_BASIS_MODE_COUNT)
     shapes, slopes = (
         _basis_shapes(x),
         (_basis_shapes(x + _SLOPE_STEP) - _basis_shapes(x - _SLOPE_STEP)) / (2 * _SLOPE_STEP),
@@ -287,29 +287,29 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     ) -> NDArray[np.float64]:
         if not lump_count:
             return uniform_beam_array
-        extended_array = np.zeros((_BASIS_MODES + lump_count,) * uniform_beam_array.ndim)
-        extended_array[(slice(_BASIS_MODES),) * uniform_beam_array.ndim] = uniform_beam_array
-        lump_indices = range(_BASIS_MODES, _BASIS_MODES + lump_count)
+        extended_array = np.zeros((_BASIS_MODE_COUNT + lump_count,) * uniform_beam_array.ndim)
+        extended_array[(slice(_BASIS_MODE_COUNT),) * uniform_beam_array.ndim] = uniform_beam_array
+        lump_indices = range(_BASIS_MODE_COUNT, _BASIS_MODE_COUNT + lump_count)
         extended_array[(lump_indices,) * uniform_beam_array.ndim] = diagonal_value
         return extended_array
 
     density_deviation = basis.deviation(alteration.density)
     mass = with_lump_modes(
-        np.eye(_BASIS_MODES) + basis.weighted_products(basis.shapes, density_deviation), 1.0
+        np.eye(_BASIS_MODE_COUNT) + basis.weighted_products(basis.shapes, density_deviation), 1.0
     )
     mass_arm = with_lump_modes(
         basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x)
     )
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
     tension, tension_arm = with_lump_modes(basis.tension), with_lump_modes(basis.arms_of_tension)
-    for lump_index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODES):
+    for lump_index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODE_COUNT):
         mass_fraction, shape = (
             mass_kg / (beam.density_kg_per_m * length_m),
             with_lump_modes(_basis_shapes_at_lump(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
         flexibility_beyond_basis = position**3 / 3 - float(
-            np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2)
+            np.sum((shape[:_BASIS_MODE_COUNT] / basis.z**2) ** 2)
         )
         shape[lump_index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
         lump += mass_fraction * np.outer(shape, shape)
@@ -326,7 +326,7 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     beam_flexibility = with_lump_modes(
         basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
     )
-    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODES) / basis.z**2)
+    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.z**2)
     clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
     elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
     gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length_m**3

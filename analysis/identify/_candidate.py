@@ -28,13 +28,13 @@ class Candidate:
         Damping structure.
     fit : RecordFit
         Fit of this structure to the record.
-    columns : int
+    effect_count : int
         Number of nonlinear effects with a free amplitude, in addition to the parameters of the fit.
     """
 
     structure: Structure
     fit: RecordFit
-    columns: int = 0
+    effect_count: int = 0
 
     @property
     def parameters(self) -> int:
@@ -42,14 +42,16 @@ class Candidate:
 
         These amplitudes are common to all candidates.
         """
-        return len(self.fit.interval) + self.columns
+        return len(self.fit.interval) + self.effect_count
 
     @property
     def values(self) -> int:
         """Return the number of real values of the record to which the candidate is fitted."""
         fit = self.fit
         decay_amplitude_count = fit.ringing.degrees_of_freedom
-        return fit.degrees_of_freedom + len(fit.interval) + decay_amplitude_count + self.columns
+        return (
+            fit.degrees_of_freedom + len(fit.interval) + decay_amplitude_count + self.effect_count
+        )
 
     @property
     def deviance(self) -> float:

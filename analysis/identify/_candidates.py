@@ -55,13 +55,13 @@ _CERTAIN_COEFFICIENT_OVER_STD: Final = 5.0
 """Ratio of a damping coefficient to its standard deviation above which the damping is certainly
 significant, so that no structure without it is fitted."""
 
-_FREEST: Final = STRUCTURES["VI"]
+_FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 """Structure with internal and external damping, both of free order."""
 
-_ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
+_ONE_DAMPING_STRUCTURES: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 """Structures with only internal or only external damping, of free order."""
 
-_INTEGER_ORDER: Final = STRUCTURES["VII"]
+_INTEGER_ORDER_STRUCTURE: Final = STRUCTURES["VII"]
 """Structure with internal and external damping whose internal damping has order 1."""
 
 _ROUGH_FIT_EVALUATIONS: Final = 3
@@ -164,7 +164,7 @@ class CandidateSet:
             The record cannot be used.
         """
         first_candidate, *other_candidates = earlier
-        if first_candidate.columns:
+        if first_candidate.effect_count:
             return None  # nonlinear effects are searched for again, in the whole record
         unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
@@ -201,7 +201,7 @@ class CandidateSet:
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST, *additional)
+        structures = (_FREEST_STRUCTURE, *additional)
         return cls._of_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
@@ -250,10 +250,12 @@ class CandidateSet:
         candidate.
         """
         by_structure = {c.structure.name: c for c in self.candidates}
-        freest_candidate = by_structure.get(_FREEST.name)
+        freest_candidate = by_structure.get(_FREEST_STRUCTURE.name)
         if freest_candidate is None:
             return self.best
-        one_damping = [by_structure[s.name] for s in _ONE_DAMPING if s.name in by_structure]
+        one_damping = [
+            by_structure[s.name] for s in _ONE_DAMPING_STRUCTURES if s.name in by_structure
+        ]
         best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest_candidate)
         return (
             best_one_damping
@@ -417,9 +419,13 @@ class CandidateSet:
         the search for the freest structure may mistake for the lowest one. A search from an order
         of 1 avoids that minimum.
         """
-        fit = next(candidate.fit for candidate in self.candidates if candidate.structure is _FREEST)
+        fit = next(
+            candidate.fit
+            for candidate in self.candidates
+            if candidate.structure is _FREEST_STRUCTURE
+        )
         low_alpha, high_alpha = fit.interval["alpha"] or (math.inf, -math.inf)
-        special_cases = [_INTEGER_ORDER] if not low_alpha <= 1 <= high_alpha else []
+        special_cases = [_INTEGER_ORDER_STRUCTURE] if not low_alpha <= 1 <= high_alpha else []
         special_cases += _one_damping_structures(fit)
         fitted_candidates = (
             self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
@@ -496,7 +502,7 @@ class CandidateSet:
             added_candidates.append(refits[-1].candidate())
             return added_candidates[-1].fit
 
-        freest_fit = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
+        freest_fit = by_structure.get(_FREEST_STRUCTURE.name) or fit_structure(_FREEST_STRUCTURE)
         for structure in _one_damping_structures(freest_fit):
             if structure.name not in by_structure:
                 fit_structure(structure)
@@ -507,23 +513,23 @@ class CandidateSet:
             return new_set.cross_check()
         return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).residual_noise())
 
-    def refit_with_additional_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
+    def refit_with_additional_effect(self, effect_spectra: NDArray[np.complex128]) -> CandidateSet:
         """Return the set refitted with additional torque spectra, each of free amplitude.
 
         The noise is estimated again from the residual of the best candidate with these spectra.
         """
-        all_columns = np.concatenate([self.columns, columns])
+        all_columns = np.concatenate([self.columns, effect_spectra])
         best_refit = replace(self, columns=all_columns).refit(self.best)
         return self.refit_with_effect_spectra(all_columns, best_refit.residual_noise())
 
     def refit_with_effect_spectra(
-        self, columns: NDArray[np.complex128], noise: NoiseSpectrum
+        self, effect_spectra: NDArray[np.complex128], noise: NoiseSpectrum
     ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-        The spectra represent effects in addition to the linear beam and replace `columns`.
+        The spectra represent effects in addition to the linear beam and replace `effect_spectra`.
         """
-        new_set = replace(self, columns=columns, noise=noise)
+        new_set = replace(self, columns=effect_spectra, noise=noise)
         return new_set.with_candidates(
             new_set.refit(c).candidate() for c in self.candidates
         ).cross_check()
@@ -542,7 +548,7 @@ class CandidateSet:
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
     """Return the damping structures that leave out an insignificant damping of a fit."""
-    structures_and_missing = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
     return [
         structure
         for structure, missing_damping in structures_and_missing

@@ -82,13 +82,13 @@ class Comparison:
     removed_nm : ndarray, shape (samples,)
         Torque by impacts, drag, hum and the incoherent angle that was removed, at the retained
         samples.
-    removed_at_unknown_nm : ndarray, shape (u,)
+    removed_in_gaps_nm : ndarray, shape (u,)
         The same torque at the ticks with unknown torque.
     hum : tuple of Hum
         Hum that was removed, as estimated; its remainder is projected out.
     incoherent_rad : ndarray, shape (m,), or float
         Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
-    incoherent_nm, incoherent_at_unknown_nm : ndarray or float
+    incoherent_nm, incoherent_in_gaps_nm : ndarray or float
         Torque caused by that part of the angle, which was removed, at the retained samples and at
         the ticks with unknown torque.
     drag : DragExpansion, optional
@@ -111,11 +111,11 @@ class Comparison:
     decays: DecaySpectra
     later_decays: tuple[LaterDecaySpectra, ...] = ()
     removed_nm: NDArray[np.float64] | float = 0.0
-    removed_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    removed_in_gaps_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
     incoherent_rad: NDArray[np.float64] | float = 0.0
     incoherent_nm: NDArray[np.float64] | float = 0.0
-    incoherent_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    incoherent_in_gaps_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
     impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
@@ -240,7 +240,7 @@ class Comparison:
             self,
             torque_nm=remaining_nm,
             removed_nm=self.removed_nm + torque_nm,
-            removed_at_unknown_nm=self.removed_at_unknown_nm + unknown_tick_nm,
+            removed_in_gaps_nm=self.removed_in_gaps_nm + unknown_tick_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
@@ -295,7 +295,7 @@ class Comparison:
         """
         if self.measurement.reference_rad is None:
             return self.angle_rad
-        coherent_angle_rad = self._coherent_part(self.angle_rad)
+        coherent_angle_rad = self._coherent_angle_rad(self.angle_rad)
         # The speeds are compared, since a slow drift of the angle does not disturb the estimate.
         angle_power, incoherent_power = (
             np.sum(np.diff(angle_rad[self.retained]) ** 2)
@@ -307,7 +307,7 @@ class Comparison:
             else self.angle_rad
         )
 
-    def _coherent_part(
+    def _coherent_angle_rad(
         self, angle_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
         """Return the part of an angle in rad coherent with the controller's reference, shape (m,).
@@ -349,9 +349,9 @@ class Comparison:
         coherent_rad = self.coherent_rad()
         if coherent_rad is self.angle_rad:
             return self
-        return self._use_coherent_part(self.angle_rad, coherent_rad, plant)
+        return self._use_coherent_angle(self.angle_rad, coherent_rad, plant)
 
-    def _use_coherent_part(
+    def _use_coherent_angle(
         self,
         angle_rad: NDArray[np.float64],
         coherent_rad: NDArray[np.float64],
@@ -383,10 +383,10 @@ class Comparison:
             plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
         updated_comparison = replace(
-            self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=unknown_tick_nm
+            self, incoherent_nm=incoherent_nm, incoherent_in_gaps_nm=unknown_tick_nm
         )
         return updated_comparison._remove_torque(
-            incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_at_unknown_nm
+            incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
         )
 
     def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
@@ -420,10 +420,10 @@ class Comparison:
         )
         # The torque of a ringing beam moves the motor, and that motion changes the ringing.
         for _ in range(_FEEDBACK_ITERATIONS):
-            coherent_rad = self._coherent_part(
+            coherent_rad = self._coherent_angle_rad(
                 whole_angle_rad, coherent_prediction.with_angle(coherent_rad).torque(plant)[0]
             )
-        return self._use_coherent_part(whole_angle_rad, coherent_rad, plant)
+        return self._use_coherent_angle(whole_angle_rad, coherent_rad, plant)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
@@ -476,7 +476,7 @@ class Comparison:
             self,
             torque_nm=self.torque_nm - drag_torque.torque_nm,
             removed_nm=self.removed_nm + drag_torque.torque_nm[self.retained],
-            removed_at_unknown_nm=self.removed_at_unknown_nm + full_rate_nm[unknown_indices],
+            removed_in_gaps_nm=self.removed_in_gaps_nm + full_rate_nm[unknown_indices],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
@@ -554,7 +554,7 @@ class Comparison:
             return self
         filled_nm = self.measurement.torque_nm.copy()
         filled_nm[~known_mask] = (
-            self.removed_at_unknown_nm
+            self.removed_in_gaps_nm
             + self.prediction.torque_at_fine_samples(
                 plant, self.decimation.factor, self._decimated_indices(~known_mask)
             )[0]

@@ -198,21 +198,21 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
 class _DragFitStart:
     """Start values of a fit with air drag: plant, damping structure, drag law and noise.
 
-    `two_numbers` states whether both numbers of the drag law are estimated.
+    `has_two_numbers` states whether both numbers of the drag law are estimated.
     """
 
     plant: Plant
     structure: Structure
     law: DragLaw
     noise: NoiseSpectrum
-    two_numbers: bool = False
+    has_two_numbers: bool = False
 
     @classmethod
     def of(cls, refit: Refit) -> _DragFitStart:
         """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
-        two_numbers = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, two_numbers)
+        has_two_numbers = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_numbers)
 
 
 def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
@@ -294,8 +294,8 @@ def _converged_drag_fit(
     """
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(fit_start.plant)
-    law, noise, two_numbers = fit_start.law, fit_start.noise, fit_start.two_numbers
-    comparison, may_be_rough, cost_reduction = (
+    law, noise, has_two_numbers = fit_start.law, fit_start.noise, fit_start.has_two_numbers
+    comparison, is_rough_fit, cost_reduction = (
         start_comparison,
         tolerance > _COST_TOLERANCE,
         math.inf,
@@ -314,10 +314,10 @@ def _converged_drag_fit(
         assert drag_expansion is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         start_refit = descent(
-            x, columns=drag_expansion.by_law[: 1 + two_numbers], max_evaluations=1
+            x, columns=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
         )
         refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
-        if two_numbers or may_be_rough or _relative_std(refit) > _ONE_NUMBER_LAW_STD:
+        if has_two_numbers or is_rough_fit or _relative_std(refit) > _ONE_NUMBER_LAW_STD:
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
@@ -329,7 +329,7 @@ def _converged_drag_fit(
                 return start_refit
         else:
             # Not before: a second number would compensate for wrong damping of the beam.
-            two_numbers = True
+            has_two_numbers = True
             refit = descent(
                 refit.x, columns=drag_expansion.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
             )

@@ -44,7 +44,7 @@ _DERIVATIVE_STEP: Final = 1e-6
 """Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
 their range."""
 
-_MAX_STEPS: Final = 12
+_MAX_DESCENT_STEPS: Final = 12
 """Maximum number of Gauss-Newton steps in the fit of a cause."""
 
 _MAX_RELATIVE_STEP: Final = 1.0
@@ -53,10 +53,10 @@ _MAX_RELATIVE_STEP: Final = 1.0
 _MAX_CHI_SQUARE_RISE: Final = 10.0
 """Largest factor by which chi-square may rise in one Gauss-Newton step."""
 
-_MAX_HALVINGS: Final = 3
+_MAX_STEP_HALVINGS: Final = 3
 """Maximum number of times that a Gauss-Newton step is halved."""
 
-_CONVERGED_REDUCTION: Final = 0.02
+_CONVERGED_CHI_SQUARE_REDUCTION: Final = 0.02
 """Predicted reduction of chi-square below which the fit of a cause has converged, relative to
 chi-square or to 1 if that is larger."""
 
@@ -298,7 +298,7 @@ class _CauseSearch:
         direction it rises first and then falls further.
         """
         unknown_scale, lowest_chi_square, best_y = self._scale, math.inf, y
-        for _ in range(_MAX_STEPS):
+        for _ in range(_MAX_DESCENT_STEPS):
             whitened_deviation, derivatives = self._deviations_by_all(y)
             chi_square = float(whitened_deviation @ whitened_deviation)
             if chi_square < lowest_chi_square:
@@ -309,14 +309,16 @@ class _CauseSearch:
                 (self._lower - y) / unknown_scale,
                 (self._upper - y) / unknown_scale,
             )
-            if chi_square - predicted_chi_square < _CONVERGED_REDUCTION * max(chi_square, 1.0):
+            if chi_square - predicted_chi_square < _CONVERGED_CHI_SQUARE_REDUCTION * max(
+                chi_square, 1.0
+            ):
                 break
             scaled_step = (
                 scaled_step
                 * unknown_scale
                 * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(scaled_step).max()))
             )
-            for _ in range(_MAX_HALVINGS):
+            for _ in range(_MAX_STEP_HALVINGS):
                 new_deviation = self._deviations(np.clip(y + scaled_step, self._lower, self._upper))
                 if new_deviation @ new_deviation < _MAX_CHI_SQUARE_RISE * chi_square:
                     break
@@ -423,13 +425,13 @@ def _limited_step(
 def finding(
     test: UniformBeamTest, causes: Sequence[CauseFit], stiffness_step: StiffnessStep | None = None
 ) -> Finding:
-    """Return the finding that names possible causes of deviating modes.
+    """Return the finding that names possible causes of modes deviating from a uniform beam.
 
     Parameters
     ----------
     test : UniformBeamTest
         Test that refused the plain uniform beam.
-    found : sequence of CauseFit
+    causes : sequence of CauseFit
         Causes from `explanations`.
     stiffness_step : Step, optional
         Step of the stiffness during the record, from `best_stiffness_step`.

@@ -36,7 +36,7 @@ _SEARCH_HALF_WIDTHS: Final = 3.0
 """Half width of the frequency range in which a hum is searched for, in half widths of the
 resonance. A hum outside this range does not affect the mode."""
 
-_BLOCK_S: Final = 4.0
+_HUM_BLOCK_S: Final = 4.0
 """Duration in seconds of the overlapping blocks of the record in which a hum is searched for."""
 
 _ASSUMED_MODEL_ERROR: Final = 0.3
@@ -139,7 +139,7 @@ def find_hum_near_modes(
     predicted_nm, _ = comparison.prediction.torque(plant)
     measured_nm = comparison.torque_nm[comparison.retained] + comparison.hum_nm
     hz = comparison.frequency_hz
-    record_blocks = _Blocks(comparison.samples, comparison.decimation.rate_hz)
+    record_blocks = _HumBlocks(comparison.samples, comparison.decimation.rate_hz)
     found_hums: list[Hum] = []
     for pole in poles:
         if not pole.oscillates:
@@ -164,13 +164,13 @@ def find_hum_near_modes(
     return tuple(found_hums)
 
 
-class _Blocks:
+class _HumBlocks:
     """Overlapping windowed time blocks of a record, in which a steady sinusoid is searched for."""
 
     def __init__(self, sample_count: int, rate_hz: float) -> None:
         self.rate_hz = rate_hz
         self.time_s = np.arange(sample_count) / rate_hz
-        half_block = round(_BLOCK_S * rate_hz / 2)
+        half_block = round(_HUM_BLOCK_S * rate_hz / 2)
         self.window = np.hanning(2 * half_block + 1)[:-1]
         self.block_indices = np.arange(0, sample_count - 2 * half_block + 1, half_block)[
             :, None
@@ -188,9 +188,9 @@ class _Blocks:
 
         Parameters
         ----------
-        residual, predicted, free_decay : ndarray, shape (samples,)
+        residual_nm, predicted_nm, free_decay_nm : ndarray, shape (samples,)
             Torque in N·m: residual, prediction, and estimated free decay.
-        near_hz : tuple of float
+        range_hz : tuple of float
             Lowest and highest frequency of the search.
         noise_variance : float
             Variance of one sample of noise that is as strong as the noise near these frequencies,
@@ -206,10 +206,10 @@ class _Blocks:
         )
         block_power += self._largest_block_magnitudes(free_decay_nm, *range_hz) ** 2
         time_weight = np.zeros(residual_nm.size)
-        for silent_indices, block_weight in zip(
+        for block_samples, block_weight in zip(
             self.block_indices, noise_power / block_power, strict=True
         ):
-            time_weight[silent_indices] += block_weight * self.window
+            time_weight[block_samples] += block_weight * self.window
         if time_weight.mean() < _MIN_SILENT_FRACTION:
             return None
         hum, growth_per_s = self._fit_strongest_sinusoid(residual_nm, time_weight, range_hz)
@@ -239,7 +239,7 @@ class _Blocks:
 
         Only frequencies from `first_hz` to `last_hz` are considered.
         """
-        frequency_count = math.ceil((last_hz - first_hz) * _BLOCK_S * 2) + 1
+        frequency_count = math.ceil((last_hz - first_hz) * _HUM_BLOCK_S * 2) + 1
         hz = np.linspace(first_hz, last_hz, frequency_count)
         phase_rotation = np.exp(
             -2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz)

@@ -94,21 +94,21 @@ class DetectedImpact:
         Time, poles and amplitudes of the impact.
     explained_fraction : float
         Fraction of the unexplained cost that the impact explains.
-    power_ratio_before : float
+    residual_power_ratio : float
         Power of the residual in the two seconds before the impact, relative to its mean power in
         the record once the impact is removed.
     """
 
     knock: RecordedImpact
     explained_fraction: float
-    power_ratio_before: float
+    residual_power_ratio: float
 
     @property
     def evident(self) -> bool:
         """Return whether the impact explains most of the residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
-            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
         )
 
     @property
@@ -116,7 +116,7 @@ class DetectedImpact:
         """Return whether the impact explains so much that no other effect is tested first."""
         return (
             self.explained_fraction > _OBVIOUS_FRACTION
-            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
         )
 
 
@@ -125,7 +125,8 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
 
     An impact may be larger than the response to the motor, so that a fit to the whole record fails.
     One half of the record then contains no impact, or only a free decay at its start. So the search
-    also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
+    also uses the residual of fits to either half. With `obvious` it is limited to obvious
+    impacts.
     """
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
         return
@@ -165,7 +166,7 @@ def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
         impact_extent = _impact_extent(refit_around_impact, window_start, window_end)
         if impact_extent is None:
             return None
-        impact = _with_amplitudes(refit_around_impact, *impact_extent)
+        impact = _impact_with_amplitudes(refit_around_impact, *impact_extent)
         if impact.explained_fraction < _WORTHWHILE_FRACTION:
             return None
         if impact_extent[0] > window_start:
@@ -425,7 +426,7 @@ def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[in
     )
 
 
-def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
+def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
     """Return an impact between two samples with its amplitudes and explained cost fraction."""
     comparison = refit.objective.comparison
     impact = _impact_between(refit, first_sample, end_sample)
@@ -464,7 +465,7 @@ def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> Detect
         explained_fraction=float(
             (cost_before - remaining_cost) / max(cost_before - expected_cost, 1.0)
         ),
-        power_ratio_before=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
+        residual_power_ratio=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
         if before_impact.size
         else 0.0,
     )

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 _RELATIVE_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
 
-_LEAST_ETA: Final = 1e-5
+_MIN_LOSS_FACTOR: Final = 1e-5
 """Lower bound of eta, which is twice the damping ratio of a mode."""
 
-_LARGEST_ETA: Final = 1.0
+_MAX_LOSS_FACTOR: Final = 1.0
 """Upper bound of eta, which is twice the damping ratio of a mode."""
 
 _MAX_LOG_FREQUENCY_CHANGE: Final = 0.15
@@ -116,7 +116,9 @@ class ModalFit(ModalEstimate):
     ringing: Ringing
     span: NDArray[np.float64]
 
-    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def cost_reduction_by_spectrum(
+        self, torque_spectra: NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
         """Return by how much each of c additional torque spectra would reduce the cost, shape (c,).
 
         Each spectrum is added to the fit alone, with a free amplitude; the cost is the sum of
@@ -124,10 +126,10 @@ class ModalFit(ModalEstimate):
 
         Parameters
         ----------
-        columns : ndarray of complex, shape (c, K)
+        torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra in N·m, not whitened.
         """
-        whitened = np.ascontiguousarray(columns * self.noise.weight).view(np.float64)
+        whitened = np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
         whitened -= (whitened @ self.span.T) @ self.span
         projections = whitened @ self.residual.view(np.float64)
         squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
@@ -246,10 +248,10 @@ class _ModalSearch:
     def descend_to_minimum(self) -> _ModalSearch:
         """Return the search moved to the minimum of the cost under its noise estimate."""
         lower_bounds = np.column_stack(
-            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LEAST_ETA)]
+            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MIN_LOSS_FACTOR)]
         )
         upper_bounds = np.column_stack(
-            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LARGEST_ETA)]
+            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MAX_LOSS_FACTOR)]
         )
         minimum = descend(
             self.problem().normal_equations,
@@ -344,7 +346,7 @@ class _ModalSearch:
         cost_increases = self.evidence()
         if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
             return self
-        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _LEAST_ETA
+        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _MIN_LOSS_FACTOR
         search = self
         for mode_index in np.flatnonzero((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)[
             ::-1
@@ -462,7 +464,7 @@ class _LinearSolution:
     jacobian: NDArray[np.float64]
 
 
-def _unit_pole(eta: float) -> complex:
+def _relative_pole(eta: float) -> complex:
     """Return the pole of a mode over its undamped frequency in rad/s, for the loss factor eta.
 
     It is the root of ``1 + eta q + q²`` with positive imaginary part.
@@ -470,8 +472,8 @@ def _unit_pole(eta: float) -> complex:
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
-def _unit_pole_derivative(eta: float) -> complex:
-    """Return the derivative of `_unit_pole` with respect to the loss factor eta."""
+def _relative_pole_derivative(eta: float) -> complex:
+    """Return the derivative of `_relative_pole` with respect to the loss factor eta."""
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
@@ -516,10 +518,10 @@ class _ModalProblem:
         """
         poles = []
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
-            omega_rad_s, q = math.exp(log_omega), _unit_pole(eta)
+            omega_rad_s, q = math.exp(log_omega), _relative_pole(eta)
             pole_derivative = np.zeros(x.size, dtype=np.complex128)
             pole_derivative[2 * k] = omega_rad_s * q
-            pole_derivative[2 * k + 1] = omega_rad_s * _unit_pole_derivative(eta)
+            pole_derivative[2 * k + 1] = omega_rad_s * _relative_pole_derivative(eta)
             poles.append(Pole(self._numbers[k], omega_rad_s * q, pole_derivative))
         return poles
 
@@ -618,7 +620,7 @@ class _ModalProblem:
         ] / self.scale_rad_s ** np.arange(BACKGROUND_COEFFICIENTS)
         for k, (log_omega, eta) in enumerate(mode_points):
             omega_rad_s, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
-            q = _unit_pole(eta)
+            q = _relative_pole(eta)
             poles.append(omega_rad_s * q)
             residues.append(omega_rad_s * (a + b * q) * q * q / (2j * q.imag))
             # Add the polynomial part of (a + b q) q² over the denominator.
@@ -687,11 +689,11 @@ class _ModalProblem:
         for k in range(mode_count):
             log_omega, eta = x[2 * k : 2 * k + 2]
             a, b = solution.linear_parameters[2 * k : 2 * k + 2]
-            q = _unit_pole(eta)
+            q = _relative_pole(eta)
             residue_numerator = a + b * q
             # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
             log_residue = np.log(-residue_numerator * q * q / (2 * q.imag)) + log_omega
-            pole_derivative = _unit_pole_derivative(eta)
+            pole_derivative = _relative_pole_derivative(eta)
             residue_by_eta = (
                 b / residue_numerator + 2 / q
             ) * pole_derivative - pole_derivative.imag / q.imag

@@ -78,7 +78,7 @@ class Projected:
         )
 
 
-_MAX_FILLINGS: Final = 8
+_MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
 _UNKNOWNS_TOLERANCE: Final = 1e-6
@@ -107,12 +107,12 @@ class Objective:
         self,
         comparison: Comparison,
         unknowns: Unknowns,
-        columns: NDArray[np.complex128] | None = None,
+        effect_spectra: NDArray[np.complex128] | None = None,
     ) -> None:
         no_columns = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
-        self.columns = no_columns if columns is None else columns
+        self.columns = no_columns if effect_spectra is None else effect_spectra
         self._recent: RecentValues[Linearisation] = RecentValues()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
@@ -233,7 +233,7 @@ class Objective:
             Minimum of that objective.
         """
         x = start_unknowns
-        for _ in range(_MAX_FILLINGS):
+        for _ in range(_MAX_TORQUE_FILLINGS):
             objective = self._fill_unknown_torque(x)
             minimum = descend(
                 partial(objective.normal_equations, weight=weight),
