@@ -270,7 +270,7 @@ class CandidateSet:
 
     @property
     def likeliest(self) -> RecordFit:
-        """Return the fit of the candidate with the lowest cost."""
+        """Return the candidates' fit with the lowest cost, a sum of squared whitened residuals."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
@@ -314,9 +314,9 @@ class CandidateSet:
         )
 
     def _update_reference_following(self) -> CandidateSet:
-        """Re-estimate the part of the angle that follows the reference, and refit all candidates.
+        """Return the set refitted with a new estimate of the reference-following motor angle.
 
-        Return `self` if that part has converged.
+        Return `self` if the reference-following part of the angle has converged.
         """
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -527,7 +527,8 @@ class CandidateSet:
     ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-        The spectra represent effects in addition to the linear beam and replace `effect_spectra`.
+        The spectra represent effects in addition to the linear beam. They replace the `columns` of
+        the set.
         """
         new_set = replace(self, columns=effect_spectra, noise=noise)
         return new_set.with_candidates(
@@ -539,7 +540,7 @@ class CandidateSet:
         return replace(self, candidates=_by_rising_bic(candidates))
 
     def is_nearly_white(self, fit: RecordFit) -> bool:
-        """Return whether the residual of a fit passes the test of whiteness at the 1 % level."""
+        """Return whether the torque residual of a fit is white noise at the 1 % level."""
         used_bins = self.noise.counts
         return whiteness(
             fit.residual[used_bins], self.comparison.frequency_hz[used_bins]

@@ -55,7 +55,7 @@ it is larger, the motor followed another reference, and the whole angle is used.
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Data of one record in one band, ready to be compared with the torque that a plant predicts.
+    """Torque and angle of a record in a frequency band, compared with a plant's prediction.
 
     Attributes
     ----------

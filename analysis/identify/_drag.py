@@ -317,7 +317,7 @@ def _converged_drag_fit(
             x, columns=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
         )
         refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
-        if has_two_numbers or is_rough_fit or _relative_std(refit) > _ONE_NUMBER_LAW_STD:
+        if has_two_numbers or is_rough_fit or _relative_drag_std(refit) > _ONE_NUMBER_LAW_STD:
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
@@ -340,7 +340,7 @@ def _converged_drag_fit(
     return None
 
 
-def _relative_std(refit: Refit) -> float:
+def _relative_drag_std(refit: Refit) -> float:
     """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
     law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
@@ -427,7 +427,7 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
 
 # Damping of a mode against its amplitude
 
-_REPORTED_MODES: Final = (1, 2)
+_REPORTED_MODE_NUMBERS: Final = (1, 2)
 """Numbers of the modes whose damping ratio is reported at several amplitudes."""
 
 _RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
@@ -477,7 +477,7 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
     covariance = np.array(drag_estimate.covariance)
     estimates = []
     for mode_number in fit.modes:
-        if mode_number.number not in _REPORTED_MODES or mode_number.frequency_hz <= 0:
+        if mode_number.number not in _REPORTED_MODE_NUMBERS or mode_number.frequency_hz <= 0:
             continue
         for relative_amplitude in _RELATIVE_TIP_AMPLITUDES:
             tip_amplitude_m = relative_amplitude * fit.plant.beam.length_m

@@ -202,29 +202,33 @@ def _descend_with_noise(
     was far behind in them is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
-    noise = reference_descent.noise(with_lines=True)
+    noise_spectrum = reference_descent.noise(with_lines=True)
     hum = reference_descent.objective.comparison.hum
-    noise = replace(noise, lines=(*noise.lines, *(removed_hum.line for removed_hum in hum)))
+    noise_spectrum = replace(
+        noise_spectrum, lines=(*noise_spectrum.lines, *(removed_hum.line for removed_hum in hum))
+    )
     closest_descent = (
         searches[closest_index]
-        .descend_to_lowest(noise, reference_descent)
-        .descend_to_minimum(noise, _COST_TOLERANCE)
+        .descend_to_lowest(noise_spectrum, reference_descent)
+        .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
-    far_behind_ratio = math.exp(FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise.counts)))
-    cost_limit = far_behind_ratio * closest_descent.cost(noise)
-    descents = []
+    far_behind_ratio = math.exp(
+        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.counts))
+    )
+    cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
+    structure_descents = []
     for i, search in enumerate(searches):
         descent = closest_descent if i == closest_index else None
         if descent is None and earlier_descents:
             descent = _descent_if_still_worse(
-                Descent(search.objective, earlier_descents[i].x), noise, cost_limit
+                Descent(search.objective, earlier_descents[i].x), noise_spectrum, cost_limit
             )
         if descent is None:
-            descent = search.descend_to_lowest(noise).descend_to_minimum(
-                noise, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
+            descent = search.descend_to_lowest(noise_spectrum).descend_to_minimum(
+                noise_spectrum, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
             )
-        descents.append(descent)
-    return noise, descents
+        structure_descents.append(descent)
+    return noise_spectrum, structure_descents
 
 
 def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:

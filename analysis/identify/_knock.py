@@ -105,7 +105,7 @@ class DetectedImpact:
 
     @property
     def evident(self) -> bool:
-        """Return whether the impact explains most of the residual and begins abruptly."""
+        """Return whether the impact explains most of the torque residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
             and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
@@ -156,22 +156,22 @@ def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
     if start_sample is None:
         return None
     comparison = refit.objective.comparison
-    for width_s in _WINDOW_HALF_WIDTHS_S:
-        half_width = math.ceil(width_s * comparison.decimation.rate_hz)
+    for window_half_width_s in _WINDOW_HALF_WIDTHS_S:
+        half_width_samples = math.ceil(window_half_width_s * comparison.decimation.rate_hz)
         window_start, window_end = (
-            max(start_sample - half_width, 0),
-            min(start_sample + half_width, comparison.samples),
+            max(start_sample - half_width_samples, 0),
+            min(start_sample + half_width_samples, comparison.samples),
         )
         refit_around_impact = _fit_around_impact(refit, window_start, window_end)
         impact_extent = _impact_extent(refit_around_impact, window_start, window_end)
         if impact_extent is None:
             return None
-        impact = _impact_with_amplitudes(refit_around_impact, *impact_extent)
-        if impact.explained_fraction < _WORTHWHILE_FRACTION:
+        found_impact = _impact_with_amplitudes(refit_around_impact, *impact_extent)
+        if found_impact.explained_fraction < _WORTHWHILE_FRACTION:
             return None
         if impact_extent[0] > window_start:
-            return impact
-        if impact.explained_fraction < _EVIDENT_FRACTION:
+            return found_impact
+        if found_impact.explained_fraction < _EVIDENT_FRACTION:
             return None
         # A touch may have begun before this window: try the wider one.
     return None

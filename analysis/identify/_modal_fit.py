@@ -269,12 +269,14 @@ class _ModalSearch:
             search = search.descend_to_minimum()
             problem = search.problem()
             modal_model = problem.model(search.x)
-            residual = problem.residual(search.x, modal_model)
+            residual_spectrum = problem.residual(search.x, modal_model)
             comparison = search.comparison.renewed(modal_model, search.noise).fill_unknown_torque(
                 modal_model
             )
-            noise_power = smooth_power(residual, finely=True)
-            noise_power = noise_power_with_peaks(residual, noise_power, ~search.is_near_mode())
+            noise_power = smooth_power(residual_spectrum, finely=True)
+            noise_power = noise_power_with_peaks(
+                residual_spectrum, noise_power, ~search.is_near_mode()
+            )
             noise_power /= comparison.measurement.known_torque_fraction
             used_bins = search.noise.counts
             mean_log_change = np.abs(np.log(noise_power / search.noise.power)[used_bins]).mean()
@@ -404,7 +406,7 @@ class _ModalSearch:
         solution = problem.solution_at(x)
         joint_covariance = problem.covariance(solution)
         constants, covariance = problem.constants(solution, x, joint_covariance)
-        residual = solution.residual.view(np.complex128)
+        residual_spectrum = solution.residual.view(np.complex128)
         used_bins = search.noise.counts
         return ModalFit(
             model=problem.model(x),
@@ -412,9 +414,11 @@ class _ModalSearch:
             constants=constants,
             joint_covariance=covariance,
             evidence=tuple(cost_increases.tolist()),
-            residual=residual,
+            residual=residual_spectrum,
             noise=search.noise,
-            whiteness=whiteness(residual[used_bins], search.comparison.frequency_hz[used_bins]),
+            whiteness=whiteness(
+                residual_spectrum[used_bins], search.comparison.frequency_hz[used_bins]
+            ),
             input_relation=search.residual_dependence_on_angle(solution),
             ringing=problem.ringing(solution, joint_covariance),
             span=np.concatenate([solution.span, _orthonormal_rows(solution.jacobian)[0]]),
@@ -589,8 +593,10 @@ class _ModalProblem:
         poles = self._poles(x)
         nuisance_spectra = self._whiten(self._nuisance_spectra(poles))
         drag_spectrum, *drag_jacobian = self._whiten(self._drag_change(poles))
-        columns = np.concatenate([spectra[:numerator_count], self._background, nuisance_spectra])
-        span, triangular_factor = _orthonormal_rows(columns)
+        linear_spectra = np.concatenate(
+            [spectra[:numerator_count], self._background, nuisance_spectra]
+        )
+        span, triangular_factor = _orthonormal_rows(linear_spectra)
         measured_torque = self._measured_torque - drag_spectrum
         projections = span @ measured_torque
         residual = projections @ span - measured_torque
@@ -606,7 +612,7 @@ class _ModalProblem:
             jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
         projected_jacobian = jacobian - (jacobian @ span.T) @ span
         return _LinearSolution(
-            residual, linear_parameters, columns, span, jacobian, projected_jacobian
+            residual, linear_parameters, linear_spectra, span, jacobian, projected_jacobian
         )
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:

@@ -72,7 +72,7 @@ def replace_by_modal_model(
     *,
     half_width: float = NORMAL_95,
 ) -> _EstimatesT:
-    """Replace the estimates for an exactly uniform beam by those of more general models.
+    """Return the estimates with those of an exactly uniform beam replaced by more general ones.
 
     Modes come from the modal model. Parameters come from the beam with a tolerance of the geometry.
 

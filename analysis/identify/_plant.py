@@ -26,7 +26,7 @@ the age of the torque relative to the angle, and the inertia between torque sens
 
 
 def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
-    """Return the `SETTINGS` that are not fixed, in their order.
+    """Return the names of the plant's `SETTINGS` that are not fixed, in the order of `SETTINGS`.
 
     Parameters
     ----------
