@@ -82,9 +82,9 @@ class Rig:
         moved = moved / (1 + 1.4 * S / loop + (S / loop) ** 2)
         self.grid = ResponseGrid(S)
         self.angle = answer(moved)
-        self.torque = answer(self.grid.evaluate(self.plant, angle=moved)[0])
+        self.torque = answer(self.grid.evaluate(self.plant, angle_transform=moved)[0])
         self.turned = 500 * S * (S + 310) / (S + 80) ** 4 * np.exp(-S / RATE_HZ)
-        self.answered = self.grid.evaluate(self.plant, angle=self.turned)[0]
+        self.answered = self.grid.evaluate(self.plant, angle_transform=self.turned)[0]
 
     def session(self, seed: int, *, fed_back: bool) -> Records:
         """Measure with noise that does or does not move the motor."""

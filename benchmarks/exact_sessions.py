@@ -62,5 +62,5 @@ def session(plant: Plant) -> Session:
     s = 5.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
     loop = 2 * np.pi * 20
     angle = np.fft.rfft(reference * decay, 4 * n) / (1 + 1.4 * s / loop + (s / loop) ** 2)
-    torque = ResponseGrid(s).evaluate(plant, angle=angle)[0]
+    torque = ResponseGrid(s).evaluate(plant, angle_transform=angle)[0]
     return Session(*(np.fft.irfft(x, 4 * n)[:n] / decay for x in (angle, torque)))

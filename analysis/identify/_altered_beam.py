@@ -36,13 +36,13 @@ if TYPE_CHECKING:
 GRAVITY_M_S2: Final = 9.81
 """Acceleration of gravity, in m/s²."""
 
-_BASIS_MODES: Final = 14
+_BASIS_MODE_COUNT: Final = 14
 """Number of modes of the uniform beam in the basis."""
 
-_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODES + 1)[-1])
+_NEXT_EIGENVALUE: Final = float(clamped_free_eigenvalues(_BASIS_MODE_COUNT + 1)[-1])
 """Eigenvalue k L of the first mode of the uniform beam that is not in the basis."""
 
-_POINTS_PER_HALF: Final = 32
+_QUADRATURE_POINTS_PER_HALF: Final = 32
 """Number of quadrature points in each half of the beam."""
 
 _SLOPE_STEP: Final = 1e-5
@@ -67,7 +67,7 @@ is a cosine of one period."""
 
 @dataclass(frozen=True, slots=True)
 class Alteration:
-    """Deviations of a rig from a plain uniform beam on a rigid clamp.
+    """Deviations of a rig from a uniform beam on a rigid clamp with an ideal torque channel.
 
     Attributes
     ----------
@@ -103,7 +103,7 @@ class Alteration:
 
     @classmethod
     def stated(cls, nominal: Plant, tilt_deg: float | None = None) -> Alteration:
-        """Return the alterations that the file states: the mass at the tip and the inclination.
+        """Return the alteration that the session file states: tip mass and gravity by inclination.
 
         Parameters
         ----------
@@ -119,25 +119,33 @@ class Alteration:
             gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(tilt_deg or 0.0)),
         )
 
-    def has_same_shapes(self, other: Alteration) -> bool:
-        """Return whether another alteration leads to the same mode shapes."""
+    def has_same_shapes(self, other_alteration: Alteration) -> bool:
+        """Return whether two alterations differ at most in what leaves the mode shapes unchanged.
+
+        This is the relaxation of the material, and the lags of the torque channel.
+        """
         return self == replace(
-            other, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
+            other_alteration, relaxation=self.relaxation, sensor=self.sensor, lag_s=self.lag_s
         )
 
     def channel(self, s: NDArray[np.complex128]) -> NDArray[np.complex128] | float:
-        """Return the transfer function of the torque channel's lags at `s` in rad/s."""
-        time_s, inverse_quality = self.sensor
+        """Return the dimensionless transfer function of the torque channel's lags.
+
+        `s` is the Laplace variable in rad/s. The result is 1.0 if the channel has no lag.
+        """
+        sensor_time_s, inverse_quality = self.sensor
         response: NDArray[np.complex128] | float = 1.0
-        if time_s:
-            q = s * time_s
+        if sensor_time_s:
+            q = s * sensor_time_s
             response = 1 / (1 + inverse_quality * q + q * q)
         return response / (1 + self.lag_s * s) if self.lag_s else response
 
 
 @dataclass(frozen=True, slots=True)
 class ModeTerms:
-    """Galerkin coefficients of n modes of an altered beam; the module defines D and its terms.
+    """Galerkin coefficients of n modes of an altered beam.
+
+    The documentation of the module defines the dynamic stiffness D and its terms.
 
     Attributes
     ----------
@@ -195,16 +203,24 @@ class _Basis:
     def weighted_products(
         self, rows: NDArray[np.float64], profile: NDArray[np.float64]
     ) -> NDArray[np.float64]:
-        """Return the integrals of products of two rows, weighted by a profile, shape (N, N)."""
+        """Return the integrals over the beam of products of two functions, shape (N, N).
+
+        The N functions are given as `rows` of values at the quadrature points. Each product is
+        weighted by a `profile`, the values of another function at these points.
+        """
         integrals: NDArray[np.float64] = (rows * (self.weights * profile)) @ rows.T
         return integrals
 
     def deviation(self, deviations: Sequence[tuple[Profile, float]]) -> NDArray[np.float64]:
-        """Return the sum of relative deviations at the quadrature points, shape (points,)."""
-        total = np.zeros(self.x.size)
+        """Return the sum of relative deviations of density or stiffness, shape (points,).
+
+        Each deviation is a profile along the beam and its size. The sum is evaluated at the
+        quadrature points.
+        """
+        total_deviation = np.zeros(self.x.size)
         for profile, size in deviations:
-            total += size * _PROFILE_FUNCTIONS[profile](self.x)
-        return total
+            total_deviation += size * _PROFILE_FUNCTIONS[profile](self.x)
+        return total_deviation
 
 
 _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[np.float64]]]] = {
@@ -216,24 +232,27 @@ _PROFILE_FUNCTIONS: Final[dict[Profile, Callable[[NDArray[np.float64]], NDArray[
 
 
 def _basis_shapes(x: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the shapes of the basis modes at relative positions along the beam, (N, …)."""
-    return np.array([mode_shape(number, x) for number in range(1, _BASIS_MODES + 1)])
+    """Return the N shapes of the basis modes at positions relative to the length, (N, …)."""
+    return np.array([mode_shape(mode_number, x) for mode_number in range(1, _BASIS_MODE_COUNT + 1)])
 
 
 @lru_cache(maxsize=32)
 def _basis_shapes_at_lump(position: float) -> NDArray[np.float64]:
-    """Return the shapes of the basis modes at one relative position, (N,); read-only and cached."""
+    """Return the basis modes' deflections at one position relative to the length, shape (N,).
+
+    The array is cached and must not be changed.
+    """
     return _basis_shapes(np.array(position))
 
 
 @lru_cache(maxsize=1)
 def _basis() -> _Basis:
     """Return the cached basis: the first modes of the uniform beam, with their integrals."""
-    nodes, weights = np.polynomial.legendre.leggauss(_POINTS_PER_HALF)
-    x = np.concatenate([0.25 * (nodes + 1), 0.25 * (nodes + 3)])
+    quadrature_nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS_PER_HALF)
+    x = np.concatenate([0.25 * (quadrature_nodes + 1), 0.25 * (quadrature_nodes + 3)])
     weights = np.tile(weights / 4, 2)
-    z = clamped_free_eigenvalues(_BASIS_MODES)
-    signs = (-1.0) ** np.arange(_BASIS_MODES)
+    z = clamped_free_eigenvalues(_BASIS_MODE_COUNT)
+    signs = (-1.0) ** np.arange(_BASIS_MODE_COUNT)
     shapes, slopes = (
         _basis_shapes(x),
         (_basis_shapes(x + _SLOPE_STEP) - _basis_shapes(x - _SLOPE_STEP)) / (2 * _SLOPE_STEP),
@@ -260,37 +279,39 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     represents all modes beyond the basis.
     """
     basis = _basis()
-    length, indices = beam.length_m, np.array(modes) - 1
+    length_m, mode_indices = beam.length_m, np.array(modes) - 1
     lump_count = len(alteration.lumps)
 
-    def with_lump_modes(array: NDArray[np.float64], value: float = 0.0) -> NDArray[np.float64]:
+    def with_lump_modes(
+        uniform_beam_array: NDArray[np.float64], diagonal_value: float = 0.0
+    ) -> NDArray[np.float64]:
         if not lump_count:
-            return array
-        extended = np.zeros((_BASIS_MODES + lump_count,) * array.ndim)
-        extended[(slice(_BASIS_MODES),) * array.ndim] = array
-        lump_indices = range(_BASIS_MODES, _BASIS_MODES + lump_count)
-        extended[(lump_indices,) * array.ndim] = value
-        return extended
+            return uniform_beam_array
+        extended_array = np.zeros((_BASIS_MODE_COUNT + lump_count,) * uniform_beam_array.ndim)
+        extended_array[(slice(_BASIS_MODE_COUNT),) * uniform_beam_array.ndim] = uniform_beam_array
+        lump_indices = range(_BASIS_MODE_COUNT, _BASIS_MODE_COUNT + lump_count)
+        extended_array[(lump_indices,) * uniform_beam_array.ndim] = diagonal_value
+        return extended_array
 
     density_deviation = basis.deviation(alteration.density)
     mass = with_lump_modes(
-        np.eye(_BASIS_MODES) + basis.weighted_products(basis.shapes, density_deviation), 1.0
+        np.eye(_BASIS_MODE_COUNT) + basis.weighted_products(basis.shapes, density_deviation), 1.0
     )
     mass_arm = with_lump_modes(
         basis.arms + basis.shapes @ (basis.weights * density_deviation * basis.x)
     )
     lump, lump_arm = np.zeros_like(mass), np.zeros_like(mass_arm)
     tension, tension_arm = with_lump_modes(basis.tension), with_lump_modes(basis.arms_of_tension)
-    for index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODES):
+    for lump_index, (position, mass_kg) in enumerate(alteration.lumps, start=_BASIS_MODE_COUNT):
         mass_fraction, shape = (
-            mass_kg / (beam.density_kg_per_m * length),
+            mass_kg / (beam.density_kg_per_m * length_m),
             with_lump_modes(_basis_shapes_at_lump(position).copy()),
         )
         # All modes beyond the basis act on a point mass as one spring, and move as one mode.
         flexibility_beyond_basis = position**3 / 3 - float(
-            np.sum((shape[:_BASIS_MODES] / basis.z**2) ** 2)
+            np.sum((shape[:_BASIS_MODE_COUNT] / basis.z**2) ** 2)
         )
-        shape[index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
+        shape[lump_index] = math.sqrt(max(flexibility_beyond_basis, 0.0)) * _NEXT_EIGENVALUE**2
         lump += mass_fraction * np.outer(shape, shape)
         lump_arm += mass_fraction * position * shape
         if alteration.gravity_m_s2:
@@ -305,10 +326,10 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     beam_flexibility = with_lump_modes(
         basis.weighted_products(moments, relative_flexibility), _NEXT_EIGENVALUE**-4.0
     )
-    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODES) / basis.z**2)
+    root_moments = with_lump_modes(2 * (-1.0) ** np.arange(_BASIS_MODE_COUNT) / basis.z**2)
     clamp_flexibility: Terms = alteration.clamp_compliance * np.outer(root_moments, root_moments)
     elastic_stiffness: Terms = np.linalg.inv(beam_flexibility + clamp_flexibility)
-    gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length**3
+    gravity_factor = alteration.gravity_m_s2 * beam.density_over_stiffness * length_m**3
     # Eigenvalues are 1 / omega²: the largest ones, of the lowest modes, are the most exact.
     inverse_factor = np.linalg.inv(np.linalg.cholesky(elastic_stiffness + gravity_factor * tension))
     inverse_squares, eigenvectors = np.linalg.eigh(
@@ -316,31 +337,36 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
     )
     inverse_squares, eigenvectors = inverse_squares[::-1], eigenvectors[:, ::-1]
     all_shapes = inverse_factor.T @ eigenvectors / np.sqrt(inverse_squares)  # of modal mass 1
-    shapes: Terms = all_shapes[:, indices]
+    shapes: Terms = all_shapes[:, mode_indices]
     if alteration.clamp_loss:
         clamp_flexibility = clamp_flexibility / (1 + 1j * alteration.clamp_loss)
         elastic_stiffness = np.linalg.inv(beam_flexibility + clamp_flexibility)
         shapes = _complex_shapes(elastic_stiffness + gravity_factor * tension, mass + lump, shapes)
-    loads = elastic_stiffness @ shapes
+    modal_loads = elastic_stiffness @ shapes
     modal_masses = np.sum(shapes * shapes, axis=0)
     # Losses change the mode shapes to first order, and so the phase of the residues.
-    eigenvalue_differences = 1 / inverse_squares[indices] - 1 / inverse_squares[:, None]
-    eigenvalue_differences[indices, np.arange(indices.size)] = np.inf
+    eigenvalue_differences = 1 / inverse_squares[mode_indices] - 1 / inverse_squares[:, None]
+    eigenvalue_differences[mode_indices, np.arange(mode_indices.size)] = np.inf
     mass_arms = (mass_arm + lump_arm) @ all_shapes
     turn_by_medium = mass_arms @ ((all_shapes.T @ shapes) / eigenvalue_differences)
     turn_by_internal = mass_arms @ (
-        ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ loads) / eigenvalue_differences
+        ((elastic_stiffness @ all_shapes).T @ beam_flexibility @ modal_loads)
+        / eigenvalue_differences
     )
 
-    def modal_coefficients(matrix: NDArray[np.float64]) -> Terms:
-        coefficients: Terms = np.sum(shapes * (matrix @ shapes), axis=0) / modal_masses
+    def modal_coefficients(coefficient_matrix: NDArray[np.float64]) -> Terms:
+        coefficients: Terms = np.sum(shapes * (coefficient_matrix @ shapes), axis=0) / modal_masses
         return coefficients
 
     root_modal_masses = np.sqrt(modal_masses)
-    gravity_per_length = alteration.gravity_m_s2 / length
+    gravity_per_length = alteration.gravity_m_s2 / length_m
     return ModeTerms(
-        stiffness=np.sum(loads * (beam_flexibility @ loads), axis=0) / modal_masses / length**4,
-        clamp=np.sum(loads * (clamp_flexibility @ loads), axis=0) / modal_masses / length**4,
+        stiffness=np.sum(modal_loads * (beam_flexibility @ modal_loads), axis=0)
+        / modal_masses
+        / length_m**4,
+        clamp=np.sum(modal_loads * (clamp_flexibility @ modal_loads), axis=0)
+        / modal_masses
+        / length_m**4,
         mass=modal_coefficients(mass),
         lump=modal_coefficients(lump),
         tension=gravity_per_length * modal_coefficients(tension),
@@ -348,7 +374,7 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
         lump_arm=lump_arm @ shapes / root_modal_masses,
         medium_arm=with_lump_modes(basis.arms) @ shapes / root_modal_masses,
         tension_arm=gravity_per_length * (tension_arm @ shapes) / root_modal_masses,
-        turn_by_medium=turn_by_medium / root_modal_masses * length**4,
+        turn_by_medium=turn_by_medium / root_modal_masses * length_m**4,
         turn_by_internal=turn_by_internal / root_modal_masses,
         density_kg_per_m=beam.density_kg_per_m,
         alteration=alteration,
@@ -356,18 +382,22 @@ def galerkin_mode_terms(alteration: Alteration, beam: Beam, modes: tuple[int, ..
 
 
 def _complex_shapes(
-    elastic: Terms, mass: NDArray[np.float64], shapes: Terms
+    stiffness_matrix: Terms, mass_matrix: NDArray[np.float64], lossless_shapes: Terms
 ) -> NDArray[np.complex128]:
-    """Return the complex mode shapes with a lossy clamp in the basis, shape (N, n).
+    """Return the mode shapes of a beam in a lossy clamp, as coefficients of the basis, (N, n).
 
-    They follow by inverse iteration from `shapes`, those without the loss.
+    The result is complex. It follows by inverse iteration from `lossless_shapes`, those of a
+    clamp without loss.
     """
-    complex_shapes = shapes.astype(np.complex128)
-    for mode in complex_shapes.T:
+    complex_shapes = lossless_shapes.astype(np.complex128)
+    for mode_index in complex_shapes.T:
         for _ in range(_INVERSE_ITERATIONS):
-            eigenvalue = (mode @ elastic @ mode) / (mode @ mass @ mode)
-            next_shape = np.linalg.solve(
-                elastic - eigenvalue * (1 + _RELATIVE_SHIFT) * mass, mass @ mode
+            eigenvalue = (mode_index @ stiffness_matrix @ mode_index) / (
+                mode_index @ mass_matrix @ mode_index
             )
-            mode[:] = next_shape / np.sqrt(next_shape @ mass @ next_shape)
+            next_shape = np.linalg.solve(
+                stiffness_matrix - eigenvalue * (1 + _RELATIVE_SHIFT) * mass_matrix,
+                mass_matrix @ mode_index,
+            )
+            mode_index[:] = next_shape / np.sqrt(next_shape @ mass_matrix @ next_shape)
     return complex_shapes

@@ -18,7 +18,9 @@ become the best one, however exactly its minimum is found."""
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """One damping structure fitted to one record, on a uniform beam.
+    """Fit of one damping structure (a choice of free damping parameters) to one record.
+
+    The beam is uniform.
 
     Attributes
     ----------
@@ -26,32 +28,34 @@ class Candidate:
         Damping structure.
     fit : RecordFit
         Fit of this structure to the record.
-    columns : int
+    effect_count : int
         Number of nonlinear effects with a free amplitude, in addition to the parameters of the fit.
     """
 
     structure: Structure
     fit: RecordFit
-    columns: int = 0
+    effect_count: int = 0
 
     @property
     def parameters(self) -> int:
-        """Return the number of free parameters, without the amplitudes of the free decay.
+        """Return the number of fitted parameters, except the amplitudes of the free decay.
 
         These amplitudes are common to all candidates.
         """
-        return len(self.fit.interval) + self.columns
+        return len(self.fit.interval) + self.effect_count
 
     @property
     def values(self) -> int:
         """Return the number of real values of the record to which the candidate is fitted."""
         fit = self.fit
-        decays = fit.ringing.degrees_of_freedom
-        return fit.degrees_of_freedom + len(fit.interval) + decays + self.columns
+        decay_amplitude_count = fit.ringing.degrees_of_freedom
+        return (
+            fit.degrees_of_freedom + len(fit.interval) + decay_amplitude_count + self.effect_count
+        )
 
     @property
     def deviance(self) -> float:
-        """Return ``-2 ln`` of the likelihood, up to a constant.
+        """Return the deviance: ``-2 ln`` of the likelihood, up to a constant.
 
         The noise spectrum is known up to its level, which is estimated.
         """
@@ -59,7 +63,7 @@ class Candidate:
 
     @property
     def bic(self) -> float:
-        """Return the Bayesian information criterion.
+        """Return the Bayesian information criterion (BIC) of the fit; a lower one is better.
 
         G. Schwarz, Annals of Statistics 6 (1978) 461-464.
         """
@@ -67,7 +71,7 @@ class Candidate:
 
     @property
     def aic(self) -> float:
-        """Return Akaike's information criterion.
+        """Return Akaike's information criterion (AIC) of the fit; a lower one is better.
 
         H. Akaike, IEEE Trans. Automatic Control 19 (1974) 716-723.
         """
@@ -75,5 +79,5 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Return the name of the structure, as tables show it."""
+        """Return the name of the damping structure, as tables show it: "III", for example."""
         return self.structure.name

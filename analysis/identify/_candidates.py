@@ -55,13 +55,13 @@ _CERTAIN_COEFFICIENT_OVER_STD: Final = 5.0
 """Ratio of a damping coefficient to its standard deviation above which the damping is certainly
 significant, so that no structure without it is fitted."""
 
-_FREEST: Final = STRUCTURES["VI"]
+_FREEST_STRUCTURE: Final = STRUCTURES["VI"]
 """Structure with internal and external damping, both of free order."""
 
-_ONE_DAMPING: Final = (STRUCTURES["IV"], STRUCTURES["V"])
+_ONE_DAMPING_STRUCTURES: Final = (STRUCTURES["IV"], STRUCTURES["V"])
 """Structures with only internal or only external damping, of free order."""
 
-_INTEGER_ORDER: Final = STRUCTURES["VII"]
+_INTEGER_ORDER_STRUCTURE: Final = STRUCTURES["VII"]
 """Structure with internal and external damping whose internal damping has order 1."""
 
 _ROUGH_FIT_EVALUATIONS: Final = 3
@@ -78,7 +78,9 @@ continued; it is relative to the present cost of the candidate."""
 
 @dataclass(frozen=True, slots=True)
 class CandidateSet:
-    """All candidates for one record, with the data that a further fit needs.
+    """All candidates (fits of one damping structure each) for one record.
+
+    The set also contains the data that a further fit needs.
 
     Attributes
     ----------
@@ -114,7 +116,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet:
-        """Fit every structure to a record, on a uniform beam.
+        """Fit every damping structure to a record, on a uniform beam; return the candidate set.
 
         If a sign or unit of the record is wrong, only the freest structure is fitted.
 
@@ -139,7 +141,7 @@ class CandidateSet:
         fixed: tuple[Setting, ...],
         band_hz: tuple[float, float],
     ) -> CandidateSet | None:
-        """Fit the candidates of an earlier part of the record to the longer record.
+        """Refit the candidates for the beginning of a record to the record as it is now, longer.
 
         Each descent starts from the last estimate of the candidate. Return None if the residual of
         the first candidate exceeds the noise, or if it includes nonlinear effects: then a full
@@ -162,7 +164,7 @@ class CandidateSet:
             The record cannot be used.
         """
         first_candidate, *other_candidates = earlier
-        if first_candidate.columns:
+        if first_candidate.effect_count:
             return None  # nonlinear effects are searched for again, in the whole record
         unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
@@ -190,30 +192,36 @@ class CandidateSet:
         band_hz: tuple[float, float],
         additional: tuple[Structure, ...] = (),
     ) -> CandidateSet:
-        """Fit the structure with free orders, and the `additional` structures, on a uniform beam.
+        """Fit the damping structure with free orders, and the `additional` structures, to a record.
+
+        The beam is uniform.
 
         Raises
         ------
         MeasurementError
             The record cannot be used.
         """
-        structures = (_FREEST, *additional)
+        structures = (_FREEST_STRUCTURE, *additional)
         return cls._of_uniform_beam(
             fit_record(measurement, structures, fixed=fixed, band_hz=band_hz), fixed
         )
 
     @classmethod
-    def _of_uniform_beam(cls, uniform: RecordAnalysis, fixed: tuple[Setting, ...]) -> CandidateSet:
-        """Return the candidate set of fits to a uniform beam."""
+    def _of_uniform_beam(
+        cls, uniform_analysis: RecordAnalysis, fixed: tuple[Setting, ...]
+    ) -> CandidateSet:
+        """Return the candidate set of an analysis that fitted structures on a uniform beam."""
         return cls._from_analysis(
-            uniform, fixed, (Candidate(fit.structure, fit) for fit in uniform.fits)
+            uniform_analysis,
+            fixed,
+            (Candidate(fit.structure, fit) for fit in uniform_analysis.fits),
         )
 
     @classmethod
     def _from_analysis(
         cls, analysis: RecordAnalysis, fixed: tuple[Setting, ...], candidates: Iterable[Candidate]
     ) -> CandidateSet:
-        """Return a candidate set of given candidates, with comparison and noise of an analysis."""
+        """Return a set of given candidates, with the record and noise of an analysis."""
         comparison = analysis.comparison
         return cls(
             comparison=comparison,
@@ -225,7 +233,10 @@ class CandidateSet:
 
     @property
     def best(self) -> Candidate:
-        """Return the first candidate: that of the lowest BIC, or of `with_leading_candidate`."""
+        """Return the first candidate, which is reported.
+
+        It is that of the lowest BIC unless `with_leading_candidate` moved another one to the front.
+        """
         return self.candidates[0]
 
     @property
@@ -239,10 +250,12 @@ class CandidateSet:
         candidate.
         """
         by_structure = {c.structure.name: c for c in self.candidates}
-        freest_candidate = by_structure.get(_FREEST.name)
+        freest_candidate = by_structure.get(_FREEST_STRUCTURE.name)
         if freest_candidate is None:
             return self.best
-        one_damping = [by_structure[s.name] for s in _ONE_DAMPING if s.name in by_structure]
+        one_damping = [
+            by_structure[s.name] for s in _ONE_DAMPING_STRUCTURES if s.name in by_structure
+        ]
         best_one_damping = min(one_damping, key=lambda c: c.deviance, default=freest_candidate)
         return (
             best_one_damping
@@ -257,7 +270,7 @@ class CandidateSet:
 
     @property
     def likeliest(self) -> RecordFit:
-        """Return the fit of the candidate with the lowest cost."""
+        """Return the candidates' fit with the lowest cost, a sum of squared whitened residuals."""
         return min((candidate.fit for candidate in self.candidates), key=lambda fit: fit.cost)
 
     @property
@@ -270,37 +283,40 @@ class CandidateSet:
         return self.best.bic + 2 * float(np.sum(np.log(self.noise.power[self.noise.counts])))
 
     def unknowns(self, structure: Structure) -> Unknowns:
-        """Return the unknowns of a structure on this record, as the coordinates of a search."""
+        """Return the unknown parameters that a fit of a damping structure to this record varies."""
         return Unknowns.of(structure, self.comparison.measurement.nominal, self.free)
 
     def refit(self, candidate: Candidate, max_evaluations: int = DESCENT_EVALUATIONS) -> Refit:
-        """Return the minimum reached by a descent from the estimate of a candidate."""
+        """Return the minimum of the cost that a descent reaches from a candidate's estimate."""
         return self.descend_from_plant(candidate.fit.plant, candidate.structure, max_evaluations)
 
     def descend_from_plant(
         self, plant: Plant, structure: Structure, max_evaluations: int = DESCENT_EVALUATIONS
     ) -> Refit:
-        """Return the minimum reached by a descent from a plant, with a given structure."""
+        """Return the minimum of the cost that a descent reaches from a plant's parameters.
+
+        The damping `structure` determines which parameters are free.
+        """
         unknowns = self.unknowns(structure)
         return self.descent(unknowns, unknowns.vector(plant), max_evaluations)
 
     def descent(
-        self, unknowns: Unknowns, start: NDArray[np.float64], max_evaluations: int
+        self, unknowns: Unknowns, start_point: NDArray[np.float64], max_evaluations: int
     ) -> Refit:
-        """Return the minimum reached by a descent from a vector of unknowns."""
+        """Return the minimum of the cost that a descent reaches from a vector of unknowns."""
         return Refit.descend(
             self.comparison,
             unknowns,
-            start,
+            start_point,
             self.noise,
             self.columns,
             max_evaluations=max_evaluations,
         )
 
     def _update_reference_following(self) -> CandidateSet:
-        """Re-estimate the part of the angle that follows the reference, and refit all candidates.
+        """Return the set refitted with a new estimate of the reference-following motor angle.
 
-        Return `self` if that part has converged.
+        Return `self` if the reference-following part of the angle has converged.
         """
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
@@ -332,7 +348,7 @@ class CandidateSet:
         return self.refit_under_noise(noise) if noise is not self.noise else self
 
     def refit_under_noise(self, noise: NoiseSpectrum) -> CandidateSet:
-        """Fit all candidates again under a slightly different noise spectrum."""
+        """Return the set with all candidates refitted under a slightly different noise spectrum."""
         new_set = replace(self, noise=noise)
         return new_set.with_candidates(
             self._refit_in(new_set, c, REFIT_EVALUATIONS) for c in self.candidates
@@ -341,11 +357,13 @@ class CandidateSet:
     def _refit_in(
         self, new_set: CandidateSet, candidate: Candidate, max_evaluations: int
     ) -> Candidate:
-        """Fit one candidate again with the data of another candidate set.
+        """Return a candidate refitted with the record, noise and effects of another set.
 
         A candidate whose BIC is far above the lowest one is fitted only roughly.
         """
-        bic_difference = candidate.bic - min(each.bic for each in self.candidates)
+        bic_difference = candidate.bic - min(
+            candidate_of_set.bic for candidate_of_set in self.candidates
+        )
         return new_set.refit(
             candidate,
             max_evaluations
@@ -370,28 +388,28 @@ class CandidateSet:
         return candidate_set
 
     def restart_from_plant(self, plant: Plant) -> CandidateSet:
-        """Refit each candidate, starting from a plant that another search found."""
+        """Refit each candidate from a plant that another search found; keep the better fits."""
         return self.with_candidates(
             self._refit_from_plant(c, plant) for c in self.candidates
         ).cross_check()
 
     def _refit_from_plant(self, candidate: Candidate, plant: Plant) -> Candidate:
-        """Fit a candidate starting from another plant; return the better of old and new fit.
+        """Return the better of a candidate and its refit that starts from another plant.
 
         The candidate is unchanged if the plant has a damping that its structure lacks.
         """
         structure, damping = candidate.structure, plant.damping
         if (damping.zeta and not structure.internal) or (damping.gamma and not structure.external):
             return candidate
-        start = self.descend_from_plant(plant, structure, 1)
+        start_refit = self.descend_from_plant(plant, structure, 1)
         cost_to_beat = candidate.fit.cost * (1 - MISSED_COST_FRACTION)
-        if start.predicted_cost > cost_to_beat:
+        if start_refit.predicted_cost > cost_to_beat:
             return candidate
-        first_descent = start.further(REFIT_EVALUATIONS)
+        first_descent = start_refit.further(REFIT_EVALUATIONS)
         if first_descent.cost > candidate.fit.cost * (1 + _CONTINUATION_COST_TOLERANCE):
             return candidate
-        minimum = first_descent.further(DESCENT_EVALUATIONS)
-        return candidate if minimum.cost > cost_to_beat else minimum.candidate()
+        new_minimum = first_descent.further(DESCENT_EVALUATIONS)
+        return candidate if new_minimum.cost > cost_to_beat else new_minimum.candidate()
 
     def fit_special_cases(self) -> CandidateSet:
         """Add fits of special cases of the freest structure, which start from its estimate.
@@ -401,18 +419,22 @@ class CandidateSet:
         the search for the freest structure may mistake for the lowest one. A search from an order
         of 1 avoids that minimum.
         """
-        fit = next(each.fit for each in self.candidates if each.structure is _FREEST)
-        low, high = fit.interval["alpha"] or (math.inf, -math.inf)
-        special_cases = [_INTEGER_ORDER] if not low <= 1 <= high else []
+        fit = next(
+            candidate.fit
+            for candidate in self.candidates
+            if candidate.structure is _FREEST_STRUCTURE
+        )
+        low_alpha, high_alpha = fit.interval["alpha"] or (math.inf, -math.inf)
+        special_cases = [_INTEGER_ORDER_STRUCTURE] if not low_alpha <= 1 <= high_alpha else []
         special_cases += _one_damping_structures(fit)
-        fitted = (
+        fitted_candidates = (
             self.descend_from_plant(fit.plant, structure).candidate() for structure in special_cases
         )
-        candidate_set = self.with_candidates((*self.candidates, *fitted)).cross_check()
+        candidate_set = self.with_candidates((*self.candidates, *fitted_candidates)).cross_check()
         return candidate_set.with_leading_candidate(candidate_set.freest)
 
     def fit_with_both_dampings(self, candidate: Candidate) -> tuple[RecordFit, bool]:
-        """Fit a candidate with the damping that it lacks, for the uncertainty of its modes.
+        """Return a candidate's fit with the damping it lacks, and whether that damping was added.
 
         An insignificant damping may still exist, and the damping ratio of a mode is the sum of both
         dampings. If the mode was excited for less time than it rings, this dominates its
@@ -436,67 +458,79 @@ class CandidateSet:
         if len(absent_dampings) != 1:
             return own_fit, False
         ((order, coefficient),) = absent_dampings
-        fixed = {name: value for name, value in structure.fixed.items() if structure.has(name)}
-        fixed[order] = 1.0  # type: ignore[index]
-        free = tuple(name for name in PARAMETERS if name not in fixed)
-        both_dampings = replace(structure, free=free, fixed=fixed)
+        fixed_values = {
+            parameter_name: fixed_value
+            for parameter_name, fixed_value in structure.fixed.items()
+            if structure.has(parameter_name)
+        }
+        fixed_values[order] = 1.0  # type: ignore[index]
+        free_names = tuple(
+            parameter_name for parameter_name in PARAMETERS if parameter_name not in fixed_values
+        )
+        both_dampings = replace(structure, free=free_names, fixed=fixed_values)
         unknowns = self.unknowns(both_dampings)
-        index = unknowns.names.index(coefficient)
+        coefficient_index = unknowns.names.index(coefficient)
         start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)
         # The predicted step of the logarithm is taken as linear in the coefficient itself.
-        coefficient_growth = 1 + float(start_point.predicted_step[index])
+        coefficient_growth = 1 + float(start_point.predicted_step[coefficient_index])
         if coefficient_growth > 1:
-            start = start_point.x.copy()
-            start[index] += math.log(coefficient_growth)
-            minimum = self.descent(unknowns, start, DESCENT_EVALUATIONS)
-            if minimum.x[index] > start_point.x[index]:
+            start_vector = start_point.x.copy()
+            start_vector[coefficient_index] += math.log(coefficient_growth)
+            minimum = self.descent(unknowns, start_vector, DESCENT_EVALUATIONS)
+            if minimum.x[coefficient_index] > start_point.x[coefficient_index]:
                 return minimum.fit(), False
-        scaled_hessian, scale = start_point.equations.scaled_hessian()
-        scaled_std = np.linalg.inv(scaled_hessian + 1e-12 * np.eye(scale.size))[index, index] ** 0.5
+        scaled_hessian, unknown_scale = start_point.equations.scaled_hessian()
+        scaled_std = (
+            np.linalg.inv(scaled_hessian + 1e-12 * np.eye(unknown_scale.size))[
+                coefficient_index, coefficient_index
+            ]
+            ** 0.5
+        )
         x = start_point.x.copy()
-        x[index] += max(math.log(scaled_std / scale[index]), 0.0)
+        x[coefficient_index] += max(math.log(scaled_std / unknown_scale[coefficient_index]), 0.0)
         return self.descent(unknowns, x, 1).fit(), True
 
     def fit_with_free_orders(self) -> CandidateSet:
-        """Add fits of the structures with free orders, unless the set contains them."""
-        best = self.best
+        """Return the set with fits of the structures with free damping orders, if it lacks them."""
+        best_candidate = self.best
         by_structure = {c.structure.name: c.fit for c in self.candidates}
         refits: list[Refit] = []
         added_candidates: list[Candidate] = []
 
         def fit_structure(structure: Structure) -> RecordFit:
-            refits.append(self.descend_from_plant(best.fit.plant, structure))
+            refits.append(self.descend_from_plant(best_candidate.fit.plant, structure))
             added_candidates.append(refits[-1].candidate())
             return added_candidates[-1].fit
 
-        freest_fit = by_structure.get(_FREEST.name) or fit_structure(_FREEST)
+        freest_fit = by_structure.get(_FREEST_STRUCTURE.name) or fit_structure(_FREEST_STRUCTURE)
         for structure in _one_damping_structures(freest_fit):
             if structure.name not in by_structure:
                 fit_structure(structure)
         if not refits:
             return self
         new_set = self.with_candidates((*self.candidates, *added_candidates))
-        if new_set.best.bic > best.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
+        if new_set.best.bic > best_candidate.bic - _MIN_BIC_REDUCTION_FOR_NEW_NOISE:
             return new_set.cross_check()
         return new_set.refit_under_noise(min(refits, key=lambda refit: refit.cost).residual_noise())
 
-    def refit_with_additional_effect(self, columns: NDArray[np.complex128]) -> CandidateSet:
-        """Fit all candidates with additional torque spectra of free amplitude.
+    def refit_with_additional_effect(self, effect_spectra: NDArray[np.complex128]) -> CandidateSet:
+        """Return the set refitted with additional torque spectra, each of free amplitude.
 
         The noise is estimated again from the residual of the best candidate with these spectra.
         """
-        all_columns = np.concatenate([self.columns, columns])
+        all_columns = np.concatenate([self.columns, effect_spectra])
         best_refit = replace(self, columns=all_columns).refit(self.best)
         return self.refit_with_effect_spectra(all_columns, best_refit.residual_noise())
 
     def refit_with_effect_spectra(
-        self, columns: NDArray[np.complex128], noise: NoiseSpectrum
+        self, effect_spectra: NDArray[np.complex128], noise: NoiseSpectrum
     ) -> CandidateSet:
         """Refit all candidates with given torque spectra of free amplitude, under a given noise.
 
-        The spectra represent effects in addition to the linear beam and replace `columns`.
+        The spectra represent effects in addition to the linear beam. They replace the `columns` of
+        the set.
         """
-        new_set = replace(self, columns=columns, noise=noise)
+        new_set = replace(self, columns=effect_spectra, noise=noise)
         return new_set.with_candidates(
             new_set.refit(c).candidate() for c in self.candidates
         ).cross_check()
@@ -506,16 +540,16 @@ class CandidateSet:
         return replace(self, candidates=_by_rising_bic(candidates))
 
     def is_nearly_white(self, fit: RecordFit) -> bool:
-        """Return whether the residual of a fit passes the test of whiteness at the 1 % level."""
-        is_used = self.noise.counts
+        """Return whether the torque residual of a fit is white noise at the 1 % level."""
+        used_bins = self.noise.counts
         return whiteness(
-            fit.residual[is_used], self.comparison.frequency_hz[is_used]
+            fit.residual[used_bins], self.comparison.frequency_hz[used_bins]
         ).is_nearly_white
 
 
 def _one_damping_structures(fit: RecordFit) -> list[Structure]:
-    """Return the structures without one of the dampings that is not clearly significant."""
-    structures_and_missing = zip(_ONE_DAMPING, (fit.external, fit.internal), strict=True)
+    """Return the damping structures that leave out an insignificant damping of a fit."""
+    structures_and_missing = zip(_ONE_DAMPING_STRUCTURES, (fit.external, fit.internal), strict=True)
     return [
         structure
         for structure, missing_damping in structures_and_missing

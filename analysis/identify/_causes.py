@@ -27,7 +27,9 @@ RELAXATION: Final = "relaxation"
 
 @dataclass(frozen=True, slots=True)
 class Cause:
-    """Physical cause of deviating modes, with one or two unknowns of its own.
+    """Physical cause that makes the modes deviate from those of a uniform beam.
+
+    It has one or two unknowns of its own.
 
     Attributes
     ----------
@@ -59,7 +61,7 @@ class Cause:
 
 
 def _set_tilt(stated_alteration: Alteration, unknowns: Sequence[float], _: Beam) -> Alteration:
-    """Return an alteration with the axis tilted by an unknown angle in degrees."""
+    """Return a beam alteration by gravity for a tilted axis; the unknown is the tilt in degrees."""
     return replace(
         stated_alteration, gravity_m_s2=GRAVITY_M_S2 * math.sin(math.radians(unknowns[0]))
     )
@@ -69,13 +71,13 @@ def _describe_tilt(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]
     """Describe a tilt of the axis: size in degrees, unit and phrase."""
     direction = "lower" if unknowns[0] > 0 else "higher"
     phrase = (
-        f"an axis {_two_digits(abs(unknowns[0]))}° off plumb "
+        f"an axis {_format_two_digits(abs(unknowns[0]))}° off plumb "
         f"(the tip at rest {direction} than the axis)"
     )
     return unknowns[0], "deg", phrase
 
 
-def _mass_kg(fraction: float, beam: Beam) -> float:
+def _added_mass_kg(fraction: float, beam: Beam) -> float:
     """Return a mass in kilograms that is a given fraction of the beam's mass."""
     return fraction * beam.density_kg_per_m * beam.length_m
 
@@ -83,40 +85,47 @@ def _mass_kg(fraction: float, beam: Beam) -> float:
 def _set_tip_mass(
     stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam
 ) -> Alteration:
-    """Return an alteration with a tip mass as a fraction of the beam's mass."""
-    return replace(stated_alteration, lumps=((1.0, _mass_kg(unknowns[0], beam)),))
+    """Return a beam alteration with a tip mass; the unknown is its fraction of the beam's mass."""
+    return replace(stated_alteration, lumps=((1.0, _added_mass_kg(unknowns[0], beam)),))
 
 
 def _describe_tip_mass(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
     """Describe a mass at the tip: size in kilograms, unit and phrase."""
-    mass_kg = _mass_kg(unknowns[0], beam)
-    return mass_kg, "kg", f"a mass of {_two_digits(1e3 * mass_kg)} g at the tip"
+    mass_kg = _added_mass_kg(unknowns[0], beam)
+    return mass_kg, "kg", f"a mass of {_format_two_digits(1e3 * mass_kg)} g at the tip"
 
 
 def _add_lump(stated_alteration: Alteration, unknowns: Sequence[float], beam: Beam) -> Alteration:
-    """Return an alteration with a further point mass: its relative position and mass fraction."""
+    """Return a beam alteration with a further point mass.
+
+    The unknowns are its position relative to the length and its fraction of the beam's mass.
+    """
     return replace(
         stated_alteration,
-        lumps=(*stated_alteration.lumps, (unknowns[0], _mass_kg(unknowns[1], beam))),
+        lumps=(*stated_alteration.lumps, (unknowns[0], _added_mass_kg(unknowns[1], beam))),
     )
 
 
 def _describe_lump(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
     """Describe a point mass on the beam: size in kilograms, unit and phrase."""
-    mass_kg = _mass_kg(unknowns[1], beam)
-    position = f"{100 * unknowns[0]:.0f} % of the length"
-    return mass_kg, "kg", f"a mass of {_two_digits(1e3 * mass_kg)} g on the beam at {position}"
+    mass_kg = _added_mass_kg(unknowns[1], beam)
+    position_phrase = f"{100 * unknowns[0]:.0f} % of the length"
+    return (
+        mass_kg,
+        "kg",
+        f"a mass of {_format_two_digits(1e3 * mass_kg)} g on the beam at {position_phrase}",
+    )
 
 
 def _compliance_rad_per_nm(unknowns: Sequence[float], beam: Beam) -> float:
-    """Return the compliance of the clamp in rad/(N·m), for a compliance relative to L/EI."""
+    """Return the clamp's compliance in rad/(N·m); the unknown is that compliance over L/EI."""
     return unknowns[0] * beam.length_m / beam.bending_stiffness_n_m2
 
 
 def _set_clamp_compliance(
     stated_alteration: Alteration, unknowns: Sequence[float], _: Beam
 ) -> Alteration:
-    """Return an alteration with a compliant clamp and, optionally, a loss factor of the clamp.
+    """Return a beam alteration with a compliant clamp; unknowns are compliance and loss factor.
 
     The compliance is relative to that of the beam, L/EI.
     """
@@ -128,72 +137,81 @@ def _set_clamp_compliance(
 
 
 def _describe_clamp(unknowns: Sequence[float], beam: Beam) -> tuple[float, str, str]:
-    """Describe a compliant clamp: stiffness in N·m/rad, unit and phrase."""
-    stiffness = 1 / _compliance_rad_per_nm(unknowns, beam)
-    loss = f" and a loss factor of {_two_digits(unknowns[1])}" if len(unknowns) > 1 else ""
+    """Describe a compliant clamp: rotational stiffness in N·m/rad, unit and phrase."""
+    stiffness_nm_per_rad = 1 / _compliance_rad_per_nm(unknowns, beam)
+    loss_phrase = (
+        f" and a loss factor of {_format_two_digits(unknowns[1])}" if len(unknowns) > 1 else ""
+    )
     return (
-        stiffness,
+        stiffness_nm_per_rad,
         "N·m/rad",
-        f"a clamp with a stiffness of {_two_digits(stiffness)} N·m/rad{loss}",
+        f"a clamp with a stiffness of {_format_two_digits(stiffness_nm_per_rad)} "
+        f"N·m/rad{loss_phrase}",
     )
 
 
 def _describe_first_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
     """Describe a first-order filter of the torque channel: corner in Hz, unit and phrase."""
-    hz = _frequency_hz(unknowns)
+    hz = _filter_frequency_hz(unknowns)
     return (
         hz,
         "Hz",
-        f"a low-pass filter of first order at {_two_digits(hz)} Hz in the torque channel",
+        f"a low-pass filter of first order at {_format_two_digits(hz)} Hz in the torque channel",
     )
 
 
 def _describe_second_order_filter(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
     """Describe a second-order filter of the torque channel: corner in Hz, unit and phrase."""
-    hz = _frequency_hz(unknowns)
+    hz = _filter_frequency_hz(unknowns)
     return (
         hz,
         "Hz",
-        f"a low-pass filter of second order at {_two_digits(hz)} Hz in the torque channel",
+        f"a low-pass filter of second order at {_format_two_digits(hz)} Hz in the torque channel",
     )
 
 
 def _plant_with_first_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
-    """Return the plant with a first-order filter; None if the file already states a filter."""
-    stated_s = plant.filter_time_constant_s
-    return None if stated_s else replace(plant, filter_time_constant_s=1e-3 * unknowns[0])
+    """Return a plant with a first-order torque filter; None if the file states one."""
+    stated_time_constant_s = plant.filter_time_constant_s
+    return (
+        None
+        if stated_time_constant_s
+        else replace(plant, filter_time_constant_s=1e-3 * unknowns[0])
+    )
 
 
 def _plant_with_second_order_filter(unknowns: Sequence[float], plant: Plant) -> Plant | None:
-    """Return the plant with a second-order filter; None if the file already states a filter."""
-    stated_s = plant.second_order_filter_time_constant_s
+    """Return a plant with a second-order torque filter; None if the file states one."""
+    stated_time_constant_s = plant.second_order_filter_time_constant_s
     return (
-        None if stated_s else replace(plant, second_order_filter_time_constant_s=1e-3 * unknowns[0])
+        None
+        if stated_time_constant_s
+        else replace(plant, second_order_filter_time_constant_s=1e-3 * unknowns[0])
     )
 
 
 def _describe_resonance(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    """Describe a resonance of the sensor: frequency in Hz, unit and phrase."""
-    hz = _frequency_hz(unknowns)
-    return hz, "Hz", f"a resonance of sensor or mount near {_two_digits(hz)} Hz"
+    """Describe a resonance of the torque sensor: frequency in Hz, unit and phrase."""
+    hz = _filter_frequency_hz(unknowns)
+    return hz, "Hz", f"a resonance of sensor or mount near {_format_two_digits(hz)} Hz"
 
 
-def _frequency_hz(unknowns: Sequence[float]) -> float:
+def _filter_frequency_hz(unknowns: Sequence[float]) -> float:
     """Return the corner or resonance frequency in hertz for a time constant in milliseconds."""
     return 1e3 / (2 * math.pi * unknowns[0])
 
 
 def _describe_relaxation(unknowns: Sequence[float], _: Beam) -> tuple[float, str, str]:
-    """Describe a relaxation of the material: relative stiffening, unit and phrase."""
-    time_s = math.exp(unknowns[0])
+    """Describe a relaxation of the beam's material: relative stiffening, unit and phrase."""
+    relaxation_time_s = math.exp(unknowns[0])
     phrase = (
-        f"a relaxation of the material in {_two_digits(1e3 * time_s)} ms that stiffens it by "
-        f"{_two_digits(100 * unknowns[1])} %"
+        f"a relaxation of the material in {_format_two_digits(1e3 * relaxation_time_s)} ms that "
+        f"stiffens it by {_format_two_digits(100 * unknowns[1])} %"
     )
     return unknowns[1], "1", phrase
 
 
-def _two_digits(value: float) -> str:
+def _format_two_digits(value: float) -> str:
     """Format a value with two significant digits."""
     return f"{value:.2g}" if abs(value) < 100 else f"{float(f'{value:.2g}'):.0f}"
 
@@ -226,7 +244,9 @@ def _uneven_stiffness_cause(profile: Profile, phrase: str) -> Cause:
 
 
 def _describe_deviation(phrase: str) -> Callable[[Sequence[float], Beam], tuple[float, str, str]]:
-    """Return a function that describes a relative deviation: size, unit and phrase.
+    """Return a function that describes a relative deviation of the beam's density or stiffness.
+
+    That function returns size, unit and phrase.
 
     `phrase` is the text, with ``{}`` for the size in per cent.
     """
@@ -249,7 +269,7 @@ CAUSES: Final = (
         (1.0,),
         _set_tip_mass,
         _describe_tip_mass,
-        lambda unknowns, plant: replace(plant, tip_mass_kg=_mass_kg(unknowns[0], plant.beam)),
+        lambda unknowns, plant: replace(plant, tip_mass_kg=_added_mass_kg(unknowns[0], plant.beam)),
     ),
     Cause(
         "lump",

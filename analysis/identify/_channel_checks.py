@@ -39,24 +39,24 @@ _MAX_STANDSTILL_MOTION: Final = 0.02
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
-    torque, is_known = measurement.torque_nm, measurement.torque_known
+    torque_nm, known_mask = measurement.torque_nm, measurement.torque_known
     clipped = []
-    for limit in (torque[is_known].max(), torque[is_known].min()):
-        is_at_limit = is_known & (torque == limit)
+    for torque_limit_nm in (torque_nm[known_mask].max(), torque_nm[known_mask].min()):
+        is_at_limit = known_mask & (torque_nm == torque_limit_nm)
         is_repeated = is_at_limit & (np.roll(is_at_limit, 1) | np.roll(is_at_limit, -1))
-        if limit != 0 and np.count_nonzero(is_repeated) >= _MIN_CLIPPED_VALUES:
-            clipped.append((float(limit), int(np.count_nonzero(is_at_limit))))
+        if torque_limit_nm != 0 and np.count_nonzero(is_repeated) >= _MIN_CLIPPED_VALUES:
+            clipped.append((float(torque_limit_nm), int(np.count_nonzero(is_at_limit))))
     if not clipped:
         return
-    limits = " and ".join(f"{limit:+.3g} N·m" for limit, _ in clipped)
-    count = sum(ticks for _, ticks in clipped)
+    limits_text = " and ".join(f"{torque_limit_nm:+.3g} N·m" for torque_limit_nm, _ in clipped)
+    clipped_tick_count = sum(tick_count for _, tick_count in clipped)
     yield Finding(
         kind="clipping",
         sentence=(
-            f"The torque is clipped at {limits}: {count} values lie exactly there and none "
-            "beyond, and no flag says so."
+            f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly "
+            "there and none beyond, and no flag says so."
         ),
-        value=max(abs(limit) for limit, _ in clipped),
+        value=max(abs(torque_limit_nm) for torque_limit_nm, _ in clipped),
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
@@ -67,28 +67,31 @@ def standstill_findings(measurement: Measurement) -> Iterator[Finding]:
     reference_rad = measurement.reference_rad
     if reference_rad is None:
         return
-    length = max(round(_STANDSTILL_BLOCK_S * measurement.rate_hz), 2)
-    blocks = reference_rad.size // length
-    if blocks == 0:
+    block_length = max(round(_STANDSTILL_BLOCK_S * measurement.rate_hz), 2)
+    block_count = reference_rad.size // block_length
+    if block_count == 0:
         return
-    motion, reference_motion = (
-        np.ptp(values[: blocks * length].reshape(blocks, length), axis=1)
-        for values in (measurement.angle_rad, reference_rad)
+    motion_rad, reference_motion_rad = (
+        np.ptp(
+            angle_values_rad[: block_count * block_length].reshape(block_count, block_length),
+            axis=1,
+        )
+        for angle_values_rad in (measurement.angle_rad, reference_rad)
     )
-    is_still = (reference_motion > np.median(reference_motion)) & (
-        motion < _MAX_STANDSTILL_MOTION * reference_motion
+    is_still = (reference_motion_rad > np.median(reference_motion_rad)) & (
+        motion_rad < _MAX_STANDSTILL_MOTION * reference_motion_rad
     )
     if not is_still.any():
         return
-    count, first = longest_run(is_still)
+    longest_still_blocks, first_still_block = longest_run(is_still)
     yield Finding(
         kind="stop",
         sentence=(
-            f"The motor does not move from {first * _STANDSTILL_BLOCK_S:.1f} to "
-            f"{(first + count) * _STANDSTILL_BLOCK_S:.1f} s of the record, although its "
-            "reference does."
+            f"The motor does not move from {first_still_block * _STANDSTILL_BLOCK_S:.1f} to "
+            f"{(first_still_block + longest_still_blocks) * _STANDSTILL_BLOCK_S:.1f} s of the "
+            "record, although its reference does."
         ),
-        value=count * _STANDSTILL_BLOCK_S,
+        value=longest_still_blocks * _STANDSTILL_BLOCK_S,
         unit="s",
         remedy="Find what held the shaft or switched the drive off, and sweep again.",
     )
@@ -131,23 +134,25 @@ searches for a stiffness so far from that of the file."""
 
 
 def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
-    """Yield a finding if torque over angle has the wrong sign or a wrong unit."""
-    angle = comparison.spectrum(comparison.angle_rad[comparison.retained])
-    torque = comparison.spectrum(comparison.torque_nm[comparison.retained])
-    power = np.abs(angle) ** 2
-    is_driven = power > _MIN_DRIVEN_POWER * power.max()
+    """Yield a finding if the ratio of torque to motor angle has a wrong sign or a wrong unit."""
+    angle_spectrum = comparison.spectrum(comparison.angle_rad[comparison.retained])
+    torque_spectrum = comparison.spectrum(comparison.torque_nm[comparison.retained])
+    angle_power = np.abs(angle_spectrum) ** 2
+    is_driven = angle_power > _MIN_DRIVEN_POWER * angle_power.max()
     beam = comparison.measurement.nominal.beam
-    expected = transfer(
+    expected_response = transfer(
         2j * np.pi * comparison.frequency_hz[is_driven],
         beam,
         Damping(zeta=_ASSUMED_INTERNAL_DAMPING_S),
     )
-    torque_ratio = torque[is_driven] / (angle[is_driven] * expected)
-    magnitude = np.abs(torque_ratio)
-    cosine = float(np.median(torque_ratio.real / np.maximum(magnitude, np.finfo(float).tiny)))
-    if abs(cosine) < _MIN_PHASE_COSINE:
+    torque_ratio = torque_spectrum[is_driven] / (angle_spectrum[is_driven] * expected_response)
+    ratio_magnitude = np.abs(torque_ratio)
+    phase_cosine = float(
+        np.median(torque_ratio.real / np.maximum(ratio_magnitude, np.finfo(float).tiny))
+    )
+    if abs(phase_cosine) < _MIN_PHASE_COSINE:
         return
-    if cosine < 0:
+    if phase_cosine < 0:
         yield Finding(
             kind="sign",
             sentence=(
@@ -159,15 +164,15 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
                 "the beam towards positive angles."
             ),
         )
-    factor = float(np.median(magnitude))
-    if not factor > 0 or abs(math.log(factor)) < _MIN_LOG_FACTOR:
+    median_magnitude = float(np.median(ratio_magnitude))
+    if not median_magnitude > 0 or abs(math.log(median_magnitude)) < _MIN_LOG_FACTOR:
         return
     matching_units = [
-        description
-        for ratio, description in _UNIT_FACTORS
-        if abs(abs(math.log(factor)) - abs(math.log(ratio))) < _LOG_FACTOR_TOLERANCE
+        unit_description
+        for unit_factor, unit_description in _UNIT_FACTORS
+        if abs(abs(math.log(median_magnitude)) - abs(math.log(unit_factor))) < _LOG_FACTOR_TOLERANCE
     ]
-    if not matching_units and abs(math.log(factor)) < _CERTAIN_LOG_FACTOR:
+    if not matching_units and abs(math.log(median_magnitude)) < _CERTAIN_LOG_FACTOR:
         return
     explanation = (
         f"which is the factor of {matching_units[0]}: a wrong unit"
@@ -177,11 +182,11 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
     yield Finding(
         kind="unit",
         sentence=(
-            f"Torque over angle is {factor:.3g} times what the beam in the file gives, "
+            f"Torque over angle is {median_magnitude:.3g} times what the beam in the file gives, "
             f"{explanation}. "
             "No number here is valid for the antenna."
         ),
-        value=factor,
+        value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",
     )
 
@@ -197,16 +202,26 @@ due to noise."""
 
 
 def torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
-    """Return how far the torque sensor's zero drifts in N·m; 0 if noise explains the drift.
+    """Return how far the torque sensor's zero point drifts, in N·m; 0 if noise explains it.
 
     It is the range of the mean residuals of segments of the record.
     """
     comparison = candidate_set.comparison
-    torque, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
-    residual = comparison.torque_nm[comparison.retained] - torque
-    length = residual.size // _DRIFT_SEGMENTS
-    means = residual[: _DRIFT_SEGMENTS * length].reshape(_DRIFT_SEGMENTS, length).mean(axis=1)
+    predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
+    residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
+    segment_length = residual_nm.size // _DRIFT_SEGMENTS
+    segment_means_nm = (
+        residual_nm[: _DRIFT_SEGMENTS * segment_length]
+        .reshape(_DRIFT_SEGMENTS, segment_length)
+        .mean(axis=1)
+    )
     # Expected scatter for white noise with the power of the band's upper half.
     upper_half_power = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
-    std_by_noise = math.sqrt(float(np.median(upper_half_power)) / comparison.samples / length)
-    return float(np.ptp(means)) if float(means.std()) > _MIN_SCATTER_RATIO * std_by_noise else 0.0
+    noise_std_nm = math.sqrt(
+        float(np.median(upper_half_power)) / comparison.samples / segment_length
+    )
+    return (
+        float(np.ptp(segment_means_nm))
+        if float(segment_means_nm.std()) > _MIN_SCATTER_RATIO * noise_std_nm
+        else 0.0
+    )

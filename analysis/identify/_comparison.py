@@ -55,7 +55,7 @@ it is larger, the motor followed another reference, and the whole angle is used.
 
 @dataclass(frozen=True, slots=True)
 class Comparison:
-    """Data of one record in one band, ready to be compared with the torque that a plant predicts.
+    """Torque and angle of a record in a frequency band, compared with a plant's prediction.
 
     Attributes
     ----------
@@ -82,13 +82,13 @@ class Comparison:
     removed_nm : ndarray, shape (samples,)
         Torque by impacts, drag, hum and the incoherent angle that was removed, at the retained
         samples.
-    removed_at_unknown_nm : ndarray, shape (u,)
+    removed_in_gaps_nm : ndarray, shape (u,)
         The same torque at the ticks with unknown torque.
     hum : tuple of Hum
         Hum that was removed, as estimated; its remainder is projected out.
     incoherent_rad : ndarray, shape (m,), or float
         Part of the angle that is incoherent with the reference; 0 if the whole angle is used.
-    incoherent_nm, incoherent_at_unknown_nm : ndarray or float
+    incoherent_nm, incoherent_in_gaps_nm : ndarray or float
         Torque caused by that part of the angle, which was removed, at the retained samples and at
         the ticks with unknown torque.
     drag : DragExpansion, optional
@@ -111,18 +111,18 @@ class Comparison:
     decays: DecaySpectra
     later_decays: tuple[LaterDecaySpectra, ...] = ()
     removed_nm: NDArray[np.float64] | float = 0.0
-    removed_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    removed_in_gaps_nm: NDArray[np.float64] | float = 0.0
     hum: tuple[Hum, ...] = ()
     incoherent_rad: NDArray[np.float64] | float = 0.0
     incoherent_nm: NDArray[np.float64] | float = 0.0
-    incoherent_at_unknown_nm: NDArray[np.float64] | float = 0.0
+    incoherent_in_gaps_nm: NDArray[np.float64] | float = 0.0
     drag: DragExpansion | None = None
     impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
-        """Reduce a measurement to a band.
+        """Return a measurement filtered to a frequency band, ready for comparison.
 
         The mean of the residual is never compared, since it contains the zero offset of the torque
         sensor.
@@ -166,71 +166,81 @@ class Comparison:
             )
         retained = slice(usable_samples.start, usable_samples.start + samples)
         frequency_hz = all_hz[bins]
-        beam = measurement.beam
-        gaps = measurement.long_gaps(highest_hz)
-        if gaps:
-            measurement = measurement.without_torque_in(gaps)
-        is_known, torque = measurement.torque_known, measurement.torque_nm
-        ticks = np.arange(torque.size)
-        interpolated = (
-            torque if is_known.all() else np.interp(ticks, ticks[is_known], torque[is_known])
+        nominal_beam = measurement.beam
+        angle_gaps = measurement.long_gaps(highest_hz)
+        if angle_gaps:
+            measurement = measurement.without_torque_in(angle_gaps)
+        torque_is_known, torque_nm = measurement.torque_known, measurement.torque_nm
+        ticks = np.arange(torque_nm.size)
+        interpolated_nm = (
+            torque_nm
+            if torque_is_known.all()
+            else np.interp(ticks, ticks[torque_is_known], torque_nm[torque_is_known])
         )
         omega_rad_s = 2 * np.pi * frequency_hz
         comparison = cls(
             measurement=measurement,
             angle_rad=angle_rad,
-            torque_nm=decimation.apply(interpolated),
+            torque_nm=decimation.apply(interpolated_nm),
             decimation=decimation,
             retained=retained,
             prediction=TorquePredictor(angle_rad, decimation.rate_hz, retained),
             bins=bins,
             frequency_hz=frequency_hz,
             visible_modes=int(
-                np.sum(undamped_frequencies_rad_s(beam, 50) < 2 * np.pi * highest_hz)
+                np.sum(undamped_frequencies_rad_s(nominal_beam, 50) < 2 * np.pi * highest_hz)
             ),
             decays=DecaySpectra(samples, decimation.rate_hz, omega_rad_s),
         )
-        gap_end_s = [end / measurement.rate_hz - comparison.first_s for _, end in gaps]
+        gap_end_s = [
+            gap_end / measurement.rate_hz - comparison.first_s for _, gap_end in angle_gaps
+        ]
         later_decays = tuple(
             LaterDecaySpectra(
-                samples, decimation.rate_hz, omega_rad_s, first_s, 1 / measurement.rate_hz
+                samples, decimation.rate_hz, omega_rad_s, decay_start_s, 1 / measurement.rate_hz
             )
-            for first_s in gap_end_s
-            if 0 < first_s < (samples - 1) / decimation.rate_hz
+            for decay_start_s in gap_end_s
+            if 0 < decay_start_s < (samples - 1) / decimation.rate_hz
         )
         comparison = replace(comparison, later_decays=later_decays)
         return comparison._remove_impacts() if measurement.knocks else comparison
 
     def _remove_impacts(self) -> Comparison:
-        """Remove the torque of the known impacts as estimated.
+        """Return the comparison without the estimated torque of the known impacts on the beam.
 
         Errors of this estimate are projected out with `impact_spectra`.
         """
         rate_hz, knocks = self.decimation.rate_hz, self.measurement.knocks
-        grid_s = self.times_s()
-        ticks = self._decimated_indices(~self.measurement.torque_known)
+        sample_times_s = self.times_s()
+        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
         reach_s = self.decimation.reach / rate_hz
-        unknown_s = ticks / self.measurement.rate_hz - reach_s
+        unknown_times_s = unknown_indices / self.measurement.rate_hz - reach_s
         impact_nm, impact_at_unknown_nm = (
-            np.sum([each.torque(time_s, grid_s, rate_hz) for each in knocks], axis=0)
-            for time_s in (grid_s, unknown_s)
+            np.sum([impact.torque(time_s, sample_times_s, rate_hz) for impact in knocks], axis=0)
+            for time_s in (sample_times_s, unknown_times_s)
         )
-        impact_torques = np.concatenate([each.columns(grid_s, rate_hz) for each in knocks])
+        impact_torques = np.concatenate(
+            [impact.columns(sample_times_s, rate_hz) for impact in knocks]
+        )
         return replace(self, impact_spectra=self.spectrum(impact_torques))._remove_torque(
             impact_nm, impact_at_unknown_nm
         )
 
     def _remove_torque(
-        self, torque_nm: NDArray[np.float64] | float, at_unknown_nm: NDArray[np.float64] | float
+        self, torque_nm: NDArray[np.float64] | float, unknown_tick_nm: NDArray[np.float64] | float
     ) -> Comparison:
-        """Remove torque at the retained samples and at the ticks with unknown torque."""
+        """Return the comparison with a torque in N·m subtracted from the measured torque.
+
+        `torque_nm` is that at the retained samples, and `unknown_tick_nm` that at the ticks at
+        which the torque was not measured.
+        """
         remaining_nm = self.torque_nm.copy()
         remaining_nm[self.retained] -= torque_nm
         return replace(
             self,
             torque_nm=remaining_nm,
             removed_nm=self.removed_nm + torque_nm,
-            removed_at_unknown_nm=self.removed_at_unknown_nm + at_unknown_nm,
+            removed_in_gaps_nm=self.removed_in_gaps_nm + unknown_tick_nm,
         )
 
     def times_s(self) -> NDArray[np.float64]:
@@ -244,7 +254,7 @@ class Comparison:
 
     @property
     def samples(self) -> int:
-        """Return the number of compared samples, at the decimated rate."""
+        """Return the number of compared time samples, at the decimated rate."""
         return int(self.retained.stop - self.retained.start)
 
     def poles(self, plant: Plant, wrt: Sequence[str] = ()) -> tuple[Pole, ...]:
@@ -261,25 +271,31 @@ class Comparison:
         self.last_poles_rad_s[:] = [pole.at_rad_s for pole in poles]
         return poles
 
-    def spectrum(self, values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        """Transform retained samples, shape (..., samples), to spectra in the band, (..., K)."""
-        return np.fft.rfft(values)[..., self.bins]
+    def spectrum(self, time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
+        """Transform time series of the retained samples to spectra in the band.
+
+        The shape changes from (..., samples) to (..., K).
+        """
+        return np.fft.rfft(time_series)[..., self.bins]
 
     def in_time(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Transform a spectrum in the band, shape (K,), to the retained samples, (samples,)."""
+        """Transform a spectrum in the band, shape (K,), to the time series of retained samples.
+
+        The result has the shape (samples,).
+        """
         full_spectrum = np.zeros(self.samples // 2 + 1, dtype=np.complex128)
         full_spectrum[self.bins] = spectrum
         return np.fft.irfft(full_spectrum, self.samples)
 
     def coherent_rad(self) -> NDArray[np.float64]:
-        """Return the part of the angle that is coherent with the reference, shape (m,).
+        """Return the part of the motor angle in rad that is coherent with the reference, (m,).
 
-        The whole angle is returned if there is no reference, or if the reference does not explain
-        the angle.
+        The reference is the angle that the motor's controller was to follow. The whole angle is
+        returned if there is no reference, or if the reference does not explain the angle.
         """
         if self.measurement.reference_rad is None:
             return self.angle_rad
-        coherent_angle_rad = self._coherent_part(self.angle_rad)
+        coherent_angle_rad = self._coherent_angle_rad(self.angle_rad)
         # The speeds are compared, since a slow drift of the angle does not disturb the estimate.
         angle_power, incoherent_power = (
             np.sum(np.diff(angle_rad[self.retained]) ** 2)
@@ -291,21 +307,21 @@ class Comparison:
             else self.angle_rad
         )
 
-    def _coherent_part(
+    def _coherent_angle_rad(
         self, angle_rad: NDArray[np.float64], torque_nm: NDArray[np.float64] | None = None
     ) -> NDArray[np.float64]:
-        """Return the part of an angle that is coherent with the reference, shape (m,).
+        """Return the part of an angle in rad coherent with the controller's reference, shape (m,).
 
         With a torque, the part of the angle that follows the torque is included.
         """
         reference_rad = self.measurement.reference_rad
         assert reference_rad is not None
         # The samples after the record are the filter's response to its end; none is compared.
-        end = self._recorded_samples
-        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:end]
+        recorded_samples = self._recorded_samples
+        reference_rad = self.decimation.apply(reference_rad - reference_rad[0])[:recorded_samples]
         coherent_rad = angle_rad.copy()
-        coherent_rad[:end] = reference_coherent_part(
-            angle_rad[:end], reference_rad, self.decimation.rate_hz, torque_nm
+        coherent_rad[:recorded_samples] = reference_coherent_part(
+            angle_rad[:recorded_samples], reference_rad, self.decimation.rate_hz, torque_nm
         )
         return coherent_rad
 
@@ -315,9 +331,10 @@ class Comparison:
         return int(self.decimation.samples_inside_record(self.measurement.angle_rad.size).stop)
 
     def use_reference_coherent_angle(self, plant: Plant | ModalModel) -> Comparison:
-        """Use the part of the angle coherent with the reference as input (instrumental variable).
+        """Return a comparison whose input is the part of the angle coherent with the reference.
 
-        The torque caused by the incoherent part of the angle is removed.
+        The reference of the motor's controller thus is an instrumental variable. The torque caused
+        by the incoherent part of the angle is removed.
 
         Parameters
         ----------
@@ -332,15 +349,18 @@ class Comparison:
         coherent_rad = self.coherent_rad()
         if coherent_rad is self.angle_rad:
             return self
-        return self._use_coherent_part(self.angle_rad, coherent_rad, plant)
+        return self._use_coherent_angle(self.angle_rad, coherent_rad, plant)
 
-    def _use_coherent_part(
+    def _use_coherent_angle(
         self,
         angle_rad: NDArray[np.float64],
         coherent_rad: NDArray[np.float64],
         plant: Plant | ModalModel,
     ) -> Comparison:
-        """Use one part of the angle as input, and remove the torque caused by the other part."""
+        """Return a comparison whose input is the reference-coherent part of the angle.
+
+        The torque that a plant predicts from the remaining part is subtracted.
+        """
         return replace(
             self,
             angle_rad=coherent_rad,
@@ -349,25 +369,28 @@ class Comparison:
         ).recompute_incoherent_torque(plant)
 
     def recompute_incoherent_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Recompute and remove the torque caused by the incoherent part of the angle.
+        """Return the comparison with the torque of the incoherent angle predicted again.
 
-        `plant` predicts the torque. Return `self` if the whole angle is coherent with the
-        reference.
+        That torque, predicted with `plant`, is subtracted from the measured torque. The incoherent
+        angle is the part that does not follow the reference of the motor's controller. Return
+        `self` if the whole angle is coherent with the reference.
         """
         if not isinstance(self.incoherent_rad, np.ndarray):
             return self
         incoherent_prediction = self.prediction.with_angle(self.incoherent_rad)
         incoherent_nm = incoherent_prediction.torque(plant)[0]
-        at_unknown_nm = incoherent_prediction.torque_at_fine_samples(
+        unknown_tick_nm = incoherent_prediction.torque_at_fine_samples(
             plant, self.decimation.factor, self._decimated_indices(~self.measurement.torque_known)
         )[0]
-        updated = replace(self, incoherent_nm=incoherent_nm, incoherent_at_unknown_nm=at_unknown_nm)
-        return updated._remove_torque(
-            incoherent_nm - self.incoherent_nm, at_unknown_nm - self.incoherent_at_unknown_nm
+        updated_comparison = replace(
+            self, incoherent_nm=incoherent_nm, incoherent_in_gaps_nm=unknown_tick_nm
+        )
+        return updated_comparison._remove_torque(
+            incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
         )
 
     def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
-        """Re-estimate the part of the angle coherent with the reference, with a better plant.
+        """Return the comparison with the reference-coherent angle estimated with a better plant.
 
         Parameters
         ----------
@@ -382,13 +405,14 @@ class Comparison:
             `self` if the new torque of the incoherent part would move no parameter by more than a
             third of its standard deviation.
         """
-        updated = self.recompute_incoherent_torque(plant)
-        if updated is self:
+        updated_comparison = self.recompute_incoherent_torque(plant)
+        if updated_comparison is self:
             return self
-        change = (
-            self.spectrum(updated.incoherent_nm - np.asarray(self.incoherent_nm)) * noise.weight
+        whitened_change = (
+            self.spectrum(updated_comparison.incoherent_nm - np.asarray(self.incoherent_nm))
+            * noise.weight
         )
-        if np.vdot(change, change).real <= _MAX_REMOVED_TORQUE_CHANGE:
+        if np.vdot(whitened_change, whitened_change).real <= _MAX_REMOVED_TORQUE_CHANGE:
             return self
         whole_angle_rad, coherent_rad = self.angle_rad + self.incoherent_rad, self.angle_rad
         coherent_prediction = TorquePredictor(
@@ -396,29 +420,32 @@ class Comparison:
         )
         # The torque of a ringing beam moves the motor, and that motion changes the ringing.
         for _ in range(_FEEDBACK_ITERATIONS):
-            coherent_rad = self._coherent_part(
+            coherent_rad = self._coherent_angle_rad(
                 whole_angle_rad, coherent_prediction.with_angle(coherent_rad).torque(plant)[0]
             )
-        return self._use_coherent_part(whole_angle_rad, coherent_rad, plant)
+        return self._use_coherent_angle(whole_angle_rad, coherent_rad, plant)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
-        """Return the removed hum in newton metres at the retained samples; 0 if there is none."""
+        """Return the removed hum torque in N·m at the retained samples; 0 if there is no hum."""
         return self._hum_torque_at(np.arange(self.samples) / self.decimation.rate_hz)
 
     def remove_hum(self, hum: tuple[Hum, ...]) -> Comparison:
-        """Return the comparison with only the given hum removed; restore hum removed before."""
+        """Return the comparison with only the given hum subtracted from the torque.
+
+        Hum that was subtracted before is added again.
+        """
         with_new_hum = replace(self, hum=hum)
-        ticks = self._decimated_indices(~self.measurement.torque_known)
+        unknown_indices = self._decimated_indices(~self.measurement.torque_known)
         first_s = self.retained.start / self.decimation.rate_hz
-        time_s = ticks / self.measurement.rate_hz - first_s
+        unknown_times_s = unknown_indices / self.measurement.rate_hz - first_s
         return with_new_hum._remove_torque(
             with_new_hum.hum_nm - self.hum_nm,
-            with_new_hum._hum_torque_at(time_s) - self._hum_torque_at(time_s),
+            with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),
         )
 
     def remove_drag_torque(self, plant: Plant, law: DragLaw) -> Comparison:
-        """Compute the torque by drag, remove it, and store its derivatives.
+        """Return the comparison without the torque by air drag, with that torque's derivatives.
 
         Parameters
         ----------
@@ -434,11 +461,11 @@ class Comparison:
         """
         # Drag acts on the whole motion, whether or not it followed a reference.
         whole_angle_rad = self.angle_rad + self.incoherent_rad
-        response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant)
-        drag_torque = response.torque(law, range(1, self.visible_modes + 1))
+        drag_response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant)
+        drag_torque = drag_response.torque(law, range(1, self.visible_modes + 1))
 
-        def band(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-            return self.spectrum(values[..., self.retained])
+        def band(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:
+            return self.spectrum(time_series[..., self.retained])
 
         unknown_indices = self._decimated_indices(~self.measurement.torque_known)
         full_rate_nm = np.fft.irfft(
@@ -449,13 +476,16 @@ class Comparison:
             self,
             torque_nm=self.torque_nm - drag_torque.torque_nm,
             removed_nm=self.removed_nm + drag_torque.torque_nm[self.retained],
-            removed_at_unknown_nm=self.removed_at_unknown_nm + full_rate_nm[unknown_indices],
+            removed_in_gaps_nm=self.removed_in_gaps_nm + full_rate_nm[unknown_indices],
             drag=DragExpansion(
                 plant=plant,
                 law=law,
-                response=response,
+                response=drag_response,
                 band=band,
-                by_pole={mode: band(rows) for mode, rows in drag_torque.by_pole.items()},
+                by_pole={
+                    mode_number: band(derivative_rows)
+                    for mode_number, derivative_rows in drag_torque.by_pole.items()
+                },
                 by_external=band(drag_torque.by_external),
                 by_ln_density=band(drag_torque.by_ln_density),
                 by_delay=band(drag_torque.by_delay),
@@ -477,17 +507,20 @@ class Comparison:
         the end of the record to its beginning would leak into all bins.
         """
         hum_spectra = self.decays.hum([hum_spectra.frequency_hz for hum_spectra in self.hum])
-        drift = _drift_spectrum(self.samples)[None, self.bins]
-        impact_spectra = drift[:0] if self.impact_spectra is None else self.impact_spectra
-        decays = [each.columns(poles) for each in (self.decays, *self.later_decays)]
-        return np.concatenate([*decays, hum_spectra, impact_spectra, drift])
+        drift_spectrum = _drift_spectrum(self.samples)[None, self.bins]
+        impact_spectra = drift_spectrum[:0] if self.impact_spectra is None else self.impact_spectra
+        decay_columns = [
+            decay_spectra.columns(poles) for decay_spectra in (self.decays, *self.later_decays)
+        ]
+        return np.concatenate([*decay_columns, hum_spectra, impact_spectra, drift_spectrum])
 
     def decay_gradient(
         self, poles: Sequence[Pole], amplitudes: NDArray[np.float64]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of the free decays with given amplitudes, through the poles.
+        """Return the derivatives of the free-decay spectra by the parameters that move the poles.
 
-        Differentiates the free decays in ``amplitudes @ nuisance_spectra(poles)``.
+        These are the free decays in ``amplitudes @ nuisance_spectra(poles)``. The amplitudes are
+        held constant.
 
         Parameters
         ----------
@@ -500,37 +533,42 @@ class Comparison:
         -------
         ndarray of complex, shape (k, K)
         """
-        total = self.decays.gradient(poles, amplitudes)
-        decay_amplitudes = count_decay_spectra(poles)
-        for number, later in enumerate(self.later_decays, start=1):
-            total += later.gradient(poles, amplitudes[number * decay_amplitudes :])
-        return total
+        total_gradient = self.decays.gradient(poles, amplitudes)
+        amplitudes_per_decay = count_decay_spectra(poles)
+        for decay_number, later_decay in enumerate(self.later_decays, start=1):
+            total_gradient += later_decay.gradient(
+                poles, amplitudes[decay_number * amplitudes_per_decay :]
+            )
+        return total_gradient
 
     def fill_unknown_torque(self, plant: Plant | ModalModel) -> Comparison:
-        """Fill unknown torque with the prediction of a plant, so that its residual is 0.
+        """Return the comparison with unmeasured torque filled by a plant's prediction.
 
-        After convergence the cost has the same minimum as the cost of the known samples alone.
+        The residual at these ticks then is 0.
+
+        After convergence of the fit, the cost has the same minimum as the cost of the known samples
+        alone.
         """
-        is_known = self.measurement.torque_known
-        if is_known.all():
+        known_mask = self.measurement.torque_known
+        if known_mask.all():
             return self
-        torque = self.measurement.torque_nm.copy()
-        torque[~is_known] = (
-            self.removed_at_unknown_nm
+        filled_nm = self.measurement.torque_nm.copy()
+        filled_nm[~known_mask] = (
+            self.removed_in_gaps_nm
             + self.prediction.torque_at_fine_samples(
-                plant, self.decimation.factor, self._decimated_indices(~is_known)
+                plant, self.decimation.factor, self._decimated_indices(~known_mask)
             )[0]
         )
-        torque_nm = self.decimation.apply(torque)
-        torque_nm[self.retained] -= self.removed_nm
-        return replace(self, torque_nm=torque_nm)
+        decimated_nm = self.decimation.apply(filled_nm)
+        decimated_nm[self.retained] -= self.removed_nm
+        return replace(self, torque_nm=decimated_nm)
 
     def gradient_at_unknown_torque(
         self, plant: Plant, wrt: tuple[str, ...]
     ) -> NDArray[np.complex128]:
-        """Return the derivatives of the predicted torque at ticks without torque, (k, K).
+        """Return the spectra of the predicted torque's derivatives at unmeasured ticks, (k, K).
 
-        They are spectra of a torque that is 0 at all other ticks.
+        All other ticks, those with a measured torque, contribute 0.
 
         Parameters
         ----------
@@ -545,10 +583,10 @@ class Comparison:
             _, gradient = self.prediction.torque_at_fine_samples(
                 plant, self.decimation.factor, self._decimated_indices(is_unknown), wrt
             )
-            for row, values in zip(unknown_gradient, gradient, strict=True):
+            for spectrum_row, derivative_nm in zip(unknown_gradient, gradient, strict=True):
                 unknown_nm = np.zeros(is_unknown.size)
-                unknown_nm[is_unknown] = values
-                row[:] = self.spectrum(self.decimation.apply(unknown_nm)[self.retained])
+                unknown_nm[is_unknown] = derivative_nm
+                spectrum_row[:] = self.spectrum(self.decimation.apply(unknown_nm)[self.retained])
         return unknown_gradient
 
     def _decimated_indices(self, is_marked: NDArray[np.bool_]) -> NDArray[np.intp]:

@@ -69,7 +69,7 @@ class RecordedImpact:
     ----------
     first_s, last_s : float
         Beginning and end of the contact, since the record's first tick.
-    resolution_s : float
+    start_uncertainty_s : float
         Uncertainty of the beginning.
     poles_rad_s : tuple of complex
         Poles of the ringing modes: the upper pole of a conjugate pair, or a real pole.
@@ -87,7 +87,10 @@ class RecordedImpact:
     largest_nm: float = 0.0
 
     def decays(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the free decays of all modes, and these times the time since the impact, (d, n).
+        """Return the free decays of all modes that an impact starts, shape (d, n).
+
+        Each real decay of unit amplitude is followed by the same decay times the time since the
+        impact in seconds.
 
         The decays times the time represent small errors of the poles.
 
@@ -99,15 +102,17 @@ class RecordedImpact:
         since_s = time_s - self.first_s
         has_begun = since_s > -_START_TOLERANCE_S
         since_s = np.where(has_begun, since_s, 0.0)
-        rows = []
-        for pole in self.poles_rad_s:
-            decay = np.where(has_begun, np.exp(pole * since_s), 0.0)
-            for real_decay in (decay.real, decay.imag)[: 1 + (pole.imag != 0)]:
-                rows += [real_decay, real_decay * since_s]
-        return np.array(rows).reshape(len(rows), time_s.size)
+        decay_rows = []
+        for pole_rad_s in self.poles_rad_s:
+            complex_decay = np.where(has_begun, np.exp(pole_rad_s * since_s), 0.0)
+            for real_decay in (complex_decay.real, complex_decay.imag)[
+                : 1 + (pole_rad_s.imag != 0)
+            ]:
+                decay_rows += [real_decay, real_decay * since_s]
+        return np.array(decay_rows).reshape(len(decay_rows), time_s.size)
 
     def columns(self, time_s: NDArray[np.float64], rate_hz: float) -> NDArray[np.float64]:
-        """Return the torque of the impact per unit of each unknown amplitude.
+        """Return time series of the impact's torque, one per unknown amplitude, of unit amplitude.
 
         The rows are the free decays, then the single samples during the contact.
 
@@ -122,11 +127,13 @@ class RecordedImpact:
         -------
         ndarray, shape (c, n)
         """
-        half_s = 0.5 / rate_hz
-        in_contact = (time_s > self.first_s - half_s) & (time_s < self.last_s - half_s)
-        indices = np.flatnonzero(in_contact)
-        single_samples = np.zeros((indices.size, time_s.size))
-        single_samples[np.arange(indices.size), indices] = 1.0
+        half_period_s = 0.5 / rate_hz
+        in_contact = (time_s > self.first_s - half_period_s) & (
+            time_s < self.last_s - half_period_s
+        )
+        contact_indices = np.flatnonzero(in_contact)
+        single_samples = np.zeros((contact_indices.size, time_s.size))
+        single_samples[np.arange(contact_indices.size), contact_indices] = 1.0
         return np.concatenate([self.decays(time_s), single_samples])
 
     def torque(
@@ -139,16 +146,16 @@ class RecordedImpact:
         time_s : ndarray, shape (n,)
             Times since the record's first tick.
         grid_s : ndarray, shape (m,)
-            Times of the samples for which `sizes` was estimated.
+            Times of the samples for which `amplitudes` was estimated.
         rate_hz : float
             Sampling rate of these samples.
         """
         if not self.sizes:
             return np.zeros(time_s.size)
         decays = self.decays(time_s)
-        sizes = np.array(self.sizes)
-        contact_nm = sizes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
-        decay_nm: NDArray[np.float64] = sizes[: len(decays)] @ decays
+        amplitudes = np.array(self.sizes)
+        contact_nm = amplitudes[len(decays) :] @ self.columns(grid_s, rate_hz)[len(decays) :]
+        decay_nm: NDArray[np.float64] = amplitudes[: len(decays)] @ decays
         return decay_nm + np.interp(time_s, grid_s, contact_nm)
 
 
@@ -250,7 +257,7 @@ class Measurement:
         )
 
     def check(self, highest_hz: float) -> None:
-        """Raise if the measurement cannot be used in a band that ends at `highest_hz`.
+        """Raise an error if the measurement cannot be used in a band that ends at `highest_hz`.
 
         Raises
         ------
@@ -258,58 +265,58 @@ class Measurement:
             Shapes differ, values are not finite, too many values are unknown in total or in one
             gap, or the angle never moves.
         """
-        n = len(self.angle_rad)
-        for array in (self.torque_nm, self.angle_known, self.torque_known):
-            if len(array) != n:
+        tick_count = len(self.angle_rad)
+        for channel_array in (self.torque_nm, self.angle_known, self.torque_known):
+            if len(channel_array) != tick_count:
                 raise MeasurementError(
-                    f"{self.name}: angle, torque and their masks hold {n} and {len(array)} values, "
-                    "but must be of one length."
+                    f"{self.name}: angle, torque and their masks hold {tick_count} and "
+                    f"{len(channel_array)} values, but must be of one length."
                 )
-        for channel, unit, values, is_known in (
+        for channel, unit_name, channel_values, known_mask in (
             ("angle", "rad", self.angle_rad, self.angle_known),
             ("torque", "N·m", self.torque_nm, self.torque_known),
         ):
-            bad = np.flatnonzero(is_known & ~np.isfinite(values))
-            if bad.size:
+            bad_indices = np.flatnonzero(known_mask & ~np.isfinite(channel_values))
+            if bad_indices.size:
                 raise MeasurementError(
-                    f"{self.name}: the {channel} is {values[bad[0]]} {unit} at tick {bad[0]} and "
-                    f"not finite at {bad.size} of {n} ticks; mask them as unknown or record the "
-                    "session again."
+                    f"{self.name}: the {channel} is {channel_values[bad_indices[0]]} {unit_name} "
+                    f"at tick {bad_indices[0]} and not finite at {bad_indices.size} of "
+                    f"{tick_count} ticks; mask them as unknown or record the session again."
                 )
             complaint = unknown_fraction_message(
-                f"the {channel}", int(np.count_nonzero(~is_known)), n
+                f"the {channel}", int(np.count_nonzero(~known_mask)), tick_count
             )
             if complaint:
                 raise MeasurementError(f"{self.name}: {complaint}")
-        for channel, is_known, allowed_s in (
+        for channel, known_mask, allowed_s in (
             ("angle", self.angle_known, MAX_GAP_S),
             ("torque", self.torque_known, MAX_TORQUE_GAP_S),
         ):
-            gap, start = longest_run(~is_known)
-            if gap > allowed_s * self.rate_hz:
+            gap_ticks, gap_start = longest_run(~known_mask)
+            if gap_ticks > allowed_s * self.rate_hz:
                 raise MeasurementError(
-                    f"{self.name}: the {channel} is missing or flagged for {gap} ticks from tick "
-                    f"{start} on ({1e3 * gap / self.rate_hz:.3g} ms), longer than the "
-                    f"{1e3 * allowed_s:.3g} ms that an analysis tolerates; record the session "
+                    f"{self.name}: the {channel} is missing or flagged for {gap_ticks} ticks from "
+                    f"tick {gap_start} on ({1e3 * gap_ticks / self.rate_hz:.3g} ms), longer than "
+                    f"the {1e3 * allowed_s:.3g} ms that an analysis tolerates; record the session "
                     "again."
                 )
-        gaps = len(self.long_gaps(highest_hz))
-        if gaps > MAX_LONG_GAPS:
+        long_gap_count = len(self.long_gaps(highest_hz))
+        if long_gap_count > MAX_LONG_GAPS:
             raise MeasurementError(
-                f"{self.name}: the angle is missing or flagged {gaps} times for longer than the "
-                f"{1e3 * MAX_ANGLE_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
+                f"{self.name}: the angle is missing or flagged {long_gap_count} times for longer "
+                f"than the {1e3 * MAX_ANGLE_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
                 f"{highest_hz:g} Hz interpolates, more often than the {MAX_LONG_GAPS} times that "
                 "an analysis tolerates; record the session again or lower --band."
             )
-        angles = self.angle_rad[self.angle_known]
-        if angles.size == 0 or np.ptp(angles) == 0:
+        known_angles_rad = self.angle_rad[self.angle_known]
+        if known_angles_rad.size == 0 or np.ptp(known_angles_rad) == 0:
             raise MeasurementError(
                 f"{self.name}: the angle never changes, so nothing was excited; check the encoder "
                 "and that the motor moved."
             )
 
     def long_gaps(self, highest_hz: float) -> tuple[tuple[int, int], ...]:
-        """Return the gaps of the angle that are too long to interpolate.
+        """Return the gaps of the motor angle that are too long to interpolate, as ticks.
 
         The beam may ring after such a gap.
 
@@ -330,27 +337,27 @@ class Measurement:
         )
         settling_ticks = int(np.ceil(settling_s * self.rate_hz))
         return tuple(
-            (int(start), min(int(end) + settling_ticks, len(self.angle_rad)))
-            for start, end in zip(*_runs_of_true(~self.angle_known), strict=True)
-            if end - start > longest_ticks
+            (int(gap_start), min(int(gap_end) + settling_ticks, len(self.angle_rad)))
+            for gap_start, gap_end in zip(*_runs_of_true(~self.angle_known), strict=True)
+            if gap_end - gap_start > longest_ticks
         )
 
-    def without_torque_in(self, gaps: Iterable[tuple[int, int]]) -> Measurement:
-        """Return the measurement with the torque marked as unknown in given gaps.
+    def without_torque_in(self, tick_ranges: Iterable[tuple[int, int]]) -> Measurement:
+        """Return the measurement with its torque marked as unknown in given ranges of ticks.
 
         Parameters
         ----------
-        gaps : iterable of (int, int)
-            First tick of each gap, and the first tick after it.
+        tick_ranges : iterable of (int, int)
+            First tick of each range, and the first tick after it.
         """
-        is_known = self.torque_known.copy()
-        for start, end in gaps:
-            is_known[start:end] = False
-        return replace(self, torque_known=is_known)
+        known_mask = self.torque_known.copy()
+        for first_tick, end_tick in tick_ranges:
+            known_mask[first_tick:end_tick] = False
+        return replace(self, torque_known=known_mask)
 
     @property
     def nominal(self) -> Plant:
-        """Return the plant with the properties that the file states, and without damping."""
+        """Return the beam and rig with the properties that the session file states, undamped."""
         return Plant(
             beam=self.beam,
             damping=Damping(),
@@ -367,13 +374,16 @@ class Measurement:
         return float(np.mean(self.torque_known))
 
     def angle_from_rest(self, highest_hz: float) -> NDArray[np.float64]:
-        """Return the motor angle relative to its rest position, with gaps interpolated, shape (n,).
+        """Return the motor angle in rad relative to its rest position, gaps interpolated, (n,).
 
-        `highest_hz` is the highest frequency that the angle contains.
+        `highest_hz` is the highest frequency that the angle contains. Where the rest position is
+        unknown, it is the first angle.
         """
-        angle = interpolate_gaps(self.angle_rad, self.angle_known, highest_hz / self.rate_hz)
-        origin = angle[0] if self.rest_angle_rad is None else self.rest_angle_rad
-        return angle - origin
+        filled_angle_rad = interpolate_gaps(
+            self.angle_rad, self.angle_known, highest_hz / self.rate_hz
+        )
+        rest_angle_rad = filled_angle_rad[0] if self.rest_angle_rad is None else self.rest_angle_rad
+        return filled_angle_rad - rest_angle_rad
 
 
 # Interpolation of gaps
@@ -391,7 +401,7 @@ _RELATIVE_NOISE_POWER: Final = 1e-6
 
 
 def interpolate_gaps(
-    values: NDArray[np.float64], known: NDArray[np.bool_], highest: float
+    signal_values: NDArray[np.float64], known_mask: NDArray[np.bool_], cycles_per_sample: float
 ) -> NDArray[np.float64]:
     """Estimate the unknown values of a band-limited signal from their known neighbours.
 
@@ -402,11 +412,11 @@ def interpolate_gaps(
 
     Parameters
     ----------
-    values : ndarray, shape (n,)
+    signal_values : ndarray, shape (n,)
         Signal; unknown values are ignored.
-    known : ndarray of bool, shape (n,)
+    known_mask : ndarray of bool, shape (n,)
         Whether each value is known.
-    highest : float
+    cycles_per_sample : float
         Highest frequency, in cycles per sample.
 
     Returns
@@ -414,41 +424,51 @@ def interpolate_gaps(
     ndarray, shape (n,)
         The given values where known, the estimates elsewhere.
     """
-    filled = np.where(known, values, 0.0)
-    reach_samples = int(np.ceil(_NEIGHBOUR_REACH_PERIODS / highest))
-    for start, end in zip(*_runs_of_true(~known), strict=True):
-        first_neighbour = max(start - reach_samples, 0)
-        neighbours = first_neighbour + np.flatnonzero(known[first_neighbour : end + reach_samples])
+    filled_values = np.where(known_mask, signal_values, 0.0)
+    reach_samples = int(np.ceil(_NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
+    for gap_start, gap_end in zip(*_runs_of_true(~known_mask), strict=True):
+        first_neighbour = max(gap_start - reach_samples, 0)
+        neighbours = first_neighbour + np.flatnonzero(
+            known_mask[first_neighbour : gap_end + reach_samples]
+        )
         if neighbours.size == 0:
             continue
         weights = _interpolation_weights(
-            tuple(neighbours - start), int(end - start), _BANDWIDTH_MARGIN * highest
+            tuple(neighbours - gap_start),
+            int(gap_end - gap_start),
+            _BANDWIDTH_MARGIN * cycles_per_sample,
         )
-        mean_value = float(values[neighbours].mean())
-        filled[start:end] = mean_value + weights @ (values[neighbours] - mean_value)
-    return filled
+        mean_value = float(signal_values[neighbours].mean())
+        filled_values[gap_start:gap_end] = mean_value + weights @ (
+            signal_values[neighbours] - mean_value
+        )
+    return filled_values
 
 
 @lru_cache(maxsize=64)
 def _interpolation_weights(
-    neighbours: tuple[int, ...], length: int, highest: float
+    neighbour_offsets: tuple[int, ...], gap_length: int, cycles_per_sample: float
 ) -> NDArray[np.float64]:
-    """Return the weights of known neighbours in the estimates for a gap, (length, neighbours).
+    """Return the weights by which known values around a gap estimate the values in it.
 
-    `neighbours` are the indices of the known values relative to the start of the gap.
+    The shape is (gap length, neighbours). `cycles_per_sample` is the bandwidth of the signal.
+
+    `neighbour_offsets` are the indices of the known values relative to the start of the gap.
     """
-    indices = np.array(neighbours)
-    neighbour_covariance = np.sinc(2 * highest * np.subtract.outer(indices, indices))
-    neighbour_covariance += _RELATIVE_NOISE_POWER * np.eye(indices.size)
-    gap_covariance = np.sinc(2 * highest * np.subtract.outer(np.arange(length), indices))
+    offsets = np.array(neighbour_offsets)
+    neighbour_covariance = np.sinc(2 * cycles_per_sample * np.subtract.outer(offsets, offsets))
+    neighbour_covariance += _RELATIVE_NOISE_POWER * np.eye(offsets.size)
+    gap_covariance = np.sinc(
+        2 * cycles_per_sample * np.subtract.outer(np.arange(gap_length), offsets)
+    )
     weights: NDArray[np.float64] = np.linalg.solve(neighbour_covariance, gap_covariance.T).T
     return weights
 
 
 def _runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the start index of each run of True in a mask, and the index after its end."""
-    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    return np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
+    run_edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    return np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
 
 
 # Decimation
@@ -463,7 +483,7 @@ filter becomes long."""
 
 @dataclass(frozen=True, slots=True)
 class Decimation:
-    """Centred linear-phase low-pass filter, followed by downsampling.
+    """Reduction of the sampling rate: centred linear-phase low-pass filter, then downsampling.
 
     It does not use `scipy.signal` (`kaiserord`, `firwin` and `oaconvolve`), whose import takes 0.64
     s of processor time: a tenth of the analysis of a session of 76 s.
@@ -501,21 +521,21 @@ class Decimation:
         new_rate_hz = rate_hz / factor
         stop_hz = new_rate_hz / 2
         # Kaiser's formulas for the length of the filter and the shape of its window.
-        width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
-        half_length = (_STOP_BAND_ATTENUATION_DB - 7.95) / (2 * 2.285 * width)
-        reach = int(np.ceil(half_length / factor))
-        ticks = np.arange(-reach * factor, reach * factor + 1)
-        cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
-        kernel = cutoff * np.sinc(cutoff * ticks)
-        kernel *= np.kaiser(ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
-        return cls(factor, kernel / kernel.sum(), reach, new_rate_hz)
+        transition_width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
+        half_length = (_STOP_BAND_ATTENUATION_DB - 7.95) / (2 * 2.285 * transition_width)
+        reach_samples = int(np.ceil(half_length / factor))
+        kernel_ticks = np.arange(-reach_samples * factor, reach_samples * factor + 1)
+        relative_cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
+        kernel = relative_cutoff * np.sinc(relative_cutoff * kernel_ticks)
+        kernel *= np.kaiser(kernel_ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
+        return cls(factor, kernel / kernel.sum(), reach_samples, new_rate_hz)
 
-    def apply(self, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    def apply(self, signal_values: NDArray[np.float64]) -> NDArray[np.float64]:
         """Low-pass filter a signal and downsample it.
 
         Parameters
         ----------
-        values : ndarray, shape (n,)
+        signal_values : ndarray, shape (n,)
             Signal at the original rate, assumed to be 0 before and after.
 
         Returns
@@ -523,18 +543,19 @@ class Decimation:
         ndarray, shape (m,)
             Filtered samples. Sample `reach` has the time of the first value.
         """
-        length = values.size + self.kernel.size - 1
-        padded = fast_length(length)
-        spectrum = np.fft.rfft(values, padded) * np.fft.rfft(self.kernel, padded)
-        return np.fft.irfft(spectrum, padded)[: length : self.factor].copy()
+        filtered_length = signal_values.size + self.kernel.size - 1
+        padded_length = fast_length(filtered_length)
+        spectrum = np.fft.rfft(signal_values, padded_length) * np.fft.rfft(
+            self.kernel, padded_length
+        )
+        return np.fft.irfft(spectrum, padded_length)[: filtered_length : self.factor].copy()
 
-    def samples_inside_record(self, ticks: int) -> slice:
-        """Return the slice of decimated samples that depend on samples of the record only.
+    def samples_inside_record(self, tick_count: int) -> slice:
+        """Return the slice of decimated samples whose filter window lies within the record.
 
-        `ticks` is the number of ticks of the record. The filter window of other samples extends
-        beyond the record.
+        `tick_count` is the number of ticks of the record.
         """
-        return slice(2 * self.reach, (ticks - 1) // self.factor + 1)
+        return slice(2 * self.reach, (tick_count - 1) // self.factor + 1)
 
 
 def fast_length(at_least: int) -> int:

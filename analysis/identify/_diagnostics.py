@@ -37,7 +37,7 @@ def findings(
     forces: tuple[NonlinearForce, ...],
     harmonics: tuple[Harmonic, ...],
 ) -> tuple[Finding, ...]:
-    """Return the effects found in a record, in addition to the linear beam.
+    """Return the effects found in a record that a linear damped beam does not explain.
 
     If a sign or unit of the record is wrong, only findings that need no model are returned.
 
@@ -81,22 +81,22 @@ _MIN_REPORTED_BEAM_DEVIATION: Final = 0.003
 def search_limit_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     """Yield a finding for each fitted parameter at the limit of its search range."""
     fit = candidate_set.best.fit
-    for name, quantity, factor, unit in (
+    for parameter_name, quantity_name, unit_factor, unit_name in (
         ("delay_s", "The delay between the channels", 1e3, "ms"),
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)", 1, "s²/m⁴"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)", 1, "N·m²"),
     ):
-        if name in fit.at_bounds:
-            value = fit.parameters[name]
+        if parameter_name in fit.at_bounds:
+            limit_value = fit.parameters[parameter_name]
             yield Finding(
                 kind="implausible",
                 sentence=(
-                    f"{quantity} would have to be {factor * value:.4g} {unit} or beyond, which is "
-                    "the limit of the search range: the record contradicts its file. "
-                    "No number here is valid for the antenna."
+                    f"{quantity_name} would have to be {unit_factor * limit_value:.4g} {unit_name} "
+                    "or beyond, which is the limit of the search range: the record contradicts its "
+                    "file. No number here is valid for the antenna."
                 ),
-                value=value,
-                unit=unit if factor == 1 else "s",
+                value=limit_value,
+                unit=unit_name if unit_factor == 1 else "s",
                 remedy=(
                     "Check the signs and the units of angle and torque, and the beam's length, "
                     "density and stiffness in the file."
@@ -105,7 +105,10 @@ def search_limit_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
 
 
 def setting_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield findings of delay, inertia, beam data and initial ringing that differ from the file.
+    """Yield findings of settings whose estimates differ from the session file.
+
+    They are torque delay, tool inertia, density and stiffness of the beam. A ringing of the beam at
+    the beginning of the record yields a finding, too.
 
     A parameter with a flag in `headline` yields no finding.
     """
@@ -115,54 +118,72 @@ def setting_findings(candidate_set: CandidateSet, headline: Headline) -> Iterato
 
 
 def _significant_deviation(
-    candidate_set: CandidateSet, headline: Headline, name: Setting
+    candidate_set: CandidateSet, headline: Headline, setting_name: Setting
 ) -> tuple[float, float, float] | None:
-    """Return the deviation of a setting from the file, with its 95 % interval.
+    """Return the estimate of a setting minus the file's value, with its 95 % interval.
 
     Return None if the deviation is not significant, or if the value carries a flag.
     """
-    quantity, stated_value = headline.parameters.get(name), _stated_value(candidate_set, name)
-    if quantity is None or quantity.flag or not quantity.std or quantity.interval_95 is None:
+    reported_value, stated_value = (
+        headline.parameters.get(setting_name),
+        _stated_value(candidate_set, setting_name),
+    )
+    if (
+        reported_value is None
+        or reported_value.flag
+        or not reported_value.std
+        or reported_value.interval_95 is None
+    ):
         return None
-    if abs(quantity.value - stated_value) < SIGNIFICANT_STD * quantity.std:
+    if abs(reported_value.value - stated_value) < SIGNIFICANT_STD * reported_value.std:
         return None
-    low, high = quantity.interval_95
-    return quantity.value - stated_value, low - stated_value, high - stated_value
+    interval_low, interval_high = reported_value.interval_95
+    return (
+        reported_value.value - stated_value,
+        interval_low - stated_value,
+        interval_high - stated_value,
+    )
 
 
 def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield findings of a delay and a tool inertia that differ from the file."""
+    """Yield findings of a torque delay and a tool inertia that differ from the session file."""
     deviation = _significant_deviation(candidate_set, headline, "delay_s")
     if deviation is not None and abs(deviation[0]) > _MIN_REPORTED_DELAY_S:
-        value, *interval = deviation
-        low, high = interval
-        (size,) = to_uncertainty((abs(value),), (high - low) / 2, 1e3)
+        setting_deviation, *deviation_interval = deviation
+        interval_low, interval_high = deviation_interval
+        (rounded_size,) = to_uncertainty(
+            (abs(setting_deviation),), (interval_high - interval_low) / 2, 1e3
+        )
         delay_s = headline.parameters["delay_s"].value
         yield Finding(
             kind="delay",
             sentence=(
-                f"The torque is {size} ms {'later' if value > 0 else 'earlier'} "
-                f"than the file states ({interval_text(interval, 1e3)} ms; 95 %): an "
-                "undeclared delay between the channels. It was fitted and is not damping."
+                f"The torque is {rounded_size} ms "
+                f"{'later' if setting_deviation > 0 else 'earlier'} than the file states "
+                f"({interval_text(deviation_interval, 1e3)} ms; 95 %): an undeclared delay between "
+                "the channels. It was fitted and is not damping."
             ),
-            value=value,
-            interval=(low, high),
+            value=setting_deviation,
+            interval=(interval_low, interval_high),
             unit="s",
             remedy=f"Declare the delay between the channels as {1e3 * delay_s:.3f} ms.",
             parameters=("delay_s",),
         )
     if deviation := _significant_deviation(candidate_set, headline, "tool_inertia_kg_m2"):
-        value, *interval = deviation
-        low, high = interval
-        (size,) = to_uncertainty((value,), (high - low) / 2, 1e6)
+        setting_deviation, *deviation_interval = deviation
+        interval_low, interval_high = deviation_interval
+        (rounded_size,) = to_uncertainty(
+            (setting_deviation,), (interval_high - interval_low) / 2, 1e6
+        )
         yield Finding(
             kind="tool inertia",
             sentence=(
-                f"The inertia between torque sensor and beam is {size}·10⁻⁶ kg·m² larger than the "
-                f"file states ({interval_text(interval, 1e6)}; 95 %): clamp or flange."
+                f"The inertia between torque sensor and beam is {rounded_size}·10⁻⁶ kg·m² larger "
+                f"than the file states ({interval_text(deviation_interval, 1e6)}; 95 %): clamp or "
+                "flange."
             ),
-            value=value,
-            interval=(low, high),
+            value=setting_deviation,
+            interval=(interval_low, interval_high),
             unit="kg·m²",
             remedy="A run without the beam measures it; declare it as tool inertia.",
             parameters=("tool_inertia_kg_m2",),
@@ -170,92 +191,98 @@ def _instrument_findings(candidate_set: CandidateSet, headline: Headline) -> Ite
 
 
 def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
-    """Yield findings of density and stiffness that differ from the file."""
+    """Yield findings of the beam's density and stiffness that differ from the session file."""
     beam_parameters: tuple[tuple[Setting, str], ...] = (
         ("density_over_stiffness", "Mass per length over bending stiffness (rho/EI)"),
         ("bending_stiffness_n_m2", "The bending stiffness (EI)"),
     )
-    for name, description in beam_parameters:
-        stated_value = _stated_value(candidate_set, name)
-        deviation = _significant_deviation(candidate_set, headline, name)
+    for setting_name, description in beam_parameters:
+        stated_value = _stated_value(candidate_set, setting_name)
+        deviation = _significant_deviation(candidate_set, headline, setting_name)
         if deviation is None or abs(deviation[0]) < _MIN_REPORTED_BEAM_DEVIATION * stated_value:
             continue
-        relative, *interval = (each / stated_value for each in deviation)
-        low, high = interval
-        (size,) = to_uncertainty((abs(relative),), (high - low) / 2, 100)
+        relative_deviation, *deviation_interval = (bound / stated_value for bound in deviation)
+        interval_low, interval_high = deviation_interval
+        (percent_size,) = to_uncertainty(
+            (abs(relative_deviation),), (interval_high - interval_low) / 2, 100
+        )
         yield Finding(
             kind="beam data",
             sentence=(
-                f"{description} is {size} % {'higher' if relative > 0 else 'lower'} than the "
-                f"file states ({interval_text(interval, 100, '+')} %; 95 %)"
-                f"{_equivalent_causes(candidate_set, name)}."
+                f"{description} is {percent_size} % "
+                f"{'higher' if relative_deviation > 0 else 'lower'} than the file states "
+                f"({interval_text(deviation_interval, 100, '+')} %; 95 "
+                f"%){_equivalent_causes(candidate_set, setting_name)}."
             ),
-            value=relative,
-            interval=(low, high),
+            value=relative_deviation,
+            interval=(interval_low, interval_high),
             remedy="Weigh and measure the link again, or take the value found.",
-            parameters=(name,),
+            parameters=(setting_name,),
         )
 
 
-def _equivalent_causes(candidate_set: CandidateSet, name: Setting) -> str:
-    """Return the end of a sentence that names other causes of a deviating density or stiffness.
+def _equivalent_causes(candidate_set: CandidateSet, setting_name: Setting) -> str:
+    """Return a clause naming other causes of a deviating density or stiffness of the beam.
 
     Return an empty string if there are none.
     """
-    if name == "bending_stiffness_n_m2":
+    if setting_name == "bending_stiffness_n_m2":
         return ", or the torque's gain is"
-    fit, beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
+    fit, stated_beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
     tip_mass_effect = (
-        math.log(fit.plant.beam.density_over_stiffness / beam.density_over_stiffness) / 4
+        math.log(fit.plant.beam.density_over_stiffness / stated_beam.density_over_stiffness) / 4
     )
-    stiffness = fit.plant.beam.bending_stiffness_n_m2
+    stiffness_n_m2 = fit.plant.beam.bending_stiffness_n_m2
     std = fit.std["bending_stiffness_n_m2"] or 0.0
     # A small mass at the tip shifts all modes alike, and the torque by a quarter of that shift.
-    unexplained_change = math.log(stiffness / beam.bending_stiffness_n_m2) + tip_mass_effect
+    unexplained_change = (
+        math.log(stiffness_n_m2 / stated_beam.bending_stiffness_n_m2) + tip_mass_effect
+    )
     if (
         fit.plant.tip_mass_kg
         or tip_mass_effect <= 0
-        or abs(unexplained_change) > SIGNIFICANT_STD * std / stiffness
+        or abs(unexplained_change) > SIGNIFICANT_STD * std / stiffness_n_m2
     ):
         return ""
-    mass_g = 1e3 * tip_mass_effect * beam.density_kg_per_m * beam.length_m
+    mass_g = 1e3 * tip_mass_effect * stated_beam.density_kg_per_m * stated_beam.length_m
     return f", or the beam carries {mass_g:.2g} g at its tip"
 
 
 def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[Finding]:
     """Yield a finding if the modal model shows that the beam was ringing when the record began."""
-    ringing = None if headline.modal is None else headline.modal.ringing
-    if ringing is None or not ringing.degrees_of_freedom:
+    initial_ringing = None if headline.modal is None else headline.modal.ringing
+    if initial_ringing is None or not initial_ringing.degrees_of_freedom:
         return
-    largest_nm = max(ringing.amplitude_nm)
+    largest_ringing_nm = max(initial_ringing.amplitude_nm)
     # A hum begins and ends with the record, and so resembles a decay.
-    hum_nm = max((line.amplitude_nm for line in candidate_set.noise.lines), default=0.0)
+    hum_nm = max((noise_line.amplitude_nm for noise_line in candidate_set.noise.lines), default=0.0)
     if (
-        largest_nm <= hum_nm
-        or chi_square_deviate(ringing.chi_square, ringing.degrees_of_freedom) < SIGNIFICANT_STD
+        largest_ringing_nm <= hum_nm
+        or chi_square_deviate(initial_ringing.chi_square, initial_ringing.degrees_of_freedom)
+        < SIGNIFICANT_STD
     ):
         return
     yield Finding(
         kind="ringing start",
         sentence=(
-            f"The beam was ringing when the record began ({1e3 * largest_nm:.3g} mN·m); its free "
-            "decay was fitted and biases nothing."
+            f"The beam was ringing when the record began ({1e3 * largest_ringing_nm:.3g} mN·m); "
+            "its free decay was fitted and biases nothing."
         ),
-        value=largest_nm,
+        value=largest_ringing_nm,
         unit="N·m",
         remedy="Wait longer at rest before the sweep.",
     )
 
 
-def _stated_value(candidate_set: CandidateSet, name: Setting) -> float:
-    """Return the value that the file states for a setting."""
+def _stated_value(candidate_set: CandidateSet, setting_name: Setting) -> float:
+    """Return the value in SI units that the session file states for a setting."""
     measurement = candidate_set.comparison.measurement
     return {
         "density_over_stiffness": measurement.beam.density_over_stiffness,
         "bending_stiffness_n_m2": measurement.beam.bending_stiffness_n_m2,
         "delay_s": measurement.delay_s,
         "tool_inertia_kg_m2": measurement.tool_inertia_kg_m2,
-    }[name]
+    }[setting_name]
 
 
 # Disturbances, forces, and what remains
@@ -277,7 +304,7 @@ excitation."""
 
 
 def mains(frequency_hz: float) -> str:
-    """Return "the mains" or a multiple of the mains frequency if a frequency is near it, else "".
+    """Return the words for the mains harmonic that a frequency is near, or an empty string.
 
     The text describes the possible source of a disturbance with this frequency.
     """
@@ -292,60 +319,62 @@ def unexplained(
     whiteness: Whiteness,
     input_dependence: InputRelation,
     modes: tuple[ModeEstimate, ...],
-    step: StiffnessStep | None = None,
+    stiffness_step: StiffnessStep | None = None,
 ) -> Finding:
     """Return the finding that describes the unexplained residual of a record.
 
-    `step` is a step of the stiffness during the record, if it explains more of the residual than
-    any effect of the amplitude.
+    `stiffness_step` is a step of the stiffness during the record, if it explains more of the
+    residual than any effect of the amplitude.
     """
-    low, high = whiteness.loudest_hz
-    at_mode = [mode.number for mode in modes if low <= mode.frequency_hz <= high]
-    if step is not None:
+    peak_low_hz, peak_high_hz = whiteness.loudest_hz
+    modes_at_peak = [
+        mode.number for mode in modes if peak_low_hz <= mode.frequency_hz <= peak_high_hz
+    ]
+    if stiffness_step is not None:
         description = (
-            f"The modes do not fit together. The likeliest cause is {step.words}, but one sweep "
-            "does not tell a change in time from one with the frequency."
+            f"The modes do not fit together. The likeliest cause is {stiffness_step.words}, but "
+            "one sweep does not tell a change in time from one with the frequency."
         )
         remedy = (
             "Fasten clamp and motor mount, and sweep again in both directions "
             "(rigd run chirp --there-and-back)."
         )
     elif input_dependence.related:
-        location = (
+        location_words = (
             f"near {input_dependence.at_hz:.1f} Hz"
             if input_dependence.local
             else "all through the band"
         )
         description = (
-            f"Unmodelled linear dynamics {location}: part of the torque is a linear response to "
-            "the motor angle that no nearly uniform beam has."
+            f"Unmodelled linear dynamics {location_words}: part of the torque is a linear response "
+            "to the motor angle that no nearly uniform beam has."
         )
         remedy = (
             "Fasten clamp, motor mount and sensor cable, and sweep again; then sweep without the "
             "beam: what remains belongs to the rig."
         )
-    elif whiteness.loud and at_mode:
+    elif whiteness.loud and modes_at_peak:
         description = (
-            f"The residual is {whiteness.loudest_ratio:.1f} times the noise at mode {at_mode[0]} "
-            f"({low:.2f} to {high:.2f} Hz): encoder quantisation amplified by the resonance, or an "
-            "unmodelled effect in that mode."
+            f"The residual is {whiteness.loudest_ratio:.1f} times the noise at mode "
+            f"{modes_at_peak[0]} ({peak_low_hz:.2f} to {peak_high_hz:.2f} Hz): encoder "
+            "quantisation amplified by the resonance, or an unmodelled effect in that mode."
         )
         remedy = "Sweep again at twice the amplitude, which halves the effect of quantisation."
-    elif whiteness.loud and high < _SENSOR_DRIFT_LIMIT_HZ:
+    elif whiteness.loud and peak_high_hz < _SENSOR_DRIFT_LIMIT_HZ:
         description = (
-            f"The residual below {high:.2f} Hz is {whiteness.loudest_ratio:.1f} times the noise "
-            "and does not follow the motor: zero drift of the torque sensor."
+            f"The residual below {peak_high_hz:.2f} Hz is {whiteness.loudest_ratio:.1f} times the "
+            "noise and does not follow the motor: zero drift of the torque sensor."
         )
         remedy = ""
     else:
-        mains_words = mains((low + high) / 2)
+        mains_words = mains((peak_low_hz + peak_high_hz) / 2)
         description = (
-            f"The residual is {whiteness.loudest_ratio:.1f} times the noise from {low:.2f} to "
-            f"{high:.2f} Hz and does not follow the motor: a disturbance"
+            f"The residual is {whiteness.loudest_ratio:.1f} times the noise from {peak_low_hz:.2f} "
+            f"to {peak_high_hz:.2f} Hz and does not follow the motor: a disturbance"
             f"{', such as intermittent mains interference' if mains_words else ''}."
             if whiteness.loud
             else "The residual is not white (most power from "
-            f"{low:.2f} to {high:.2f} Hz) and does not follow the motor."
+            f"{peak_low_hz:.2f} to {peak_high_hz:.2f} Hz) and does not follow the motor."
         )
         remedy = (
             "Record for as long with the motor held (rigd run hold). If it is there too, search "
@@ -367,21 +396,23 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     if drift_nm > 0:
         yield _drift_finding(drift_nm)
     period_s = repetition_period_s(comparison)
-    for line in candidate_set.noise.lines:
-        if line.frequency_hz * duration_s < _MIN_HUM_PERIODS:
+    for noise_line in candidate_set.noise.lines:
+        if noise_line.frequency_hz * duration_s < _MIN_HUM_PERIODS:
             continue
-        mains_words = mains(line.frequency_hz)
-        source = f", {mains_words}" if mains_words else ""
-        turns = line.frequency_hz * period_s
+        mains_words = mains(noise_line.frequency_hz)
+        source_words = f", {mains_words}" if mains_words else ""
+        phase_turns = noise_line.frequency_hz * period_s
         is_harmonic = (
             period_s > 0
-            and abs(turns - round(turns)) < _HARMONIC_PHASE_TOLERANCE_TURNS * period_s / duration_s
+            and abs(phase_turns - round(phase_turns))
+            < _HARMONIC_PHASE_TOLERANCE_TURNS * period_s / duration_s
         )
         yield Finding(
             kind="hum",
             sentence=(
-                f"Narrow-band disturbance of the torque at {line.frequency_hz:.2f} Hz{source}: "
-                f"{1e3 * line.amplitude_nm:.3g} mN·m throughout the record. "
+                f"Narrow-band disturbance of the torque at {noise_line.frequency_hz:.2f} "
+                f"Hz{source_words}: {1e3 * noise_line.amplitude_nm:.3g} mN·m throughout the "
+                "record. "
                 + (
                     f"The excitation repeats every {period_s:.4g} s, and so does this line: it may "
                     "be a harmonic due to a nonlinearity. It was left out of the fit."
@@ -389,7 +420,7 @@ def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
                     else "The motor did not cause it; it was removed."
                 )
             ),
-            value=line.amplitude_nm,
+            value=noise_line.amplitude_nm,
             unit="N·m",
             remedy=(
                 "Repeat with half the amplitude: a line that shrinks is caused by the motor."
@@ -417,12 +448,12 @@ def _drag_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     drag = candidate_set.drag
     if drag is None:
         return
-    low, high = drag.interval_95_m
-    (size,) = to_uncertainty((drag.value_m,), (high - low) / 2, 1e3)
+    interval_low_m, interval_high_m = drag.interval_95_m
+    (rounded_sizes,) = to_uncertainty((drag.value_m,), (interval_high_m - interval_low_m) / 2, 1e3)
     yield Finding(
         kind="air drag",
         sentence=(
-            f"Air drag acts on the beam: C_D d = {size} mm "
+            f"Air drag acts on the beam: C_D d = {rounded_sizes} mm "
             f"({interval_text(drag.interval_95_m, 1e3)} mm; 95 %) at {drag.speed_m_s:.2g} "
             "m/s, so damping grows with the amplitude. Drag was fitted too; the beam's parameters "
             "are those without air."
@@ -437,30 +468,30 @@ def _drag_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
 
 def _force_finding(force: NonlinearForce) -> Finding:
     """Return the finding of a nonlinear restoring force or of quadratic damping."""
-    size, std, mode = force.size, force.std, force.term.mode
-    percent = f"{100 * abs(size):.2g} % (± {100 * NORMAL_95 * std:.1g} %)"
+    force_size, std, mode_number = force.size, force.std, force.term.mode
+    percent_text = f"{100 * abs(force_size):.2g} % (± {100 * NORMAL_95 * std:.1g} %)"
     if force.term.kind == "quadratic drag":
         sentence = (
-            f"The damping of mode {mode} depends on its speed, as drag in air does: its damping "
-            f"ratio is {abs(size):.2g} (± {NORMAL_95 * std:.1g}) "
-            f"{'higher' if size > 0 else 'lower'} at the highest speed than at rest."
+            f"The damping of mode {mode_number} depends on its speed, as drag in air does: its "
+            f"damping ratio is {abs(force_size):.2g} (± {NORMAL_95 * std:.1g}) "
+            f"{'higher' if force_size > 0 else 'lower'} at the highest speed than at rest."
         )
     elif force.term.kind == "cubic stiffness":
         sentence = (
-            f"The beam is not linear: the stiffness of mode {mode} "
-            f"{'rises' if size > 0 else 'falls'} by {percent} up to its largest deflection (a "
-            "cubic force). It was fitted too, and affects neither modes nor orders."
+            f"The beam is not linear: the stiffness of mode {mode_number} "
+            f"{'rises' if force_size > 0 else 'falls'} by {percent_text} up to its largest "
+            "deflection (a cubic force). It was fitted too, and affects neither modes nor orders."
         )
     else:
         sentence = (
-            f"The beam is not linear: the stiffness of mode {mode} differs from one side to the "
-            f"other, by {percent} at its largest deflection (a quadratic force)."
+            f"The beam is not linear: the stiffness of mode {mode_number} differs from one side to "
+            f"the other, by {percent_text} at its largest deflection (a quadratic force)."
         )
     return Finding(
         kind="nonlinear damping" if force.term.kind == "quadratic drag" else "nonlinear stiffness",
         sentence=sentence,
-        value=size,
-        interval=(size - NORMAL_95 * std, size + NORMAL_95 * std),
+        value=force_size,
+        interval=(force_size - NORMAL_95 * std, force_size + NORMAL_95 * std),
         remedy="Repeat the sweep at half the amplitude, where nonlinear effects are far smaller.",
     )
 
@@ -469,13 +500,13 @@ def _harmonic_findings(harmonics: tuple[Harmonic, ...]) -> Iterator[Finding]:
     """Yield a finding for each multiple of the sweep frequency that is present in the residual."""
     for harmonic in harmonics:
         if harmonic.present:
-            parity = "odd" if harmonic.multiple % 2 else "even"
+            parity_words = "odd" if harmonic.multiple % 2 else "even"
             yield Finding(
                 kind="harmonics",
                 sentence=(
                     f"The residual follows the sweep at {harmonic.multiple} times its frequency, "
-                    f"most with the sweep at {harmonic.drive_hz:.1f} Hz: an {parity} harmonic, "
-                    "which only a nonlinearity produces."
+                    f"most with the sweep at {harmonic.drive_hz:.1f} Hz: an {parity_words} "
+                    "harmonic, which only a nonlinearity produces."
                 ),
                 value=harmonic.deviate,
                 unit="standard deviations",

@@ -111,7 +111,7 @@ contains no information."""
 
 @dataclass(frozen=True, slots=True)
 class DragEstimate:
-    """Estimate of the air drag on the beam.
+    """Estimate of the air drag on the beam: the drag coefficient C_D times the width d, in metres.
 
     Attributes
     ----------
@@ -161,7 +161,7 @@ def refit_with_air_drag(candidate_set: CandidateSet) -> CandidateSet:
 
 
 def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
-    """Fit all structures with drag; return the given candidate set unless drag lowers the BIC."""
+    """Return all damping structures fitted with air drag, or the given set if its BIC is lower."""
     lead_candidate = next(
         (c for c in candidate_set.candidates if c.structure.name == _FIRST_STRUCTURE), None
     )
@@ -177,96 +177,101 @@ def _refit_with_drag(candidate_set: CandidateSet) -> CandidateSet:
         return candidate_set
     # The freest structure starts from this fit: its fit without drag may be far off.
     start_comparison, next_start = drag_fit.objective.comparison, _DragFitStart.of(drag_fit)
-    for name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
+    for structure_name in (_FREEST_STRUCTURE, _FIRST_STRUCTURE):
         drag_fit = _converged_drag_fit(
-            candidate_set, next_start, STRUCTURES[name], start_comparison=start_comparison
+            candidate_set, next_start, STRUCTURES[structure_name], start_comparison=start_comparison
         )
         if drag_fit is not None:
             break
     else:
         return candidate_set
-    refitted = _fit_all_structures(candidate_set, drag_fit)
-    assert refitted.drag is not None
+    set_with_drag = _fit_all_structures(candidate_set, drag_fit)
+    assert set_with_drag.drag is not None
     return (
-        refitted
-        if refitted.drag.value_m > 0 and refitted.bic < candidate_set.bic
+        set_with_drag
+        if set_with_drag.drag.value_m > 0 and set_with_drag.bic < candidate_set.bic
         else candidate_set
     )
 
 
 @dataclass(frozen=True, slots=True)
 class _DragFitStart:
-    """Start of a fit with drag: plant, damping structure, drag law and noise spectrum.
+    """Start values of a fit with air drag: plant, damping structure, drag law and noise.
 
-    `two_numbers` states whether both numbers of the drag law are estimated.
+    `has_two_numbers` states whether both numbers of the drag law are estimated.
     """
 
     plant: Plant
     structure: Structure
     law: DragLaw
     noise: NoiseSpectrum
-    two_numbers: bool = False
+    has_two_numbers: bool = False
 
     @classmethod
     def of(cls, refit: Refit) -> _DragFitStart:
         """Return the minimum of a refit as the start of the next fit with drag."""
         structure = refit.objective.unknowns.structure
-        two_numbers = len(refit.columns) > 1
-        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, two_numbers)
+        has_two_numbers = len(refit.columns) > 1
+        return cls(refit.plant, structure, _law_at_minimum(refit), refit.noise, has_two_numbers)
 
 
 def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
-    """Return whether drag could give some structure a lower BIC than the best candidate."""
-    best = candidate_set.best
+    """Return whether air drag could give some structure a lower BIC than the best candidate."""
+    best_candidate = candidate_set.best
     for candidate in candidate_set.candidates:
-        if candidate is not best and candidate.structure.name not in _TESTED_STRUCTURES:
+        if candidate is not best_candidate and candidate.structure.name not in _TESTED_STRUCTURES:
             continue
         refit = candidate_set.refit(candidate, 1)
-        size, cost_reduction = _first_order_drag(refit)
-        cost_without = refit.cost
-        cost_with = max(cost_without - cost_reduction, 1e-3 * cost_without)
-        deviance_reduction = candidate.values * math.log(cost_without / cost_with)
+        drag_m, cost_reduction = _first_order_drag(refit)
+        cost_without_drag = refit.cost
+        cost_with_drag = max(cost_without_drag - cost_reduction, 1e-3 * cost_without_drag)
+        deviance_reduction = candidate.values * math.log(cost_without_drag / cost_with_drag)
         if (
-            size > 0
+            drag_m > 0
             and candidate.bic - deviance_reduction + math.log(candidate.values)
-            < best.bic + _FIRST_ORDER_BIC_MARGIN
+            < best_candidate.bic + _FIRST_ORDER_BIC_MARGIN
         ):
             return True
     return False
 
 
 def small_drag_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a small drag per metre of C_D d, shape (1, K), in N·m/m."""
+    """Return the torque spectrum of a small air drag per metre of C_D d, in N·m/m, shape (1, K)."""
     whole_angle_rad = comparison.angle_rad + comparison.incoherent_rad
-    response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant)
-    return comparison.spectrum(response.first_order()[None, comparison.retained])
+    drag_response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant)
+    return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
 
 
 def _first_order_drag(refit: Refit) -> tuple[float, float]:
-    """Return C_D d in metres, to first order, and the cost reduction if drag is added to a fit.
+    """Return the air drag C_D d in metres that a fit lacks, and by how much it reduces the cost.
+
+    Both are estimated to first order.
 
     All other parameters of the fit stay free.
     """
     (drag_spectrum,), residual = refit.unexplained_columns(
         small_drag_spectrum(refit.objective.comparison, refit.plant)
     )
-    square = float(np.vdot(drag_spectrum, drag_spectrum).real)
-    if square <= 0:
+    squared_length = float(np.vdot(drag_spectrum, drag_spectrum).real)
+    if squared_length <= 0:
         return 0.0, 0.0
     projection = float(np.vdot(drag_spectrum, residual).real)
-    return -projection / square, projection**2 / square
+    return -projection / squared_length, projection**2 / squared_length
 
 
 def _first_order_start(candidate_set: CandidateSet, candidate: Candidate) -> _DragFitStart | None:
-    """Fit a candidate with drag to first order; return None if the drag would be negative."""
+    """Return start values from a candidate refitted with first-order air drag.
+
+    Return None if the drag would be negative.
+    """
     drag_spectrum = small_drag_spectrum(candidate_set.comparison, candidate.fit.plant)
     refit = replace(candidate_set, columns=drag_spectrum).refit(
         candidate, _SHORT_DESCENT_EVALUATIONS
     )
-    size = float(refit.amplitudes()[0][0])
+    drag_m = float(refit.amplitudes()[0][0])
     return (
-        _DragFitStart(refit.plant, candidate.structure, DragLaw(size), candidate_set.noise)
-        if size > 0
+        _DragFitStart(refit.plant, candidate.structure, DragLaw(drag_m), candidate_set.noise)
+        if drag_m > 0
         else None
     )
 
@@ -279,7 +284,9 @@ def _converged_drag_fit(
     tolerance: float = _COST_TOLERANCE,
     start_comparison: Comparison | None = None,
 ) -> Refit | None:
-    """Fit one structure with drag, starting from `fit_start`, until the drag torque has converged.
+    """Return a refit of one damping structure with air drag whose torque has converged.
+
+    The fit starts from `fit_start`.
 
     `tolerance` is the largest cost reduction by a further step. `start_comparison` is the
     comparison with the drag of the start, if it has been computed. Return None if the drag is
@@ -287,8 +294,12 @@ def _converged_drag_fit(
     """
     unknowns = candidate_set.unknowns(structure)
     x = unknowns.vector(fit_start.plant)
-    law, noise, two_numbers = fit_start.law, fit_start.noise, fit_start.two_numbers
-    comparison, is_rough, cost_reduction = start_comparison, tolerance > _COST_TOLERANCE, math.inf
+    law, noise, has_two_numbers = fit_start.law, fit_start.noise, fit_start.has_two_numbers
+    comparison, is_rough_fit, cost_reduction = (
+        start_comparison,
+        tolerance > _COST_TOLERANCE,
+        math.inf,
+    )
     for _ in range(_MAX_DRAG_COMPUTATIONS):
         if comparison is None:
             plant = unknowns.plant(x)
@@ -299,12 +310,14 @@ def _converged_drag_fit(
                 ).remove_drag_torque(plant, law)
             except DragError:
                 return None
-        drag = comparison.drag
-        assert drag is not None
+        drag_expansion = comparison.drag
+        assert drag_expansion is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
-        start_refit = descent(x, columns=drag.by_law[: 1 + two_numbers], max_evaluations=1)
+        start_refit = descent(
+            x, columns=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
+        )
         refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
-        if two_numbers or is_rough or _relative_std(refit) > _ONE_NUMBER_LAW_STD:
+        if has_two_numbers or is_rough_fit or _relative_drag_std(refit) > _ONE_NUMBER_LAW_STD:
             last_reduction, cost_reduction = (
                 cost_reduction,
                 start_refit.cost - max(start_refit.predicted_cost, refit.cost),
@@ -316,33 +329,33 @@ def _converged_drag_fit(
                 return start_refit
         else:
             # Not before: a second number would compensate for wrong damping of the beam.
-            two_numbers = True
+            has_two_numbers = True
             refit = descent(
-                refit.x, columns=drag.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
+                refit.x, columns=drag_expansion.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
             )
         x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
-        if law.at(drag.speed_m_s) <= 0:
+        if law.at(drag_expansion.speed_m_s) <= 0:
             return None
         comparison = None
     return None
 
 
-def _relative_std(refit: Refit) -> float:
+def _relative_drag_std(refit: Refit) -> float:
     """Return the relative standard deviation of C_D d in a refit whose drag law has one number."""
     law, (_, std) = _law_at_minimum(refit), refit.amplitudes()
     return float(std[0]) / max(float(law.constant_m), float(np.finfo(float).tiny))
 
 
 def _law_at_minimum(refit: Refit) -> DragLaw:
-    """Return the drag law at the minimum of a refit.
+    """Return the law of air drag at the minimum of a refit.
 
     It is the law for which the drag torque was computed, plus the estimated change.
     """
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     law_change = refit.amplitudes()[0].tolist()
-    slowing = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
-    return DragLaw(expansion.law.constant_m + law_change[0], slowing)
+    slowing_m = expansion.law.slowing + (law_change[1] if len(law_change) > 1 else 0.0)
+    return DragLaw(expansion.law.constant_m + law_change[0], slowing_m)
 
 
 def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> CandidateSet:
@@ -382,9 +395,9 @@ def _fit_all_structures(candidate_set: CandidateSet, converged_fit: Refit) -> Ca
 
 
 def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
-    """Return the air drag with its uncertainty, from a refit of the freest candidate.
+    """Return the estimated air drag with its uncertainty.
 
-    All possible damping parameters are free in it.
+    It comes from a refit of the candidate with the most free damping parameters.
     """
     freest_candidate = max(candidate_set.candidates, key=lambda c: (len(c.structure.free), -c.bic))
     refit = candidate_set.refit(freest_candidate)
@@ -393,19 +406,19 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
     expansion = refit.objective.comparison.drag
     assert expansion is not None
     speed_m_s = expansion.speed_m_s
-    weights = np.ones(1)
+    law_weights = np.ones(1)
     if len(covariance) > 1:
         pivot_weight = max(-covariance[0, 1] / covariance[1, 1], np.finfo(float).tiny)
         top_speed_m_s = expansion.top_speed_m_s
         speed_m_s = min(
             max(float(pivot_weight**-1.5), _LOWEST_RELATIVE_SPEED * top_speed_m_s), top_speed_m_s
         )
-        weights = np.array([1.0, speed_m_s ** (-2 / 3)])
-    value, std = law.at(speed_m_s), math.sqrt(float(weights @ covariance @ weights))
+        law_weights = np.array([1.0, speed_m_s ** (-2 / 3)])
+    drag_m, std = law.at(speed_m_s), math.sqrt(float(law_weights @ covariance @ law_weights))
     return DragEstimate(
-        value_m=value,
+        value_m=drag_m,
         std_m=std,
-        interval_95_m=(max(value - NORMAL_95 * std, 0.0), value + NORMAL_95 * std),
+        interval_95_m=(max(drag_m - NORMAL_95 * std, 0.0), drag_m + NORMAL_95 * std),
         speed_m_s=speed_m_s,
         law=law,
         covariance=tuple(tuple(row) for row in covariance.tolist()),
@@ -414,7 +427,7 @@ def _drag_estimate(candidate_set: CandidateSet) -> DragEstimate:
 
 # Damping of a mode against its amplitude
 
-_REPORTED_MODES: Final = (1, 2)
+_REPORTED_MODE_NUMBERS: Final = (1, 2)
 """Numbers of the modes whose damping ratio is reported at several amplitudes."""
 
 _RELATIVE_TIP_AMPLITUDES: Final = (0.0, 0.001, 0.003, 0.01, 0.03, 0.1)
@@ -430,7 +443,7 @@ _QUADRATURE_POINTS: Final = 64
 
 @dataclass(frozen=True, slots=True)
 class DampingAtAmplitude:
-    """Damping ratio of a mode in free vibration at one amplitude.
+    """Damping ratio of a mode in free vibration at one amplitude of the beam's tip.
 
     Attributes
     ----------
@@ -454,31 +467,35 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
 
     The result is empty if the candidates include no drag.
     """
-    drag = candidate_set.drag
-    if drag is None:
+    drag_estimate = candidate_set.drag
+    if drag_estimate is None:
         return ()
     fit = candidate_set.best.fit
-    law_numbers = np.array([drag.law.constant_m, drag.law.slowing])[: len(drag.covariance)]
-    covariance = np.array(drag.covariance)
+    law_numbers = np.array([drag_estimate.law.constant_m, drag_estimate.law.slowing])[
+        : len(drag_estimate.covariance)
+    ]
+    covariance = np.array(drag_estimate.covariance)
     estimates = []
-    for mode in fit.modes:
-        if mode.number not in _REPORTED_MODES or mode.frequency_hz <= 0:
+    for mode_number in fit.modes:
+        if mode_number.number not in _REPORTED_MODE_NUMBERS or mode_number.frequency_hz <= 0:
             continue
-        for fraction in _RELATIVE_TIP_AMPLITUDES:
-            amplitude = fraction * fit.plant.beam.length_m
+        for relative_amplitude in _RELATIVE_TIP_AMPLITUDES:
+            tip_amplitude_m = relative_amplitude * fit.plant.beam.length_m
             ratio_by_law = damping_ratio_by_drag_law(
-                mode.number,
-                2 * math.pi * mode.frequency_hz,
-                amplitude,
+                mode_number.number,
+                2 * math.pi * mode_number.frequency_hz,
+                tip_amplitude_m,
                 fit.plant.beam.density_kg_per_m,
             )[: law_numbers.size]
-            variance = mode.damping_ratio_std**2 + float(ratio_by_law @ covariance @ ratio_by_law)
+            ratio_variance = mode_number.damping_ratio_std**2 + float(
+                ratio_by_law @ covariance @ ratio_by_law
+            )
             estimates.append(
                 DampingAtAmplitude(
-                    mode=mode.number,
-                    tip_amplitude_m=amplitude,
-                    damping_ratio=mode.damping_ratio + float(ratio_by_law @ law_numbers),
-                    std=math.sqrt(variance),
+                    mode=mode_number.number,
+                    tip_amplitude_m=tip_amplitude_m,
+                    damping_ratio=mode_number.damping_ratio + float(ratio_by_law @ law_numbers),
+                    std=math.sqrt(ratio_variance),
                 )
             )
     return tuple(estimates)
@@ -487,19 +504,29 @@ def damping_with_amplitude(candidate_set: CandidateSet) -> tuple[DampingAtAmplit
 def damping_ratio_by_drag_law(
     mode: int, omega_rad_s: float, tip_amplitude_m: float, density_kg_per_m: float
 ) -> NDArray[np.float64]:
-    """Return the damping ratio by air drag per unit of each number of a `DragLaw`, shape (2,).
+    """Return a mode's damping ratio by air drag, per unit of each number of a `DragLaw`, (2,).
 
-    It is that of a mode in free vibration with a given amplitude of the tip.
+    The mode vibrates freely with a given amplitude of the tip in metres.
     """
     nodes, weights = np.polynomial.legendre.leggauss(_QUADRATURE_POINTS)
-    shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))
-    speed = tip_amplitude_m * omega_rad_s
-    ratios = []
-    for power in _SPEED_EXPONENTS:
-        time_mean = 2 / math.sqrt(math.pi) * math.gamma(power / 2 + 1) / math.gamma(power / 2 + 1.5)
-        shape_mean = float(weights @ shape ** (power + 1)) / float(weights @ shape**2)
-        damping_per_length = (
-            HALF_AIR_DENSITY_KG_PER_M3 * speed ** (power - 1) * time_mean * shape_mean
+    relative_shape = np.abs(mode_shape(mode, 0.5 * (nodes + 1)) / mode_shape(mode, 1.0))
+    tip_speed_m_s = tip_amplitude_m * omega_rad_s
+    damping_ratios = []
+    for speed_exponent in _SPEED_EXPONENTS:
+        time_mean = (
+            2
+            / math.sqrt(math.pi)
+            * math.gamma(speed_exponent / 2 + 1)
+            / math.gamma(speed_exponent / 2 + 1.5)
         )
-        ratios.append(damping_per_length / (2 * density_kg_per_m * omega_rad_s))
-    return np.array(ratios)
+        shape_mean = float(weights @ relative_shape ** (speed_exponent + 1)) / float(
+            weights @ relative_shape**2
+        )
+        damping_per_length = (
+            HALF_AIR_DENSITY_KG_PER_M3
+            * tip_speed_m_s ** (speed_exponent - 1)
+            * time_mean
+            * shape_mean
+        )
+        damping_ratios.append(damping_per_length / (2 * density_kg_per_m * omega_rad_s))
+    return np.array(damping_ratios)

@@ -44,7 +44,7 @@ _DERIVATIVE_STEP: Final = 1e-6
 """Step of an unknown for numerical derivatives. Steps of the unknowns of a cause are relative to
 their range."""
 
-_MAX_STEPS: Final = 12
+_MAX_DESCENT_STEPS: Final = 12
 """Maximum number of Gauss-Newton steps in the fit of a cause."""
 
 _MAX_RELATIVE_STEP: Final = 1.0
@@ -53,10 +53,10 @@ _MAX_RELATIVE_STEP: Final = 1.0
 _MAX_CHI_SQUARE_RISE: Final = 10.0
 """Largest factor by which chi-square may rise in one Gauss-Newton step."""
 
-_MAX_HALVINGS: Final = 3
+_MAX_STEP_HALVINGS: Final = 3
 """Maximum number of times that a Gauss-Newton step is halved."""
 
-_CONVERGED_REDUCTION: Final = 0.02
+_CONVERGED_CHI_SQUARE_REDUCTION: Final = 0.02
 """Predicted reduction of chi-square below which the fit of a cause has converged, relative to
 chi-square or to 1 if that is larger."""
 
@@ -107,7 +107,7 @@ class CauseFit:
     plant: Plant | None = None
 
     def as_json(self) -> dict[str, Any]:
-        """Return the fit of the cause as a dictionary for `json.dumps`."""
+        """Return name, size and goodness of fit of the cause as a dictionary for `json.dumps`."""
         return {
             "name": self.name,
             "size": self.size,
@@ -120,7 +120,7 @@ class CauseFit:
 def explanations(
     fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
 ) -> tuple[CauseFit, ...]:
-    """Return the causes of which each alone explains the modes, by falling p-value.
+    """Return fits of the causes that each alone explain the modes, by falling p-value.
 
     Parameters
     ----------
@@ -131,10 +131,10 @@ def explanations(
     tilt_deg : float, optional
         Inclination of the plane of motion along the beam at rest as the file states it.
     """
-    modes = fit.visible
-    if not modes:
+    visible_modes = fit.visible
+    if not visible_modes:
         return ()
-    problem = UniformBeamProblem(fit, modes, nominal, tilt_deg=tilt_deg)
+    problem = UniformBeamProblem(fit, visible_modes, nominal, tilt_deg=tilt_deg)
     best_beam = problem.minima()[0].x
     middle_start = problem.starts()[len(problem.starts()) // 2]
     without_internal = np.where(np.arange(best_beam.size) == 0, problem.lower, middle_start)
@@ -150,7 +150,9 @@ def explanations(
             continue
         # Of each name only the best fit, and no general cause if a special case suffices.
         rival_chi_squares = [
-            explained_by[name].chi_square for name in cause.special_cases if name in explained_by
+            explained_by[cause_name].chi_square
+            for cause_name in cause.special_cases
+            if cause_name in explained_by
         ]
         required_reduction = _NAMED_CHI_SQUARE_MARGIN
         if cause.name in explained_by:
@@ -160,14 +162,16 @@ def explanations(
             or cause_fit.chi_square < min(rival_chi_squares) - required_reduction
         ):
             explained_by[cause.name] = cause_fit
-    lowest_chi_square = min((each.chi_square for each in explained_by.values()), default=0.0)
+    lowest_chi_square = min(
+        (cause_fit_found.chi_square for cause_fit_found in explained_by.values()), default=0.0
+    )
     named_causes = [
-        each
-        for each in explained_by.values()
-        if each.p_value >= _NAMED_P_VALUE
-        or each.chi_square <= lowest_chi_square + _NAMED_CHI_SQUARE_MARGIN
+        cause_fit_found
+        for cause_fit_found in explained_by.values()
+        if cause_fit_found.p_value >= _NAMED_P_VALUE
+        or cause_fit_found.chi_square <= lowest_chi_square + _NAMED_CHI_SQUARE_MARGIN
     ]
-    named_causes.sort(key=lambda each: -each.p_value)
+    named_causes.sort(key=lambda cause_fit_found: -cause_fit_found.p_value)
     return tuple(named_causes[:_MAX_NAMED_CAUSES])
 
 
@@ -184,9 +188,11 @@ def _fit_cause(
     if degrees_of_freedom <= 0:
         return None
     starts = [(*_CauseSearch(problem, cause, x).best_start(), x) for x in start_beams]
-    for _, start, x in sorted(starts, key=lambda each: each[0]):
-        cost, y = _descend_with_tolerances(problem, cause, x, start, degrees_of_freedom)
-        p_value = float(chi_square_p_value(cost, degrees_of_freedom))
+    for _, start_unknowns, x in sorted(starts, key=lambda each: each[0]):
+        chi_square, y = _descend_with_tolerances(
+            problem, cause, x, start_unknowns, degrees_of_freedom
+        )
+        p_value = float(chi_square_p_value(chi_square, degrees_of_freedom))
         if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM:
             break
     else:
@@ -197,13 +203,13 @@ def _fit_cause(
     if at_bound.any():
         return None
     plant = problem.plant(y[:beam_unknowns])
-    size, unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
+    cause_size, size_unit, phrase = cause.describe(cause_unknowns.tolist(), plant.beam)
     return CauseFit(
         name=cause.name,
         words=phrase,
-        size=size,
-        unit=unit,
-        chi_square=cost,
+        size=cause_size,
+        unit=size_unit,
+        chi_square=chi_square,
         p_value=p_value,
         plant=cause.plant(cause_unknowns.tolist(), plant) if cause.plant else None,
     )
@@ -216,13 +222,16 @@ def _descend_with_tolerances(
     y: NDArray[np.float64],
     degrees_of_freedom: int,
 ) -> tuple[float, NDArray[np.float64]]:
-    """Descend from `y`, first with a tolerance; return chi-square and the unknowns."""
-    cost = math.inf
+    """Return chi-square and unknowns of beam and cause at a minimum reached from `y`.
+
+    The first descents tolerate deviations of the modal constants; the last one does not.
+    """
+    chi_square = math.inf
     for tolerance in _CONSTANT_TOLERANCES:
-        cost, y = _CauseSearch(problem, cause, x, tolerance).descend(y)
-        if cost > _GIVE_UP_CHI_SQUARE * degrees_of_freedom:
+        chi_square, y = _CauseSearch(problem, cause, x, tolerance).descend(y)
+        if chi_square > _GIVE_UP_CHI_SQUARE * degrees_of_freedom:
             break
-    return cost, y
+    return chi_square, y
 
 
 class _CauseSearch:
@@ -258,53 +267,64 @@ class _CauseSearch:
         self._whitener = np.linalg.inv(np.linalg.cholesky(covariance))
 
     def best_start(self) -> tuple[float, NDArray[np.float64]]:
-        """Return the best point after one step of the beam's unknowns from each start of the cause.
+        """Return the best start of a cause, after one step of the beam's unknowns from each start.
 
-        The result is chi-square, and the unknowns of beam and cause.
+        The result is its chi-square, and its unknowns of beam and cause.
         """
         x, derivatives = self._beam_x, None
-        low, high = (ends[: x.size] - x for ends in (self._lower, self._upper))
-        steps = []
-        for start in self._cause.starts:
-            y = np.concatenate([x, start])
-            terms = self._mode_terms(y)
+        lowest_step, highest_step = (limits[: x.size] - x for limits in (self._lower, self._upper))
+        stepped_starts = []
+        for cause_start in self._cause.starts:
+            y = np.concatenate([x, cause_start])
+            mode_terms = self._mode_terms(y)
             if derivatives is None:
                 _, derivatives = self._deviations_by_beam(y)
-            step = _limited_step(
-                self._whitened_deviations(x[None], terms)[0], derivatives, low, high
+            beam_step = _limited_step(
+                self._whitened_deviations(x[None], mode_terms)[0],
+                derivatives,
+                lowest_step,
+                highest_step,
             )[0]
-            deviations = self._whitened_deviations((x + step)[None], terms)[0]
-            steps.append((float(deviations @ deviations), np.concatenate([x + step, start])))
-        return min(steps, key=lambda pair: pair[0])
+            deviations = self._whitened_deviations((x + beam_step)[None], mode_terms)[0]
+            stepped_starts.append(
+                (float(deviations @ deviations), np.concatenate([x + beam_step, cause_start]))
+            )
+        return min(stepped_starts, key=lambda pair: pair[0])
 
     def descend(self, y: NDArray[np.float64]) -> tuple[float, NDArray[np.float64]]:
-        """Take Gauss-Newton steps from `y`; return the lowest chi-square and the unknowns there.
+        """Return the lowest chi-square on a Gauss-Newton path from `y`, and the unknowns there.
 
         Steps are not shortened as a rule, even where chi-square rises a little: along a curved flat
         direction it rises first and then falls further.
         """
-        scale, lowest, best_y = self._scale, math.inf, y
-        for _ in range(_MAX_STEPS):
-            deviation, derivatives = self._deviations_by_all(y)
-            cost = float(deviation @ deviation)
-            if cost < lowest:
-                lowest, best_y = cost, y
-            step, predicted = _limited_step(
-                deviation,
-                derivatives * scale[:, None],
-                (self._lower - y) / scale,
-                (self._upper - y) / scale,
+        unknown_scale, lowest_chi_square, best_y = self._scale, math.inf, y
+        for _ in range(_MAX_DESCENT_STEPS):
+            whitened_deviation, derivatives = self._deviations_by_all(y)
+            chi_square = float(whitened_deviation @ whitened_deviation)
+            if chi_square < lowest_chi_square:
+                lowest_chi_square, best_y = chi_square, y
+            scaled_step, predicted_chi_square = _limited_step(
+                whitened_deviation,
+                derivatives * unknown_scale[:, None],
+                (self._lower - y) / unknown_scale,
+                (self._upper - y) / unknown_scale,
             )
-            if cost - predicted < _CONVERGED_REDUCTION * max(cost, 1.0):
+            if chi_square - predicted_chi_square < _CONVERGED_CHI_SQUARE_REDUCTION * max(
+                chi_square, 1.0
+            ):
                 break
-            step = step * scale * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(step).max()))
-            for _ in range(_MAX_HALVINGS):
-                new_deviation = self._deviations(np.clip(y + step, self._lower, self._upper))
-                if new_deviation @ new_deviation < _MAX_CHI_SQUARE_RISE * cost:
+            scaled_step = (
+                scaled_step
+                * unknown_scale
+                * min(1.0, _MAX_RELATIVE_STEP / float(np.abs(scaled_step).max()))
+            )
+            for _ in range(_MAX_STEP_HALVINGS):
+                new_deviation = self._deviations(np.clip(y + scaled_step, self._lower, self._upper))
+                if new_deviation @ new_deviation < _MAX_CHI_SQUARE_RISE * chi_square:
                     break
-                step /= 2
-            y = np.clip(y + step, self._lower, self._upper)
-        return lowest, best_y
+                scaled_step /= 2
+            y = np.clip(y + scaled_step, self._lower, self._upper)
+        return lowest_chi_square, best_y
 
     def _mode_terms(self, y: NDArray[np.float64]) -> ModeTerms:
         """Return the Galerkin coefficients of the modes for the unknowns of beam and cause."""
@@ -317,78 +337,95 @@ class _CauseSearch:
         # The mass of a cause is a fraction of the beam's: the mode shapes do not change with that.
         return terms if self._problem.stated.lumps else replace(terms, density_kg_per_m=None)
 
-    def _whitened_deviations(self, x: NDArray[np.float64], terms: ModeTerms) -> NDArray[np.float64]:
+    def _whitened_deviations(
+        self, x: NDArray[np.float64], mode_terms: ModeTerms
+    ) -> NDArray[np.float64]:
         """Return the whitened deviations of the modal constants for m beams, shape (m, 4 n).
 
-        `x` are the unknowns of the beams, shape (m, 7), and `terms` describe the beam with the
+        `x` are the unknowns of the beams, shape (m, 7), and `mode_terms` describe the beam with the
         cause.
         """
-        differences = self._problem.differences(x, terms)
+        differences = self._problem.differences(x, mode_terms)
         whitened: NDArray[np.float64] = np.nan_to_num(differences @ self._whitener.T, nan=1e6)
         return whitened
 
     def _deviations(self, y: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the whitened deviations of the modal constants at one point, shape (4 n,)."""
-        deviations: NDArray[np.float64] = self._whitened_deviations(
+        whitened_deviations: NDArray[np.float64] = self._whitened_deviations(
             y[None, : self._beam_x.size], self._mode_terms(y)
         )[0]
-        return deviations
+        return whitened_deviations
 
     def _deviations_by_beam(
         self, y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the whitened deviations and their derivatives by the beam's unknowns."""
+        """Return the whitened deviations of the modal constants, and their derivatives.
+
+        The derivatives are those by the beam's unknowns.
+        """
         beam_unknowns = self._beam_x.size
-        steps = np.concatenate(
+        unknown_steps = np.concatenate(
             [np.zeros((1, beam_unknowns)), _DERIVATIVE_STEP * np.eye(beam_unknowns)]
         )
-        deviations = self._whitened_deviations(y[:beam_unknowns] + steps, self._mode_terms(y))
+        deviations = self._whitened_deviations(
+            y[:beam_unknowns] + unknown_steps, self._mode_terms(y)
+        )
         return deviations[0], (deviations[1:] - deviations[0]) / _DERIVATIVE_STEP
 
     def _deviations_by_all(
         self, y: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the whitened deviations and their derivatives by all unknowns."""
-        deviation, beam_rows = self._deviations_by_beam(y)
-        steps = _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
-        cause_rows = [(self._deviations(y + step) - deviation) / step.sum() for step in steps]
-        return deviation, np.concatenate([beam_rows, cause_rows])
+        """Return the whitened deviations of the modal constants, and their derivatives.
+
+        The derivatives are those by the unknowns of beam and cause.
+        """
+        whitened_deviation, beam_rows = self._deviations_by_beam(y)
+        cause_steps = _DERIVATIVE_STEP * np.diag(self._scale)[self._beam_x.size :]
+        cause_rows = [
+            (self._deviations(y + cause_step) - whitened_deviation) / cause_step.sum()
+            for cause_step in cause_steps
+        ]
+        return whitened_deviation, np.concatenate([beam_rows, cause_rows])
 
 
 def _limited_step(
     deviation: NDArray[np.float64],
-    rows: NDArray[np.float64],
-    low: NDArray[np.float64],
-    high: NDArray[np.float64],
+    derivative_rows: NDArray[np.float64],
+    lowest_step: NDArray[np.float64],
+    highest_step: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], float]:
-    """Return the Gauss-Newton step within limits, and the chi-square predicted after the step.
+    """Return the Gauss-Newton step within limits, and the chi-square predicted after it.
 
     The deviations themselves are solved by least squares. Frequencies are known a thousand times
     more precisely than residues, and normal equations would square that ratio.
     """
-    step, free = np.zeros(len(rows)), np.arange(len(rows))
-    while free.size:
-        step[free] = 0.0
-        remaining = deviation + step @ rows
-        matrix = np.concatenate([rows[free].T, _STEP_REGULARIZATION * np.eye(free.size)])
-        target = np.concatenate([-remaining, np.zeros(free.size)])
-        unlimited, *_ = np.linalg.lstsq(matrix, target)
-        step[free] = np.clip(unlimited, low[free], high[free])
-        at_limit = step[free] != unlimited
+    step, free_unknowns = np.zeros(len(derivative_rows)), np.arange(len(derivative_rows))
+    while free_unknowns.size:
+        step[free_unknowns] = 0.0
+        remaining_deviation = deviation + step @ derivative_rows
+        design_matrix = np.concatenate(
+            [derivative_rows[free_unknowns].T, _STEP_REGULARIZATION * np.eye(free_unknowns.size)]
+        )
+        reduced_deviation = np.concatenate([-remaining_deviation, np.zeros(free_unknowns.size)])
+        unlimited, *_ = np.linalg.lstsq(design_matrix, reduced_deviation)
+        step[free_unknowns] = np.clip(
+            unlimited, lowest_step[free_unknowns], highest_step[free_unknowns]
+        )
+        at_limit = step[free_unknowns] != unlimited
         if not at_limit.any():
             break
-        free = free[~at_limit]
-    remaining = deviation + step @ rows
-    return step, float(remaining @ remaining)
+        free_unknowns = free_unknowns[~at_limit]
+    remaining_deviation = deviation + step @ derivative_rows
+    return step, float(remaining_deviation @ remaining_deviation)
 
 
 # Words
 
 
 def finding(
-    test: UniformBeamTest, causes: Sequence[CauseFit], step: StiffnessStep | None = None
+    test: UniformBeamTest, causes: Sequence[CauseFit], stiffness_step: StiffnessStep | None = None
 ) -> Finding:
-    """Return the finding that names possible causes of deviating modes.
+    """Return the finding that names possible causes of modes deviating from a uniform beam.
 
     Parameters
     ----------
@@ -396,32 +433,35 @@ def finding(
         Test that refused the plain uniform beam.
     causes : sequence of CauseFit
         Causes from `explanations`.
-    step : Step, optional
+    stiffness_step : Step, optional
         Step of the stiffness during the record, from `best_stiffness_step`.
     """
-    phrases = [each.words for each in causes]
-    if step is not None and step.named:
-        phrases.append(step.words)
-    refusal = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
-    if not phrases:
+    cause_phrases = [cause_fit.words for cause_fit in causes]
+    if stiffness_step is not None and stiffness_step.named:
+        cause_phrases.append(stiffness_step.words)
+    refusal_sentence = f"A plain uniform beam does not predict the modes ({test.summary.chance})."
+    if not cause_phrases:
         return Finding(
             kind="rival explanations",
             sentence=(
-                f"{refusal} None of the simple causes tried explains them alone: tilt, a mass at "
-                "the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, a filter "
-                "or resonance of the sensor, a relaxation of the material."
+                f"{refusal_sentence} None of the simple causes tried explains them alone: tilt, a "
+                "mass at the tip or elsewhere, an uneven or tapered beam, a soft or lossy clamp, a "
+                "filter or resonance of the sensor, a relaxation of the material."
             ),
             remedy="Check the beam and its clamp for several of these at once.",
         )
-    if len(phrases) == 1:
-        sentence = f"{refusal} This would: {phrases[0]}. It is not established by this record."
+    if len(cause_phrases) == 1:
+        cause_sentence = (
+            f"{refusal_sentence} This would: {cause_phrases[0]}. "
+            "It is not established by this record."
+        )
     else:
-        sentence = (
-            f"{refusal} Each of these alone would: {'; '.join(phrases)}. None is established by "
-            "this record."
+        cause_sentence = (
+            f"{refusal_sentence} Each of these alone would: {'; '.join(cause_phrases)}. None is "
+            "established by this record."
         )
     return Finding(
         kind="rival explanations",
-        sentence=sentence,
+        sentence=cause_sentence,
         remedy="Weigh, measure or change one of them, state it in the file, and sweep again.",
     )

@@ -88,7 +88,7 @@ _INTERVAL_PATTERN: Final = re.compile(r" \((?:[^()]*; 95 %|± [^()]*)\)")
 
 
 def doubted(finding: Finding, reason: str) -> Finding:
-    """Return a finding marked as not established, for a reason.
+    """Return a finding whose sentence says that it is not established, for a given reason.
 
     Parameters
     ----------
@@ -111,11 +111,11 @@ def doubted(finding: Finding, reason: str) -> Finding:
     """
     if finding.kind in MODEL_INDEPENDENT_KINDS:
         return finding
-    sentence = _INTERVAL_PATTERN.sub("", finding.sentence)
-    if sentence[1:2].islower() or sentence[1:2] == " ":  # no abbreviation
-        sentence = sentence[0].lower() + sentence[1:]
+    shortened_sentence = _INTERVAL_PATTERN.sub("", finding.sentence)
+    if shortened_sentence[1:2].islower() or shortened_sentence[1:2] == " ":  # no abbreviation
+        shortened_sentence = shortened_sentence[0].lower() + shortened_sentence[1:]
     return replace(
         finding,
-        sentence=f"Not established, because {reason}: {sentence}",
+        sentence=f"Not established, because {reason}: {shortened_sentence}",
         interval=None,
     )

@@ -202,51 +202,57 @@ def _descend_with_noise(
     was far behind in them is not searched for again.
     """
     # Lines are searched for once, in the residual of a fit to every bin.
-    noise = reference_descent.noise(with_lines=True)
+    noise_spectrum = reference_descent.noise(with_lines=True)
     hum = reference_descent.objective.comparison.hum
-    noise = replace(noise, lines=(*noise.lines, *(each.line for each in hum)))
+    noise_spectrum = replace(
+        noise_spectrum, lines=(*noise_spectrum.lines, *(removed_hum.line for removed_hum in hum))
+    )
     closest_descent = (
         searches[closest_index]
-        .descend_to_lowest(noise, reference_descent)
-        .descend_to_minimum(noise, _COST_TOLERANCE)
+        .descend_to_lowest(noise_spectrum, reference_descent)
+        .descend_to_minimum(noise_spectrum, _COST_TOLERANCE)
     )
-    far_behind_ratio = math.exp(FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise.counts)))
-    cost_limit = far_behind_ratio * closest_descent.cost(noise)
-    descents = []
+    far_behind_ratio = math.exp(
+        FAR_BEHIND_BIC_DIFFERENCE / (2 * np.count_nonzero(noise_spectrum.counts))
+    )
+    cost_limit = far_behind_ratio * closest_descent.cost(noise_spectrum)
+    structure_descents = []
     for i, search in enumerate(searches):
         descent = closest_descent if i == closest_index else None
         if descent is None and earlier_descents:
             descent = _descent_if_still_worse(
-                Descent(search.objective, earlier_descents[i].x), noise, cost_limit
+                Descent(search.objective, earlier_descents[i].x), noise_spectrum, cost_limit
             )
         if descent is None:
-            descent = search.descend_to_lowest(noise).descend_to_minimum(
-                noise, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
+            descent = search.descend_to_lowest(noise_spectrum).descend_to_minimum(
+                noise_spectrum, _COST_TOLERANCE, (_FAR_BEHIND_EVALUATIONS, cost_limit)
             )
-        descents.append(descent)
-    return noise, descents
+        structure_descents.append(descent)
+    return noise_spectrum, structure_descents
 
 
 def _residual_is_noise(descent: Descent, noise: NoiseSpectrum) -> bool:
-    """Return whether the residual of a descent passes the test of whiteness at the 1 % level."""
-    objective, is_used = descent.objective, noise.counts
+    """Return whether the residual at the end of a descent is white at the 1 % level."""
+    objective, used_bins = descent.objective, noise.counts
     residual = objective.project(objective.linearise(descent.x), noise.weight).residual
     hz = objective.comparison.frequency_hz
-    return whiteness(residual[is_used], hz[is_used]).is_nearly_white
+    return whiteness(residual[used_bins], hz[used_bins]).is_nearly_white
 
 
 def _descent_if_still_worse(
-    earlier: Descent, noise: NoiseSpectrum, cost_limit: float
+    earlier_descent: Descent, noise: NoiseSpectrum, cost_limit: float
 ) -> Descent | None:
-    """Return a short descent of a structure if its cost stays above a limit, else None."""
-    if earlier.cost(noise) <= cost_limit:
+    """Continue a descent briefly; return it if its cost stays above a limit, else None."""
+    if earlier_descent.cost(noise) <= cost_limit:
         return None
-    descent = earlier.descend_to_minimum(noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit))
-    return descent if descent.cost(noise) > cost_limit else None
+    short_descent = earlier_descent.descend_to_minimum(
+        noise, _COST_TOLERANCE, (_EARLY_EVALUATIONS, cost_limit)
+    )
+    return short_descent if short_descent.cost(noise) > cost_limit else None
 
 
 def _update_reference_following(descent: Descent, whole_angle: Comparison) -> Descent:
-    """Recompute the part of the angle that follows the reference, without the hum.
+    """Return a descent with the reference-following angle estimated again, without the hum.
 
     The first estimate was biased by the hum.
     """
@@ -263,7 +269,7 @@ def _update_reference_following(descent: Descent, whole_angle: Comparison) -> De
 
 
 def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) -> RecordFit:
-    """Return a fit with parameters, uncertainties, modes and residual at a minimum of the cost.
+    """Return the fit at a minimum of the cost: parameters, uncertainties, modes and residual.
 
     Parameters
     ----------
@@ -281,38 +287,46 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
     compared_values = round(2 * np.sum(noise.counts) * comparison.measurement.known_torque_fraction)
     degrees_of_freedom = compared_values - x.size - projected.amplitudes.size
     residual_variance = projected.cost / degrees_of_freedom
-    lower, upper = unknowns.bounds
-    at_bound = (x <= lower) | (x >= upper)
+    lower_bounds, upper_bounds = unknowns.bounds
+    at_bound = (x <= lower_bounds) | (x >= upper_bounds)
     jacobian = _compared_jacobian(objective, x, projected, noise)
-    covariance, determined = covariance_of_unknowns(jacobian, residual_variance, at_bound)
-    names, plant = unknowns.names, unknowns.plant(x)
-    values = unknowns.parameters(x)
-    uncertainty = parameter_uncertainty(unknowns, x, at_bound, covariance, determined)
-    std, intervals = dict(uncertainty.std), dict(uncertainty.interval)
-    tool_inertia = "tool_inertia_kg_m2"
-    if tool_inertia in names and at_bound[names.index(tool_inertia)]:
-        index = names.index(tool_inertia)
-        other_at_bound = at_bound & (np.arange(at_bound.size) != index)
+    covariance, determined_mask = covariance_of_unknowns(jacobian, residual_variance, at_bound)
+    unknown_names, plant = unknowns.names, unknowns.plant(x)
+    parameter_values = unknowns.parameters(x)
+    parameter_uncertainties = parameter_uncertainty(
+        unknowns, x, at_bound, covariance, determined_mask
+    )
+    std, intervals = dict(parameter_uncertainties.std), dict(parameter_uncertainties.interval)
+    tool_inertia_name = "tool_inertia_kg_m2"
+    if tool_inertia_name in unknown_names and at_bound[unknown_names.index(tool_inertia_name)]:
+        inertia_index = unknown_names.index(tool_inertia_name)
+        other_at_bound = at_bound & (np.arange(at_bound.size) != inertia_index)
         free_covariance, _ = covariance_of_unknowns(jacobian, residual_variance, other_at_bound)
         estimates_by_unknowns = unknowns.estimates_by_unknowns(x)
-        std[tool_inertia] = float(
-            estimates_by_unknowns[index, index] * free_covariance[index, index] ** 0.5
+        std[tool_inertia_name] = float(
+            estimates_by_unknowns[inertia_index, inertia_index]
+            * free_covariance[inertia_index, inertia_index] ** 0.5
         )
-    tool_inertia_std = std.get(tool_inertia)
-    if tool_inertia in names and tool_inertia_std:
-        intervals[tool_inertia] = interval_from_zero(values[tool_inertia], tool_inertia_std)
-    hum_spectra = comparison.decays.hum([line.frequency_hz for line in noise.lines]) * noise.weight
+    tool_inertia_std = std.get(tool_inertia_name)
+    if tool_inertia_name in unknown_names and tool_inertia_std:
+        intervals[tool_inertia_name] = interval_from_zero(
+            parameter_values[tool_inertia_name], tool_inertia_std
+        )
+    hum_spectra = (
+        comparison.decays.hum([noise_line.frequency_hz for noise_line in noise.lines])
+        * noise.weight
+    )
     return RecordFit(
         structure=unknowns.structure,
         plant=plant,
-        parameters=values,
+        parameters=parameter_values,
         std=std,
         interval=intervals,
-        determined=uncertainty.determined,
-        covariance=uncertainty.covariance,
-        at_bounds=uncertainty.at_bounds,
-        internal=uncertainty.internal,
-        external=uncertainty.external,
+        determined=parameter_uncertainties.determined,
+        covariance=parameter_uncertainties.covariance,
+        at_bounds=parameter_uncertainties.at_bounds,
+        internal=parameter_uncertainties.internal,
+        external=parameter_uncertainties.external,
         modes=mode_table(linearisation.poles, covariance),
         ringing=ringing(
             linearisation.poles,
@@ -333,7 +347,7 @@ def _compared_jacobian(
     projected: Projected,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
-    """Return the whitened Jacobian of the torques that were measured, shape (k, K).
+    """Return the whitened derivatives of the measured torque's spectrum by the unknowns, (k, K).
 
     Torques that are unknown, and filled by the prediction, contribute nothing.
     """

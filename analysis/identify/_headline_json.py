@@ -37,7 +37,7 @@ def headline_json(
     findings: Iterable[Finding],
     validity: Validity,
 ) -> dict[str, Any]:
-    """Return the headline numbers as the content of the JSON document.
+    """Return the headline numbers of a record or campaign as the content of the JSON document.
 
     Parameters
     ----------
@@ -62,13 +62,20 @@ def headline_json(
         "file": file,
         "type": estimates.name,
         "validity": {**validity.as_json(), "uniform_beam": uniform_beam},
-        "parameters": {name: each.as_json() for name, each in estimates.parameters.items()},
+        "parameters": {
+            quantity_name: quantity.as_json()
+            for quantity_name, quantity in estimates.parameters.items()
+        },
         "drag_speed_m_s": estimates.drag_speed_m_s,
         "sizes": [
-            {"damping": each.damping, "omega_rad_s": each.omega_rad_s, **each.size.as_json()}
-            for each in estimates.sizes
+            {
+                "damping": quantity.damping,
+                "omega_rad_s": quantity.omega_rad_s,
+                **quantity.size.as_json(),
+            }
+            for quantity in estimates.sizes
         ],
-        "modes": [_mode_json(each) for each in estimates.modes],
+        "modes": [_mode_json(quantity) for quantity in estimates.modes],
         "uniformity_percent": None
         if estimates.tolerant is None
         else 100 * estimates.tolerant.uniformity,
@@ -76,35 +83,40 @@ def headline_json(
         "covariance": None if estimates.tolerant is None else estimates.tolerant.covariance_json(),
         "modal_model": None if estimates.modal is None else estimates.modal.as_json(),
         "exact_geometry": None if estimates.exact is None else _exact_json(estimates.exact),
-        "structures": [{"type": name, "status": status} for name, status in estimates.structures],
+        "structures": [
+            {"type": quantity_name, "status": structure_status}
+            for quantity_name, structure_status in estimates.structures
+        ],
         "orders": {
-            each.order: {
-                "status": each.status,
-                "interval_95": None if each.interval is None else list(each.interval),
+            quantity.order: {
+                "status": quantity.status,
+                "interval_95": None if quantity.interval is None else list(quantity.interval),
             }
-            for each in orders
+            for quantity in orders
         },
         "conditional": None
         if estimates.simpler is None
         else {
             "type": estimates.simpler.name,
             "on": dict(estimates.simpler.fixed),
-            "parameters": {n: each.as_json() for n, each in estimates.simpler.parameters.items()},
+            "parameters": {
+                n: quantity.as_json() for n, quantity in estimates.simpler.parameters.items()
+            },
         },
         "named": [
             {
-                "what": each.kind,
-                "value": each.value,
-                "interval_95": None if each.interval is None else list(each.interval),
-                "sentence": each.sentence,
+                "what": quantity.kind,
+                "value": quantity.value,
+                "interval_95": None if quantity.interval is None else list(quantity.interval),
+                "sentence": quantity.sentence,
             }
-            for each in findings
+            for quantity in findings
         ],
     }
 
 
 def _mode_json(mode: ReportedMode) -> dict[str, Any]:
-    """Return a mode as a dictionary for the JSON document."""
+    """Return frequency, damping and participation of a beam mode as a dictionary for JSON."""
     participation = mode.participation
     return {
         "mode": mode.number,
@@ -116,10 +128,13 @@ def _mode_json(mode: ReportedMode) -> dict[str, Any]:
     }
 
 
-def _exact_json(exact: Estimates) -> dict[str, Any]:
+def _exact_json(exact_estimates: Estimates) -> dict[str, Any]:
     """Return the estimates for a beam that is uniform to 1e-5, for the JSON document."""
     return {
         "condition": EXACTLY_UNIFORM_CONDITION,
-        "parameters": {name: each.as_json() for name, each in exact.parameters.items()},
-        "modes": [_mode_json(each) for each in exact.modes],
+        "parameters": {
+            quantity_name: quantity.as_json()
+            for quantity_name, quantity in exact_estimates.parameters.items()
+        },
+        "modes": [_mode_json(quantity) for quantity in exact_estimates.modes],
     }

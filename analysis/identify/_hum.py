@@ -36,7 +36,7 @@ _SEARCH_HALF_WIDTHS: Final = 3.0
 """Half width of the frequency range in which a hum is searched for, in half widths of the
 resonance. A hum outside this range does not affect the mode."""
 
-_BLOCK_S: Final = 4.0
+_HUM_BLOCK_S: Final = 4.0
 """Duration in seconds of the overlapping blocks of the record in which a hum is searched for."""
 
 _ASSUMED_MODEL_ERROR: Final = 0.3
@@ -88,18 +88,21 @@ class Hum:
 
     @property
     def line(self) -> NoiseLine:
-        """Return frequency and amplitude of the hum as a noise line."""
+        """Return frequency in Hz and amplitude in N·m of the hum, as a line of the noise."""
         return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
 
     def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
         """Return the torque of the hum in N·m at times since the first compared sample."""
-        rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
-        torque: NDArray[np.float64] = (self.phasor_nm * rotation).real
-        return torque
+        phase_rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
+        torque_nm: NDArray[np.float64] = (self.phasor_nm * phase_rotation).real
+        return torque_nm
 
 
 def resonance_half_width_hz(pole: Pole, spacing_hz: float) -> float:
-    """Return the half width of a resonance in hertz, for bins that are `spacing_hz` apart."""
+    """Return the half width in hertz of the range around a resonance in which hum is sought.
+
+    It is at least a number of bins, which are `spacing_hz` apart.
+    """
     return max(
         _RESONANCE_HALF_WIDTHS * abs(pole.at_rad_s.real) / (2 * np.pi),
         _MIN_RESONANCE_BINS * spacing_hz,
@@ -113,7 +116,7 @@ def find_hum_near_modes(
     noise: NoiseSpectrum,
     decaying_nm: NDArray[np.float64],
 ) -> tuple[Hum, ...]:
-    """Search for hum near each mode, including the hum that has already been removed.
+    """Return the hum found near each mode, including the hum that has already been removed.
 
     Parameters
     ----------
@@ -133,89 +136,93 @@ def find_hum_near_modes(
     tuple of Hum
         At most one hum per mode.
     """
-    predicted, _ = comparison.prediction.torque(plant)
-    measured = comparison.torque_nm[comparison.retained] + comparison.hum_nm
+    predicted_nm, _ = comparison.prediction.torque(plant)
+    measured_nm = comparison.torque_nm[comparison.retained] + comparison.hum_nm
     hz = comparison.frequency_hz
-    blocks = _Blocks(comparison.samples, comparison.decimation.rate_hz)
-    hums: list[Hum] = []
+    record_blocks = _HumBlocks(comparison.samples, comparison.decimation.rate_hz)
+    found_hums: list[Hum] = []
     for pole in poles:
         if not pole.oscillates:
             continue
         mode_hz = pole.at_rad_s.imag / (2 * np.pi)
-        reach_hz = _SEARCH_HALF_WIDTHS * resonance_half_width_hz(pole, float(hz[1] - hz[0]))
-        search_range_hz = (max(mode_hz - reach_hz, hz[0]), min(mode_hz + reach_hz, hz[-1]))
-        if search_range_hz[1] - search_range_hz[0] < reach_hz / 2:
+        half_width_hz = _SEARCH_HALF_WIDTHS * resonance_half_width_hz(pole, float(hz[1] - hz[0]))
+        search_range_hz = (
+            max(mode_hz - half_width_hz, hz[0]),
+            min(mode_hz + half_width_hz, hz[-1]),
+        )
+        if search_range_hz[1] - search_range_hz[0] < half_width_hz / 2:
             continue  # a wrong model may have modes outside the band
-        variance = float(np.interp(mode_hz, hz, noise.power)) / comparison.samples
-        hum = blocks.find_steady_hum(
-            measured - predicted, predicted, decaying_nm, search_range_hz, variance
+        noise_variance = float(np.interp(mode_hz, hz, noise.power)) / comparison.samples
+        hum = record_blocks.find_steady_hum(
+            measured_nm - predicted_nm, predicted_nm, decaying_nm, search_range_hz, noise_variance
         )
         if hum is not None and all(
-            abs(hum.frequency_hz - other_hum.frequency_hz) > hz[1] - hz[0] for other_hum in hums
+            abs(hum.frequency_hz - other_hum.frequency_hz) > hz[1] - hz[0]
+            for other_hum in found_hums
         ):
-            hums.append(hum)
-    return tuple(hums)
+            found_hums.append(hum)
+    return tuple(found_hums)
 
 
-class _Blocks:
-    """Overlapping windowed blocks of a record, in which a steady sinusoid is searched for."""
+class _HumBlocks:
+    """Overlapping windowed time blocks of a record, in which a steady sinusoid is searched for."""
 
-    def __init__(self, samples: int, rate_hz: float) -> None:
+    def __init__(self, sample_count: int, rate_hz: float) -> None:
         self.rate_hz = rate_hz
-        self.time_s = np.arange(samples) / rate_hz
-        half_block = round(_BLOCK_S * rate_hz / 2)
+        self.time_s = np.arange(sample_count) / rate_hz
+        half_block = round(_HUM_BLOCK_S * rate_hz / 2)
         self.window = np.hanning(2 * half_block + 1)[:-1]
-        self.block_indices = np.arange(0, samples - 2 * half_block + 1, half_block)[
+        self.block_indices = np.arange(0, sample_count - 2 * half_block + 1, half_block)[
             :, None
         ] + np.arange(2 * half_block)
 
     def find_steady_hum(
         self,
-        residual: NDArray[np.float64],
-        predicted: NDArray[np.float64],
-        free_decay: NDArray[np.float64],
+        residual_nm: NDArray[np.float64],
+        predicted_nm: NDArray[np.float64],
+        free_decay_nm: NDArray[np.float64],
         range_hz: tuple[float, float],
-        variance: float,
+        noise_variance: float,
     ) -> Hum | None:
         """Return a sinusoid in the residual that is steady over the record, or None.
 
         Parameters
         ----------
-        residual, predicted, free_decay : ndarray, shape (samples,)
+        residual_nm, predicted_nm, free_decay_nm : ndarray, shape (samples,)
             Torque in N·m: residual, prediction, and estimated free decay.
         range_hz : tuple of float
             Lowest and highest frequency of the search.
-        variance : float
+        noise_variance : float
             Variance of one sample of noise that is as strong as the noise near these frequencies,
             in N²·m².
         """
         if not len(self.block_indices):
             return None
-        noise_power = variance * float(self.window @ self.window)
+        noise_power = noise_variance * float(self.window @ self.window)
         # Power of the noise, of the possible error of the model, and of the free decay.
         block_power = (
             noise_power
-            + (_ASSUMED_MODEL_ERROR * self._largest_block_magnitudes(predicted, *range_hz)) ** 2
+            + (_ASSUMED_MODEL_ERROR * self._largest_block_magnitudes(predicted_nm, *range_hz)) ** 2
         )
-        block_power += self._largest_block_magnitudes(free_decay, *range_hz) ** 2
-        time_weight = np.zeros(residual.size)
-        for indices, block_weight in zip(
+        block_power += self._largest_block_magnitudes(free_decay_nm, *range_hz) ** 2
+        time_weight = np.zeros(residual_nm.size)
+        for block_samples, block_weight in zip(
             self.block_indices, noise_power / block_power, strict=True
         ):
-            time_weight[indices] += block_weight * self.window
+            time_weight[block_samples] += block_weight * self.window
         if time_weight.mean() < _MIN_SILENT_FRACTION:
             return None
-        hum, growth_per_s = self._fit_strongest_sinusoid(residual, time_weight, range_hz)
-        if abs(growth_per_s) * residual.size > _MAX_RELATIVE_GROWTH * self.rate_hz:
+        hum, growth_per_s = self._fit_strongest_sinusoid(residual_nm, time_weight, range_hz)
+        if abs(growth_per_s) * residual_nm.size > _MAX_RELATIVE_GROWTH * self.rate_hz:
             return None
-        if abs(hum.phasor_nm) ** 2 * time_weight.sum() < 4 * variance * _MIN_HUM_POWER_RATIO:
+        if abs(hum.phasor_nm) ** 2 * time_weight.sum() < 4 * noise_variance * _MIN_HUM_POWER_RATIO:
             return None
         if abs(hum.phasor_nm) < _MIN_HUM_OVER_PREDICTION * self._largest_amplitude(
-            predicted, time_weight, hum.frequency_hz
+            predicted_nm, time_weight, hum.frequency_hz
         ):
             return None
         block_phasor = hum.phasor_nm / 2 * self.window.sum()
-        demodulated = residual * np.exp(-2j * np.pi * hum.frequency_hz * self.time_s)
+        demodulated = residual_nm * np.exp(-2j * np.pi * hum.frequency_hz * self.time_s)
         relative_variation = (
             np.abs(demodulated[self.block_indices] @ self.window - block_phasor) ** 2 / block_power
         )
@@ -226,52 +233,63 @@ class _Blocks:
         return hum
 
     def _largest_block_magnitudes(
-        self, values: NDArray[np.float64], first_hz: float, last_hz: float
+        self, torque_nm: NDArray[np.float64], first_hz: float, last_hz: float
     ) -> NDArray[np.float64]:
-        """Return the largest magnitude of each block's spectrum in a frequency range, (blocks,)."""
-        count = math.ceil((last_hz - first_hz) * _BLOCK_S * 2) + 1
-        hz = np.linspace(first_hz, last_hz, count)
-        rotation = np.exp(-2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz))
-        spectra = values[self.block_indices] @ (self.window[:, None] * rotation)
-        magnitudes: NDArray[np.float64] = np.abs(spectra).max(axis=1)
-        return magnitudes
+        """Return the largest magnitude of the spectrum of each block's torque, shape (blocks,).
+
+        Only frequencies from `first_hz` to `last_hz` are considered.
+        """
+        frequency_count = math.ceil((last_hz - first_hz) * _HUM_BLOCK_S * 2) + 1
+        hz = np.linspace(first_hz, last_hz, frequency_count)
+        phase_rotation = np.exp(
+            -2j * np.pi * np.outer(np.arange(self.window.size) / self.rate_hz, hz)
+        )
+        block_spectra = torque_nm[self.block_indices] @ (self.window[:, None] * phase_rotation)
+        largest_magnitudes: NDArray[np.float64] = np.abs(block_spectra).max(axis=1)
+        return largest_magnitudes
 
     def _largest_amplitude(
-        self, values: NDArray[np.float64], weight: NDArray[np.float64], at_hz: float
+        self, torque_nm: NDArray[np.float64], time_weight: NDArray[np.float64], centre_hz: float
     ) -> float:
-        """Return the largest amplitude of a sinusoid near a frequency in a weighted torque.
+        """Return the largest amplitude in N·m of a sinusoid near a frequency in a weighted torque.
 
-        Frequencies within one bin of `at_hz` are considered.
+        Frequencies within one bin of `centre_hz` are considered.
         """
-        frequency_steps = np.linspace(-1, 1, 2 * _FREQUENCY_OVERSAMPLING + 1) / values.size
-        rotation = np.exp(
-            -2j * np.pi * np.outer(at_hz / self.rate_hz + frequency_steps, np.arange(values.size))
+        frequency_steps = np.linspace(-1, 1, 2 * _FREQUENCY_OVERSAMPLING + 1) / torque_nm.size
+        phase_rotation = np.exp(
+            -2j
+            * np.pi
+            * np.outer(centre_hz / self.rate_hz + frequency_steps, np.arange(torque_nm.size))
         )
-        return 2 * float(np.abs(rotation @ (weight * values)).max() / weight.sum())
+        return 2 * float(
+            np.abs(phase_rotation @ (time_weight * torque_nm)).max() / time_weight.sum()
+        )
 
     def _fit_strongest_sinusoid(
         self,
-        residual: NDArray[np.float64],
-        weight: NDArray[np.float64],
+        residual_nm: NDArray[np.float64],
+        time_weight: NDArray[np.float64],
         range_hz: tuple[float, float],
     ) -> tuple[Hum, float]:
         """Fit the sinusoid that explains most of a residual.
 
         Return it as a hum, with the relative growth of its amplitude per second.
         """
-        length = _FREQUENCY_OVERSAMPLING * residual.size
-        hz = np.fft.rfftfreq(length, 1 / self.rate_hz)
+        padded_length = _FREQUENCY_OVERSAMPLING * residual_nm.size
+        hz = np.fft.rfftfreq(padded_length, 1 / self.rate_hz)
         bins_in_range = slice(*np.searchsorted(hz, range_hz))
-        spectrum = np.fft.rfft(weight * residual, length)[bins_in_range]
+        spectrum = np.fft.rfft(time_weight * residual_nm, padded_length)[bins_in_range]
         frequency_hz = float(hz[bins_in_range][np.argmax(np.abs(spectrum))])
-        mean_time_s = float(weight @ self.time_s / weight.sum())
+        mean_time_s = float(time_weight @ self.time_s / time_weight.sum())
         time_s = self.time_s - mean_time_s
-        time_variance = float(weight @ time_s**2)
+        time_variance = float(time_weight @ time_s**2)
         for _ in range(_FREQUENCY_STEPS):
-            demodulated = 2 * weight * residual * np.exp(-2j * np.pi * frequency_hz * time_s)
-            phasor = complex(demodulated.sum()) / float(weight.sum())
+            demodulated = (
+                2 * time_weight * residual_nm * np.exp(-2j * np.pi * frequency_hz * time_s)
+            )
+            mean_phasor = complex(demodulated.sum()) / float(time_weight.sum())
             # Growth in quadrature means that the frequency is slightly wrong (Gauss-Newton).
-            growth = complex(demodulated @ time_s) / time_variance / phasor
-            frequency_hz += growth.imag / (2 * math.pi)
-        at_start = phasor * cmath.exp(-2j * math.pi * frequency_hz * mean_time_s)
-        return Hum(frequency_hz, at_start), growth.real
+            growth_per_s = complex(demodulated @ time_s) / time_variance / mean_phasor
+            frequency_hz += growth_per_s.imag / (2 * math.pi)
+        initial_phasor = mean_phasor * cmath.exp(-2j * math.pi * frequency_hz * mean_time_s)
+        return Hum(frequency_hz, initial_phasor), growth_per_s.real

@@ -54,7 +54,7 @@ def reference_coherent_part(
     rate_hz: float,
     torque_nm: NDArray[np.float64] | None = None,
 ) -> NDArray[np.float64]:
-    """Return the part of the angle that is coherent with the reference, shape (n,).
+    """Return the part of the motor angle in rad that is coherent with the reference, shape (n,).
 
     The response is estimated by windowed correlations (R. B. Blackman and J. W. Tukey, Bell System
     Technical Journal 37 (1958) 185-282): at each frequency by least squares over its neighbours.
@@ -72,41 +72,47 @@ def reference_coherent_part(
     return_to_zero = 0.5 * (
         1 + np.cos(np.linspace(0, np.pi, round(_RETURN_TO_ZERO_S * rate_hz) + 1)[1:])
     )
-    length = fast_length(2 * (angle_rad.size + return_to_zero.size))
+    padded_length = fast_length(2 * (angle_rad.size + return_to_zero.size))
 
     def spectrum_of(values: NDArray[np.float64]) -> NDArray[np.complex128]:
-        return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), length)
+        return np.fft.rfft(np.concatenate([values, values[-1] * return_to_zero]), padded_length)
 
-    lag_s = np.fft.fftfreq(length) * (length / rate_hz)
-    window = np.exp(-0.5 * (lag_s / _LAG_WINDOW_S) ** 2)
+    lag_s = np.fft.fftfreq(padded_length) * (padded_length / rate_hz)
+    lag_window = np.exp(-0.5 * (lag_s / _LAG_WINDOW_S) ** 2)
 
     def smooth_over_frequency(power: NDArray[np.complex128]) -> NDArray[np.complex128]:
-        return np.fft.rfft(window * np.fft.irfft(power, length))
+        return np.fft.rfft(lag_window * np.fft.irfft(power, padded_length))
 
-    angle, reference = spectrum_of(angle_rad), spectrum_of(reference_rad)
+    angle_spectrum, reference_spectrum = spectrum_of(angle_rad), spectrum_of(reference_rad)
     cross_spectrum, reference_power = (
-        smooth_over_frequency(angle * reference.conj()),
-        smooth_over_frequency(np.abs(reference) ** 2).real,
+        smooth_over_frequency(angle_spectrum * reference_spectrum.conj()),
+        smooth_over_frequency(np.abs(reference_spectrum) ** 2).real,
     )
     if not reference_power.max() > 0:
         return np.zeros(angle_rad.size)
     reference_power = np.maximum(reference_power, _RELATIVE_POWER_FLOOR * reference_power.max())
-    spectrum = cross_spectrum / reference_power * reference
+    coherent_spectrum = cross_spectrum / reference_power * reference_spectrum
     if torque_nm is not None:
         # Use the part of the torque that is no smooth response to the reference.
-        torque = spectrum_of(torque_nm)
-        torque_by_reference = smooth_over_frequency(torque * reference.conj()) / reference_power
+        torque_spectrum = spectrum_of(torque_nm)
+        torque_by_reference = (
+            smooth_over_frequency(torque_spectrum * reference_spectrum.conj()) / reference_power
+        )
         independent_torque_power = (
-            smooth_over_frequency(np.abs(torque) ** 2).real
+            smooth_over_frequency(np.abs(torque_spectrum) ** 2).real
             - np.abs(torque_by_reference) ** 2 * reference_power
         )
         independent_torque_power = np.maximum(
             independent_torque_power, _RELATIVE_POWER_FLOOR * independent_torque_power.max()
         )
         response_to_torque = (
-            smooth_over_frequency(angle * torque.conj())
+            smooth_over_frequency(angle_spectrum * torque_spectrum.conj())
             - cross_spectrum * torque_by_reference.conj()
         ) / independent_torque_power
-        spectrum += response_to_torque * (torque - torque_by_reference * reference)
-    coherent_rad: NDArray[np.float64] = np.fft.irfft(spectrum, length)[: angle_rad.size]
+        coherent_spectrum += response_to_torque * (
+            torque_spectrum - torque_by_reference * reference_spectrum
+        )
+    coherent_rad: NDArray[np.float64] = np.fft.irfft(coherent_spectrum, padded_length)[
+        : angle_rad.size
+    ]
     return coherent_rad

@@ -86,7 +86,7 @@ _MAX_QUIET_POWER_RATIO: Final = 1.5
 
 @dataclass(frozen=True, slots=True)
 class DetectedImpact:
-    """Impact found in a record, with the fraction of the residual that it explains.
+    """Impact on the beam found in a record, with the fraction of the residual that it explains.
 
     Attributes
     ----------
@@ -94,21 +94,21 @@ class DetectedImpact:
         Time, poles and amplitudes of the impact.
     explained_fraction : float
         Fraction of the unexplained cost that the impact explains.
-    before : float
+    residual_power_ratio : float
         Power of the residual in the two seconds before the impact, relative to its mean power in
         the record once the impact is removed.
     """
 
     knock: RecordedImpact
     explained_fraction: float
-    power_ratio_before: float
+    residual_power_ratio: float
 
     @property
     def evident(self) -> bool:
-        """Return whether the impact explains most of the residual and begins abruptly."""
+        """Return whether the impact explains most of the torque residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
-            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
         )
 
     @property
@@ -116,16 +116,17 @@ class DetectedImpact:
         """Return whether the impact explains so much that no other effect is tested first."""
         return (
             self.explained_fraction > _OBVIOUS_FRACTION
-            and self.power_ratio_before < _MAX_QUIET_POWER_RATIO
+            and self.residual_power_ratio < _MAX_QUIET_POWER_RATIO
         )
 
 
 def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Iterator[DetectedImpact]:
-    """Search a record for one more impact; yield alternative impacts, the likeliest first.
+    """Search a record for one more impact on the beam; yield alternatives, the likeliest first.
 
     An impact may be larger than the response to the motor, so that a fit to the whole record fails.
     One half of the record then contains no impact, or only a free decay at its start. So the search
-    also uses the residual of fits to either half. With `obvious` it is limited to obvious impacts.
+    also uses the residual of fits to either half. With `obvious` it is limited to obvious
+    impacts.
     """
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
         return
@@ -135,49 +136,51 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
         found_in_whole = None
     if obvious:
         return
-    for start in _fits_to_halves(candidate_set):
-        impact = _find_impact_in_residual(start)
-        if impact is not None:
-            yield impact
+    for refit_start in _fits_to_halves(candidate_set):
+        alternative_impact = _find_impact_in_residual(refit_start)
+        if alternative_impact is not None:
+            yield alternative_impact
     if found_in_whole is not None:
         yield found_in_whole
 
 
 def find_impact(candidate_set: CandidateSet) -> DetectedImpact | None:
-    """Search for an impact in the residual of the candidate with the lowest cost."""
-    likeliest = min(candidate_set.candidates, key=lambda each: each.fit.cost)
-    return _find_impact_in_residual(candidate_set.refit(likeliest, 1))
+    """Return an impact found in the residual of the candidate with the lowest cost, or None."""
+    likeliest_candidate = min(candidate_set.candidates, key=lambda candidate: candidate.fit.cost)
+    return _find_impact_in_residual(candidate_set.refit(likeliest_candidate, 1))
 
 
 def _find_impact_in_residual(refit: Refit) -> DetectedImpact | None:
-    """Search for an impact in the residual of a refit; return None if there is none."""
+    """Return an impact on the beam found in the residual of a refit, or None."""
     start_sample = _likeliest_start(refit)
     if start_sample is None:
         return None
     comparison = refit.objective.comparison
-    for width_s in _WINDOW_HALF_WIDTHS_S:
-        half_width = math.ceil(width_s * comparison.decimation.rate_hz)
+    for window_half_width_s in _WINDOW_HALF_WIDTHS_S:
+        half_width_samples = math.ceil(window_half_width_s * comparison.decimation.rate_hz)
         window_start, window_end = (
-            max(start_sample - half_width, 0),
-            min(start_sample + half_width, comparison.samples),
+            max(start_sample - half_width_samples, 0),
+            min(start_sample + half_width_samples, comparison.samples),
         )
         refit_around_impact = _fit_around_impact(refit, window_start, window_end)
-        extent = _impact_extent(refit_around_impact, window_start, window_end)
-        if extent is None:
+        impact_extent = _impact_extent(refit_around_impact, window_start, window_end)
+        if impact_extent is None:
             return None
-        impact = _with_amplitudes(refit_around_impact, *extent)
-        if impact.explained_fraction < _WORTHWHILE_FRACTION:
+        found_impact = _impact_with_amplitudes(refit_around_impact, *impact_extent)
+        if found_impact.explained_fraction < _WORTHWHILE_FRACTION:
             return None
-        if extent[0] > window_start:
-            return impact
-        if impact.explained_fraction < _EVIDENT_FRACTION:
+        if impact_extent[0] > window_start:
+            return found_impact
+        if found_impact.explained_fraction < _EVIDENT_FRACTION:
             return None
         # A touch may have begun before this window: try the wider one.
     return None
 
 
 def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
-    """Fit the freest structure to each half of the record, and apply the plant to the whole one.
+    """Yield refits of the whole record that start from fits to either half of it.
+
+    The damping structure is the freest one.
 
     A half is skipped if its residual is not white.
     """
@@ -185,13 +188,13 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
     measurement, hz = comparison.measurement, comparison.frequency_hz
     band_hz = (0.0 if comparison.bins.start == 1 else float(hz[0]), float(hz[-1]))
     middle_tick = measurement.angle_rad.size // 2
-    for half in (slice(0, middle_tick), slice(middle_tick, None)):
+    for half_ticks in (slice(0, middle_tick), slice(middle_tick, None)):
         half_measurement = replace(
             measurement,
-            angle_rad=measurement.angle_rad[half],
-            torque_nm=measurement.torque_nm[half],
-            angle_known=measurement.angle_known[half],
-            torque_known=measurement.torque_known[half],
+            angle_rad=measurement.angle_rad[half_ticks],
+            torque_nm=measurement.torque_nm[half_ticks],
+            angle_known=measurement.angle_known[half_ticks],
+            torque_known=measurement.torque_known[half_ticks],
             # The ringing after the impact may be far louder than the response to the reference,
             # and the part that follows the reference then identifies no beam.
             reference_rad=None,
@@ -201,8 +204,10 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
         except MeasurementError:
             continue
-        fit, is_used = analysis.fits[0], analysis.noise.counts
-        if not whiteness(fit.residual[is_used], analysis.comparison.frequency_hz[is_used]).white:
+        fit, used_bins = analysis.fits[0], analysis.noise.counts
+        if not whiteness(
+            fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
+        ).white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
@@ -231,13 +236,13 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
     `explained` states whether the model with the impacts explains the record.
     """
     for impact in impacts:
-        tolerance_s = impact.start_uncertainty_s
+        start_uncertainty_s = impact.start_uncertainty_s
         yield Finding(
             kind="knock",
             sentence=(
-                f"The beam was struck at {impact.first_s:.2f} s (to within {tolerance_s:.2g} s): "
-                f"{1e3 * impact.largest_nm:.3g} mN·m in the torque, and from then on the free "
-                "decay of its modes. "
+                f"The beam was struck at {impact.first_s:.2f} s (to within "
+                f"{start_uncertainty_s:.2g} s): {1e3 * impact.largest_nm:.3g} mN·m in the torque, "
+                "and from then on the free decay of its modes. "
                 + (
                     "It was fitted too, and biases nothing."
                     if explained
@@ -245,7 +250,7 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
                 )
             ),
             value=impact.first_s,
-            interval=(impact.first_s - tolerance_s, impact.first_s + tolerance_s),
+            interval=(impact.first_s - start_uncertainty_s, impact.first_s + start_uncertainty_s),
             unit="s",
             remedy="Keep clear of the beam while it is recorded.",
         )
@@ -255,7 +260,9 @@ def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> 
 
 
 def _likeliest_start(refit: Refit) -> int | None:
-    """Return the sample from which free decays of all modes explain most of the residual.
+    """Return the index of the sample at which an impact most likely begins.
+
+    Free decays of all modes from this sample on explain most of the residual.
 
     Return None if chance may explain as much, or if the residual does not rise abruptly. The search
     takes one correlation per decay: the sums for a decay from the first sample on, reversed in
@@ -269,27 +276,30 @@ def _likeliest_start(refit: Refit) -> int | None:
     decays = comparison.decays.columns(poles) * weight
     projections = np.array([comparison.in_time(decay.conj() * residual) for decay in decays])
     projections *= comparison.samples / 2
-    lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
-    if not lengths.all():
+    decay_lengths = np.sqrt(np.sum(np.abs(decays) ** 2, axis=1))
+    if not decay_lengths.all():
         return None
-    gram = (decays.conj() @ decays.T).real / np.outer(lengths, lengths)
-    projections /= lengths[:, None]
+    decay_gram = (decays.conj() @ decays.T).real / np.outer(decay_lengths, decay_lengths)
+    projections /= decay_lengths[:, None]
     cost_reductions = np.sum(
-        projections * np.linalg.solve(gram + 1e-9 * np.eye(lengths.size), projections), axis=0
+        projections * np.linalg.solve(decay_gram + 1e-9 * np.eye(decay_lengths.size), projections),
+        axis=0,
     )
     start_sample = int(np.argmax(cost_reductions))
-    deviate = chi_square_deviate(float(cost_reductions[start_sample]), lengths.size)
-    if deviate < math.sqrt(2 * largest_deviate_limit(comparison.samples)):
+    normal_deviate = chi_square_deviate(float(cost_reductions[start_sample]), decay_lengths.size)
+    if normal_deviate < math.sqrt(2 * largest_deviate_limit(comparison.samples)):
         return None
     # The residual of a wrong model rises and falls with the sweep; an impact begins abruptly.
-    power = comparison.in_time(residual) ** 2
+    residual_power = comparison.in_time(residual) ** 2
     rate_hz = comparison.decimation.rate_hz
-    gap_samples, window_end = (
-        math.ceil(each * rate_hz)
-        for each in (_GAP_BEFORE_IMPACT_S, _GAP_BEFORE_IMPACT_S + _COMPARED_DURATION_S)
+    gap_samples, window_samples = (
+        math.ceil(duration_s * rate_hz)
+        for duration_s in (_GAP_BEFORE_IMPACT_S, _GAP_BEFORE_IMPACT_S + _COMPARED_DURATION_S)
     )
-    power_before = power[max(start_sample - window_end, 0) : max(start_sample - gap_samples, 0)]
-    power_after = power[start_sample : start_sample + window_end]
+    power_before = residual_power[
+        max(start_sample - window_samples, 0) : max(start_sample - gap_samples, 0)
+    ]
+    power_after = residual_power[start_sample : start_sample + window_samples]
     is_abrupt = (
         power_before.size == 0
         or power_before.mean() < _MAX_POWER_BEFORE_OVER_AFTER * power_after.mean()
@@ -298,18 +308,20 @@ def _likeliest_start(refit: Refit) -> int | None:
 
 
 def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refit:
-    """Estimate plant and noise with an impact between two samples as part of the model.
+    """Return a refit whose plant and noise were estimated with an impact in the model.
 
-    Return the refit without the impact, under the new noise.
+    The impact lies between two samples.
+
+    The refit itself is without the impact.
     """
     comparison, columns_before = refit.objective.comparison, refit.columns
     for _ in range(_IMPACT_FIT_ROUNDS):
-        impact = _impact_between(refit, first_sample, end_sample)
-        columns = np.concatenate(
-            [columns_before, comparison.spectrum(_impact_torques(comparison, impact))]
+        assumed_impact = _impact_between(refit, first_sample, end_sample)
+        all_columns = np.concatenate(
+            [columns_before, comparison.spectrum(_impact_torques(comparison, assumed_impact))]
         )
         refit = Refit.descend(
-            comparison, refit.objective.unknowns, refit.x, refit.noise, columns,
+            comparison, refit.objective.unknowns, refit.x, refit.noise, all_columns,
             max_evaluations=REFIT_EVALUATIONS,
         )  # fmt: skip
         refit = replace(refit, noise=refit.residual_noise())
@@ -324,7 +336,7 @@ def _fit_around_impact(refit: Refit, first_sample: int, end_sample: int) -> Refi
 
 
 def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> RecordedImpact:
-    """Return an impact between two samples, with the poles of a refit and no amplitudes yet."""
+    """Return an impact between two samples, without amplitudes, with the poles of a refit."""
     comparison = refit.objective.comparison
     rate_hz = comparison.decimation.rate_hz
     poles = comparison.poles(refit.plant)
@@ -338,22 +350,30 @@ def _impact_between(refit: Refit, first_sample: int, end_sample: int) -> Recorde
 
 
 def _impact_torques(comparison: Comparison, impact: RecordedImpact) -> NDArray[np.float64]:
-    """Return the torques of an impact per unit amplitude at the compared samples, (c, samples)."""
+    """Return the torques of an impact of unit amplitudes at the compared samples, (c, samples)."""
     return impact.columns(comparison.times_s(), comparison.decimation.rate_hz)
 
 
-def _successive_cost_reductions(refit: Refit, columns: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Return the cost reduction by each torque in addition to the torques before it, shape (c,).
+def _successive_cost_reductions(
+    refit: Refit, unit_torques: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the cost reduction by each torque after the torques in the rows before it, (c,).
 
-    `columns` are torques of unit amplitude at the compared samples, shape (c, samples). All free
-    parameters of the fit stay free, to first order.
+    `unit_torques` are torques of unit amplitude at the compared samples, shape (c, samples). All
+    free parameters of the fit stay free, to first order.
     """
-    unexplained, residual = refit.unexplained_columns(refit.objective.comparison.spectrum(columns))
-    unexplained /= np.maximum(np.linalg.norm(unexplained, axis=1), np.finfo(float).tiny)[:, None]
+    unexplained_spectra, residual = refit.unexplained_columns(
+        refit.objective.comparison.spectrum(unit_torques)
+    )
+    unexplained_spectra /= np.maximum(
+        np.linalg.norm(unexplained_spectra, axis=1), np.finfo(float).tiny
+    )[:, None]
     # Gram-Schmidt orthogonalisation: each torque without its projection on the earlier ones.
-    basis, triangular = np.linalg.qr(np.ascontiguousarray(unexplained).view(np.float64).T)
-    projections = basis.T @ residual.view(np.float64)
-    projections[np.abs(np.diag(triangular)) < _DEPENDENT_LENGTH] = 0.0
+    orthonormal_basis, triangular_factor = np.linalg.qr(
+        np.ascontiguousarray(unexplained_spectra).view(np.float64).T
+    )
+    projections = orthonormal_basis.T @ residual.view(np.float64)
+    projections[np.abs(np.diag(triangular_factor)) < _DEPENDENT_LENGTH] = 0.0
     cost_reductions: NDArray[np.float64] = projections**2
     return cost_reductions
 
@@ -364,66 +384,73 @@ it is a linear combination of these."""
 
 
 def _impact_extent(refit: Refit, window_start: int, window_end: int) -> tuple[int, int] | None:
-    """Return first sample and end of an impact within a window; None if there is no impact.
+    """Return first sample and end sample of an impact within a window of samples, or None.
 
     Each sample of unknown torque has to reduce the cost by the BIC penalty of a parameter. If the
     samples suffice without the decays there is no impact: the sensor was disturbed.
     """
-    penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
+    bic_penalty = math.log(2 * np.count_nonzero(refit.noise.counts))
     comparison = refit.objective.comparison
     # Beginning: decays from the window's end on, then single samples backwards from there.
     impact = _impact_between(refit, window_end, window_end)
-    decays = _impact_torques(comparison, impact)
+    decay_torques = _impact_torques(comparison, impact)
     single_samples = np.zeros((window_end - window_start, comparison.samples))
     single_samples[np.arange(window_end - window_start), np.arange(window_start, window_end)] = 1.0
     cost_reductions = _successive_cost_reductions(
-        refit, np.concatenate([decays, single_samples[::-1]])
-    )[len(decays) :]
-    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
-    begin = window_end - max(int(np.argmax(net_reduction)), 1)
+        refit, np.concatenate([decay_torques, single_samples[::-1]])
+    )[len(decay_torques) :]
+    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
+    first_sample = window_end - max(int(np.argmax(net_reduction)), 1)
     # End: decays from the beginning on, then single samples forwards.
-    impact = _impact_between(refit, begin, begin)
-    decays = _impact_torques(comparison, impact)
+    impact = _impact_between(refit, first_sample, first_sample)
+    decay_torques = _impact_torques(comparison, impact)
     cost_reductions = _successive_cost_reductions(
-        refit, np.concatenate([decays, single_samples[begin - window_start :]])
-    )[len(decays) :]
-    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - penalty)])
-    end = begin + int(np.argmax(net_reduction))
+        refit, np.concatenate([decay_torques, single_samples[first_sample - window_start :]])
+    )[len(decay_torques) :]
+    net_reduction = np.concatenate([[0.0], np.cumsum(cost_reductions - bic_penalty)])
+    end_sample = first_sample + int(np.argmax(net_reduction))
     reductions_samples_first = _successive_cost_reductions(
-        refit, np.concatenate([single_samples[begin - window_start : end - window_start], decays])
+        refit,
+        np.concatenate(
+            [single_samples[first_sample - window_start : end_sample - window_start], decay_torques]
+        ),
     )
-    reduction_by_decays = float(reductions_samples_first[end - begin :].sum())
-    normal_deviate = chi_square_deviate(reduction_by_decays, len(decays))
+    reduction_by_decays = float(reductions_samples_first[end_sample - first_sample :].sum())
+    normal_deviate = chi_square_deviate(reduction_by_decays, len(decay_torques))
     is_significant = normal_deviate > math.sqrt(2 * largest_deviate_limit(comparison.samples))
     return (
-        (begin, end)
+        (first_sample, end_sample)
         if is_significant
         and reduction_by_decays > _MIN_DECAY_FRACTION * float(reductions_samples_first.sum())
         else None
     )
 
 
-def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
-    """Return an impact with its amplitudes and the fraction of the cost that it explains."""
+def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> DetectedImpact:
+    """Return an impact between two samples with its amplitudes and explained cost fraction."""
     comparison = refit.objective.comparison
     impact = _impact_between(refit, first_sample, end_sample)
-    in_time = _impact_torques(comparison, impact)
-    cost, expected_cost = refit.cost, refit.expected_cost
-    beam_free = bool(cost < _OVERWHELMING_COST_RATIO * expected_cost)
-    whitened, residual = refit.unexplained_columns(
-        comparison.spectrum(in_time), beam_free=beam_free
+    unit_torques = _impact_torques(comparison, impact)
+    cost_before, expected_cost = refit.cost, refit.expected_cost
+    is_beam_free = bool(cost_before < _OVERWHELMING_COST_RATIO * expected_cost)
+    unexplained_spectra, residual = refit.unexplained_columns(
+        comparison.spectrum(unit_torques), beam_free=is_beam_free
     )
-    unexplained_parts = whitened.view(np.float64)
-    lengths = np.linalg.norm(unexplained_parts, axis=1)
-    lengths[lengths == 0] = 1.0
-    unexplained_parts /= lengths[:, None]
-    sizes = -np.linalg.lstsq(unexplained_parts.T, residual.view(np.float64), rcond=1e-10)[0]
-    remaining = (residual.view(np.float64) + sizes @ unexplained_parts).view(np.complex128)
-    remaining_cost = float(np.vdot(remaining, remaining).real)
-    sizes /= lengths
-    torque_nm = sizes @ in_time
-    first_second = slice(first_sample, first_sample + math.ceil(comparison.decimation.rate_hz))
-    remaining_in_time = comparison.in_time(remaining)
+    unexplained_parts = unexplained_spectra.view(np.float64)
+    spectrum_lengths = np.linalg.norm(unexplained_parts, axis=1)
+    spectrum_lengths[spectrum_lengths == 0] = 1.0
+    unexplained_parts /= spectrum_lengths[:, None]
+    amplitudes = -np.linalg.lstsq(unexplained_parts.T, residual.view(np.float64), rcond=1e-10)[0]
+    remaining_spectrum = (residual.view(np.float64) + amplitudes @ unexplained_parts).view(
+        np.complex128
+    )
+    remaining_cost = float(np.vdot(remaining_spectrum, remaining_spectrum).real)
+    amplitudes /= spectrum_lengths
+    torque_nm = amplitudes @ unit_torques
+    first_second_samples = slice(
+        first_sample, first_sample + math.ceil(comparison.decimation.rate_hz)
+    )
+    remaining_in_time = comparison.in_time(remaining_spectrum)
     before_impact = remaining_in_time[
         max(
             first_sample - math.ceil(_QUIET_DURATION_S * comparison.decimation.rate_hz), 0
@@ -432,11 +459,13 @@ def _with_amplitudes(refit: Refit, first_sample: int, end_sample: int) -> Detect
     return DetectedImpact(
         knock=replace(
             impact,
-            sizes=tuple(sizes.tolist()),
-            largest_nm=float(np.abs(torque_nm[first_second]).max()),
+            sizes=tuple(amplitudes.tolist()),
+            largest_nm=float(np.abs(torque_nm[first_second_samples]).max()),
         ),
-        explained_fraction=float((cost - remaining_cost) / max(cost - expected_cost, 1.0)),
-        power_ratio_before=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
+        explained_fraction=float(
+            (cost_before - remaining_cost) / max(cost_before - expected_cost, 1.0)
+        ),
+        residual_power_ratio=float(np.mean(before_impact**2) / np.mean(remaining_in_time**2))
         if before_impact.size
         else 0.0,
     )

@@ -34,7 +34,9 @@ _HARMLESS_LEAKAGE_RATIO: Final = 0.3
 
 
 def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit) -> NoiseSpectrum:
-    """Exclude bins into which a disturbance beyond the band leaks; add it to the noise lines.
+    """Return the noise without the bins into which disturbances beyond the band leak.
+
+    The disturbances are added to the lines of the noise.
 
     Parameters
     ----------
@@ -47,58 +49,74 @@ def without_leakage(noise: NoiseSpectrum, comparison: Comparison, fit: RecordFit
     """
     rate_hz, samples = comparison.decimation.rate_hz, comparison.samples
     end_hz = float(comparison.frequency_hz[-1])
-    torque, _ = comparison.prediction.torque(fit.plant)
-    residual = np.fft.rfft(comparison.torque_nm[comparison.retained] - torque)
-    all_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
-    is_near_end = np.abs(all_hz - end_hz) < min(_SEARCH_RANGE_HZ, rate_hz / 2 - end_hz)
+    predicted_nm, _ = comparison.prediction.torque(fit.plant)
+    residual_spectrum = np.fft.rfft(comparison.torque_nm[comparison.retained] - predicted_nm)
+    all_frequencies_hz = np.fft.rfftfreq(samples, 1 / rate_hz).astype(np.float64)
+    is_near_end = np.abs(all_frequencies_hz - end_hz) < min(_SEARCH_RANGE_HZ, rate_hz / 2 - end_hz)
     known_fraction = comparison.measurement.known_torque_fraction
     near_mode = np.zeros(np.count_nonzero(is_near_end), dtype=bool)
     noise_near_end = estimate_noise(
-        residual[is_near_end], all_hz[is_near_end], samples, known_fraction, near_mode=near_mode
+        residual_spectrum[is_near_end],
+        all_frequencies_hz[is_near_end],
+        samples,
+        known_fraction,
+        near_mode=near_mode,
     )
-    is_used, lines = noise.counts.copy(), list(noise.lines)
-    for line in noise_near_end.lines:
+    used_bins, noise_lines = noise.counts.copy(), list(noise.lines)
+    for leaking_line in noise_near_end.lines:
         # A line leaks as peak / (pi distance in bins).
-        peak = line.amplitude_nm * samples / 2
+        spectrum_peak = leaking_line.amplitude_nm * samples / 2
         harmless_peak = math.sqrt(_HARMLESS_LEAKAGE_RATIO * float(noise.power[-1]))
-        reach_hz = peak / (math.pi * harmless_peak) * rate_hz / samples
-        is_used &= np.abs(comparison.frequency_hz - line.frequency_hz) > reach_hz
-        other_lines = [k for k in lines if abs(line.frequency_hz - k.frequency_hz) > _SAME_LINE_HZ]
-        lines = [*other_lines, line]
+        reach_hz = spectrum_peak / (math.pi * harmless_peak) * rate_hz / samples
+        used_bins &= np.abs(comparison.frequency_hz - leaking_line.frequency_hz) > reach_hz
+        other_lines = [
+            k
+            for k in noise_lines
+            if abs(leaking_line.frequency_hz - k.frequency_hz) > _SAME_LINE_HZ
+        ]
+        noise_lines = [*other_lines, leaking_line]
     if not noise_near_end.lines:
         return noise
     # The leakage has raised the estimated noise of whole blocks of bins: estimate it again.
-    clean_residual = (fit.residual * np.sqrt(noise.power / 2))[is_used]
-    bins = np.arange(is_used.size)
-    power = np.exp(
-        np.interp(bins, bins[is_used], np.log(smooth_power(clean_residual) / known_fraction))
+    clean_residual = (fit.residual * np.sqrt(noise.power / 2))[used_bins]
+    bin_indices = np.arange(used_bins.size)
+    noise_power = np.exp(
+        np.interp(
+            bin_indices,
+            bin_indices[used_bins],
+            np.log(smooth_power(clean_residual) / known_fraction),
+        )
     )
-    return NoiseSpectrum(power, is_used, tuple(lines))
+    return NoiseSpectrum(noise_power, used_bins, tuple(noise_lines))
 
 
 def repetition_period_s(comparison: Comparison) -> float:
     """Return the period in seconds of the motion of the motor; 0 if the motion does not repeat."""
-    angle = comparison.angle_rad[comparison.retained]
-    angle = angle - angle.mean()
-    count = angle.size
-    spectrum = np.fft.rfft(angle, 2 * count)
-    autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: count // 2 + 1]
+    motor_angle_rad = comparison.angle_rad[comparison.retained]
+    motor_angle_rad = motor_angle_rad - motor_angle_rad.mean()
+    sample_count = motor_angle_rad.size
+    spectrum = np.fft.rfft(motor_angle_rad, 2 * sample_count)
+    autocorrelation = np.fft.irfft(np.abs(spectrum) ** 2)[: sample_count // 2 + 1]
     # Norm of the two overlapping parts of the angle at each lag.
-    cumulative_energy = np.concatenate([[0.0], np.cumsum(angle**2)])
-    lags = np.arange(autocorrelation.size)
-    norm = np.sqrt(
-        cumulative_energy[count - lags] * (cumulative_energy[count] - cumulative_energy[lags])
+    cumulative_energy = np.concatenate([[0.0], np.cumsum(motor_angle_rad**2)])
+    lag_samples = np.arange(autocorrelation.size)
+    overlap_norm = np.sqrt(
+        cumulative_energy[sample_count - lag_samples]
+        * (cumulative_energy[sample_count] - cumulative_energy[lag_samples])
     )
-    correlation = autocorrelation / np.maximum(norm, np.finfo(float).tiny)
+    correlation = autocorrelation / np.maximum(overlap_norm, np.finfo(float).tiny)
     different_lags = np.flatnonzero(correlation < _DIFFERENT_MOTION_CORRELATION)
     if different_lags.size == 0:
         return 0.0
     repeated_lags = np.flatnonzero(
-        (correlation > _REPEATED_MOTION_CORRELATION) & (lags > different_lags[0])
+        (correlation > _REPEATED_MOTION_CORRELATION) & (lag_samples > different_lags[0])
     )
     if repeated_lags.size == 0:
         return 0.0
-    end = int(repeated_lags[0])
-    while end + 1 < autocorrelation.size and correlation[end + 1] > correlation[end]:
-        end += 1
-    return end / comparison.decimation.rate_hz
+    period_samples = int(repeated_lags[0])
+    while (
+        period_samples + 1 < autocorrelation.size
+        and correlation[period_samples + 1] > correlation[period_samples]
+    ):
+        period_samples += 1
+    return period_samples / comparison.decimation.rate_hz

@@ -43,10 +43,10 @@ if TYPE_CHECKING:
 _RELATIVE_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
 
-_LEAST_ETA: Final = 1e-5
+_MIN_LOSS_FACTOR: Final = 1e-5
 """Lower bound of eta, which is twice the damping ratio of a mode."""
 
-_LARGEST_ETA: Final = 1.0
+_MAX_LOSS_FACTOR: Final = 1.0
 """Upper bound of eta, which is twice the damping ratio of a mode."""
 
 _MAX_LOG_FREQUENCY_CHANGE: Final = 0.15
@@ -87,7 +87,7 @@ known to a tenth."""
 
 @dataclass(frozen=True, slots=True)
 class ModalFit(ModalEstimate):
-    """Modal model fitted to one record.
+    """Modal model (poles and residues of each mode) fitted to one record.
 
     Attributes
     ----------
@@ -116,18 +116,20 @@ class ModalFit(ModalEstimate):
     ringing: Ringing
     span: NDArray[np.float64]
 
-    def cost_reduction_by_spectrum(self, columns: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return by how much each additional torque spectrum would reduce the cost, shape (c,).
+    def cost_reduction_by_spectrum(
+        self, torque_spectra: NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
+        """Return by how much each of c additional torque spectra would reduce the cost, shape (c,).
 
         Each spectrum is added to the fit alone, with a free amplitude; the cost is the sum of
         whitened squares.
 
         Parameters
         ----------
-        columns : ndarray of complex, shape (c, K)
+        torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra in N·m, not whitened.
         """
-        whitened = np.ascontiguousarray(columns * self.noise.weight).view(np.float64)
+        whitened = np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
         whitened -= (whitened @ self.span.T) @ self.span
         projections = whitened @ self.residual.view(np.float64)
         squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
@@ -142,17 +144,17 @@ class ModalFit(ModalEstimate):
     @property
     def visible(self) -> tuple[int, ...]:
         """Return the sorted numbers of the beam modes that are visible in the record."""
-        modes = zip(self.numbers, self.evidence, strict=True)
+        modes_with_evidence = zip(self.numbers, self.evidence, strict=True)
         return tuple(
             sorted(
-                number
-                for number, reduction in modes
-                if number and reduction > _MIN_VISIBLE_DEVIANCE_REDUCTION
+                mode_number
+                for mode_number, deviance_reduction in modes_with_evidence
+                if mode_number and deviance_reduction > _MIN_VISIBLE_DEVIANCE_REDUCTION
             )
         )
 
     def plant_with_modal_frequencies(self, plant: Plant) -> Plant:
-        """Return the plant with each visible mode's stiffness adjusted to its fitted frequency.
+        """Return the plant with stiffnesses adjusted to the frequencies of the visible modes.
 
         The given plant is returned unchanged if there is no such plant, if the visible modes are
         not modes 1 to n without a gap, or if the plant has a tip mass, a compliant clamp or a
@@ -163,11 +165,17 @@ class ModalFit(ModalEstimate):
         plant : Plant
             Plant with a bare beam.
         """
-        visible = self.visible
-        if not visible or any(plant.optional_parameters.values()) or len(visible) != visible[-1]:
+        visible_modes = self.visible
+        if (
+            not visible_modes
+            or any(plant.optional_parameters.values())
+            or len(visible_modes) != visible_modes[-1]
+        ):
             return plant
-        poles = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
-        frequency_hz = [poles[number].imag / (2 * math.pi) for number in visible]
+        poles_by_mode = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
+        frequency_hz = [
+            poles_by_mode[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
+        ]
         try:
             loaded_beam = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
         except ValueError:
@@ -183,7 +191,7 @@ def fit_modes(
     starts: Sequence[tuple[int, float, float]],
     columns: NDArray[np.complex128] | None = None,
 ) -> ModalFit | None:
-    """Fit the modal model to a record; return None if no mode is within the band or significant.
+    """Return the modal model fitted to a record; None if no mode is in the band or significant.
 
     Parameters
     ----------
@@ -196,20 +204,25 @@ def fit_modes(
     columns : ndarray of complex, shape (c, K), optional
         Torque spectra of known form and unknown amplitude, as for `Objective`.
     """
-    starts_in_band = [each for each in starts if each[1] <= comparison.frequency_hz[-1]]
+    starts_in_band = [
+        mode_start for mode_start in starts if mode_start[1] <= comparison.frequency_hz[-1]
+    ]
     if not starts_in_band:
         return None
     effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
     effect_spectra = effect_spectra if columns is None else columns
     lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
-    counts = noise.counts & (comparison.frequency_hz >= lowest_hz)
+    used_bins = noise.counts & (comparison.frequency_hz >= lowest_hz)
     search = _ModalSearch(
         comparison,
-        replace(noise, counts=counts),
+        replace(noise, counts=used_bins),
         effect_spectra,
-        tuple(number for number, _, _ in starts_in_band),
+        tuple(mode_number for mode_number, _, _ in starts_in_band),
         np.array(
-            [[math.log(2 * math.pi * hz), 2 * ratio] for _, hz, ratio in starts_in_band]
+            [
+                [math.log(2 * math.pi * hz), 2 * damping_ratio]
+                for _, hz, damping_ratio in starts_in_band
+            ]
         ).ravel(),
     )
     return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
@@ -229,66 +242,70 @@ class _ModalSearch:
     x: NDArray[np.float64]
 
     def problem(self) -> _ModalProblem:
-        """Return the least-squares problem of these modes under this noise estimate."""
+        """Return the least-squares problem of the modes of this search under its noise estimate."""
         return _ModalProblem(self.comparison, self.noise.weight, self.effect_spectra, self.numbers)
 
     def descend_to_minimum(self) -> _ModalSearch:
-        """Return the search at the minimum of the cost under the current noise estimate."""
-        low = np.column_stack(
-            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LEAST_ETA)]
+        """Return the search moved to the minimum of the cost under its noise estimate."""
+        lower_bounds = np.column_stack(
+            [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MIN_LOSS_FACTOR)]
         )
-        high = np.column_stack(
-            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _LARGEST_ETA)]
+        upper_bounds = np.column_stack(
+            [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MAX_LOSS_FACTOR)]
         )
         minimum = descend(
             self.problem().normal_equations,
             self.x,
-            Box(low.ravel(), high.ravel()),
+            Box(lower_bounds.ravel(), upper_bounds.ravel()),
             relative_tolerance=_RELATIVE_TOLERANCE,
             max_evaluations=60,
         )
         return replace(self, x=minimum.x)
 
     def converge_with_noise(self) -> _ModalSearch:
-        """Alternate descents with estimates of noise and unknown torque until they converge."""
+        """Return the search after descents, noise and unknown torque have converged together."""
         search = self
         for _ in range(_MAX_NOISE_ESTIMATES):
             search = search.descend_to_minimum()
             problem = search.problem()
-            model = problem.model(search.x)
-            residual = problem.residual(search.x, model)
-            comparison = search.comparison.renewed(model, search.noise).fill_unknown_torque(model)
-            power = smooth_power(residual, finely=True)
-            power = noise_power_with_peaks(residual, power, ~search.is_near_mode())
-            power /= comparison.measurement.known_torque_fraction
-            counts = search.noise.counts
-            change = np.abs(np.log(power / search.noise.power)[counts]).mean()
-            search = replace(
-                search, comparison=comparison, noise=replace(search.noise, power=power)
+            modal_model = problem.model(search.x)
+            residual_spectrum = problem.residual(search.x, modal_model)
+            comparison = search.comparison.renewed(modal_model, search.noise).fill_unknown_torque(
+                modal_model
             )
-            if change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
+            noise_power = smooth_power(residual_spectrum, finely=True)
+            noise_power = noise_power_with_peaks(
+                residual_spectrum, noise_power, ~search.is_near_mode()
+            )
+            noise_power /= comparison.measurement.known_torque_fraction
+            used_bins = search.noise.counts
+            mean_log_change = np.abs(np.log(noise_power / search.noise.power)[used_bins]).mean()
+            search = replace(
+                search, comparison=comparison, noise=replace(search.noise, power=noise_power)
+            )
+            if mean_log_change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
                 break
         return search.descend_to_minimum()
 
     def is_near_mode(self) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,)."""
         hz = self.comparison.frequency_hz[:, None]
-        frequencies, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
-        bins_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
+        mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
+        margin_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
         reach_hz = (
-            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * frequencies
-            + bins_hz
+            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * mode_hz
+            + margin_hz
         )
-        is_near: NDArray[np.bool_] = np.any(np.abs(hz - frequencies) < reach_hz, axis=1)
-        return is_near
+        near_mode_mask: NDArray[np.bool_] = np.any(np.abs(hz - mode_hz) < reach_hz, axis=1)
+        return near_mode_mask
 
     def cost(self) -> float:
-        """Return the sum of the squared whitened residual at the current point."""
+        """Return the cost at the current point: the sum of the squared whitened residual."""
         residual = self.problem().solution_at(self.x).residual
         return float(residual @ residual)
 
     def add_resonances(self) -> _ModalSearch:
-        """Add a resonance at the frequency where the residual depends on the motor angle.
+        """Return the search with a resonance added where the residual depends on the motor angle.
 
         A resonance is added only while it reduces the cost enough and overlaps with no mode.
         """
@@ -299,9 +316,9 @@ class _ModalSearch:
             )
             if not input_dependence.related:
                 break
-            start = [math.log(2 * math.pi * input_dependence.at_hz), 0.02]
+            resonance_start = [math.log(2 * math.pi * input_dependence.at_hz), 0.02]
             with_resonance = replace(
-                search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, start])
+                search, numbers=(*search.numbers, 0), x=np.concatenate([search.x, resonance_start])
             ).converge_with_noise()
             without_resonance = replace(
                 search, noise=with_resonance.noise, comparison=with_resonance.comparison
@@ -315,58 +332,68 @@ class _ModalSearch:
         return search
 
     def last_mode_overlaps(self) -> bool:
-        """Return whether the last mode lies within the width of another mode."""
-        frequencies = np.exp(self.x[::2])
-        half_widths = frequencies * self.x[1::2] / 2
+        """Return whether the frequency of the last mode is within the width of another mode."""
+        mode_rad_s = np.exp(self.x[::2])
+        half_widths = mode_rad_s * self.x[1::2] / 2
         least_distances = _MODE_REACH_HALF_WIDTHS * (half_widths[:-1] + half_widths[-1])
-        return bool(np.any(np.abs(frequencies[:-1] - frequencies[-1]) < least_distances))
+        return bool(np.any(np.abs(mode_rad_s[:-1] - mode_rad_s[-1]) < least_distances))
 
     def remove_unexcited_modes(self) -> _ModalSearch:
-        """Remove modes that hardly reduce the cost at first and lose their damping in a descent.
+        """Return the search without modes that the record does not excite.
+
+        They hardly reduce the cost at first, and lose their damping in a descent.
 
         Such a mode would fit a narrow line of the noise.
         """
         cost_increases = self.evidence()
         if cost_increases.min() >= _MIN_DEVIANCE_REDUCTION:
             return self
-        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _LEAST_ETA
+        is_undamped = self.descend_to_minimum().x[1::2] < 2 * _MIN_LOSS_FACTOR
         search = self
-        for index in np.flatnonzero((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)[
+        for mode_index in np.flatnonzero((cost_increases < _MIN_DEVIANCE_REDUCTION) & is_undamped)[
             ::-1
         ].tolist():
-            search = search._remove_mode(index)
+            search = search._remove_mode(mode_index)
         return search
 
-    def _remove_mode(self, index: int) -> _ModalSearch:
-        """Return the search without the mode at an index."""
-        numbers = self.numbers[:index] + self.numbers[index + 1 :]
-        return replace(self, numbers=numbers, x=np.delete(self.x, [2 * index, 2 * index + 1]))
+    def _remove_mode(self, mode_index: int) -> _ModalSearch:
+        """Return the search without the mode at `mode_index` in `remaining_numbers`."""
+        remaining_numbers = self.numbers[:mode_index] + self.numbers[mode_index + 1 :]
+        return replace(
+            self,
+            numbers=remaining_numbers,
+            x=np.delete(self.x, [2 * mode_index, 2 * mode_index + 1]),
+        )
 
     def evidence(self) -> NDArray[np.float64]:
-        """Return the cost increase if each mode alone is removed, with no new descent, (n,)."""
-        cost = self.cost()
-        return np.array([self._remove_mode(i).cost() - cost for i in range(len(self.numbers))])
+        """Return the cost increase by the removal of each mode alone, without a descent, (n,)."""
+        full_cost = self.cost()
+        return np.array([self._remove_mode(i).cost() - full_cost for i in range(len(self.numbers))])
 
-    def residual_dependence_on_angle(self, point: _LinearSolution) -> InputRelation:
-        """Test whether the residual at a point depends linearly on the motor angle."""
-        residual = point.residual.view(np.complex128)
-        angle = self.comparison.spectrum(self.comparison.angle_rad[self.comparison.retained])
-        is_used = self.noise.counts
-        first_used = int(np.argmax(is_used))
+    def residual_dependence_on_angle(self, solution: _LinearSolution) -> InputRelation:
+        """Return the result of a test whether the residual depends linearly on the motor angle."""
+        residual = solution.residual.view(np.complex128)
+        angle_spectrum = self.comparison.spectrum(
+            self.comparison.angle_rad[self.comparison.retained]
+        )
+        used_bins = self.noise.counts
+        first_used_bin = int(np.argmax(used_bins))
         return input_relation(
-            residual[first_used:], angle[first_used:], self.comparison.frequency_hz[first_used:]
+            residual[first_used_bin:],
+            angle_spectrum[first_used_bin:],
+            self.comparison.frequency_hz[first_used_bin:],
         )
 
     def fit(self) -> ModalFit | None:
-        """Return the fit after the removal of modes that do not reduce the cost enough.
+        """Return the modal fit after the removal of modes that do not reduce the cost enough.
 
         Return None if no mode remains. The removed modes are undetermined.
         """
-        order = np.argsort(self.x[::2])
+        frequency_order = np.argsort(self.x[::2])
         search = replace(
             self,
-            x=self.x.reshape(-1, 2)[order].ravel(),
-            numbers=tuple(self.numbers[i] for i in order),
+            x=self.x.reshape(-1, 2)[frequency_order].ravel(),
+            numbers=tuple(self.numbers[i] for i in frequency_order),
         )
         cost_increases = search.evidence()
         while cost_increases.size and cost_increases.min() < _MIN_DEVIANCE_REDUCTION:
@@ -376,52 +403,61 @@ class _ModalSearch:
             return None
         x, numbers = search.x, search.numbers
         problem = search.problem()
-        point = problem.solution_at(x)
-        joint_covariance = problem.covariance(point)
-        constants, covariance = problem.constants(point, x, joint_covariance)
-        residual = point.residual.view(np.complex128)
-        is_used = search.noise.counts
+        solution = problem.solution_at(x)
+        joint_covariance = problem.covariance(solution)
+        constants, covariance = problem.constants(solution, x, joint_covariance)
+        residual_spectrum = solution.residual.view(np.complex128)
+        used_bins = search.noise.counts
         return ModalFit(
             model=problem.model(x),
             numbers=numbers,
             constants=constants,
             joint_covariance=covariance,
             evidence=tuple(cost_increases.tolist()),
-            residual=residual,
+            residual=residual_spectrum,
             noise=search.noise,
-            whiteness=whiteness(residual[is_used], search.comparison.frequency_hz[is_used]),
-            input_relation=search.residual_dependence_on_angle(point),
-            ringing=problem.ringing(point, joint_covariance),
-            span=np.concatenate([point.span, _orthonormal_rows(point.jacobian)[0]]),
+            whiteness=whiteness(
+                residual_spectrum[used_bins], search.comparison.frequency_hz[used_bins]
+            ),
+            input_relation=search.residual_dependence_on_angle(solution),
+            ringing=problem.ringing(solution, joint_covariance),
+            span=np.concatenate([solution.span, _orthonormal_rows(solution.jacobian)[0]]),
         )
 
 
 def _scaled_gram(
     rows: NDArray[np.float64], regularization: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return rows scaled to length 1, their regularized Gram matrix and their former lengths."""
-    lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows))
-    lengths[lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-    scaled = rows / lengths[:, None]
-    gram = scaled @ scaled.T
+    """Return the rows of a matrix scaled to length 1, their Gram matrix and former lengths.
+
+    `regularization` is added to the diagonal of the Gram matrix.
+    """
+    row_lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    row_lengths[row_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
+    unit_rows = rows / row_lengths[:, None]
+    gram = unit_rows @ unit_rows.T
     gram[np.diag_indices_from(gram)] += regularization
-    return scaled, gram, lengths
+    return unit_rows, gram, row_lengths
 
 
 def _orthonormal_rows(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return orthonormal rows of the same span, and the matrix that restores the given rows."""
-    scaled, gram, lengths = _scaled_gram(rows, 1e-13)
-    factor = np.linalg.cholesky(gram)
-    return np.linalg.solve(factor, scaled), factor * lengths[:, None]
+    """Return orthonormal rows with the same span as given rows.
+
+    Return also the matrix whose product with them restores the given rows.
+    """
+    unit_rows, gram, row_lengths = _scaled_gram(rows, 1e-13)
+    triangular_factor = np.linalg.cholesky(gram)
+    return np.linalg.solve(triangular_factor, unit_rows), triangular_factor * row_lengths[:, None]
 
 
 @dataclass(frozen=True, slots=True)
 class _LinearSolution:
-    """Solution for the linear parameters at one point, with its whitened residual and derivatives.
+    """Best linear parameters of the modal model for one set of frequencies and damping.
 
-    `columns` are the whitened spectra that the linear parameters multiply, `span` is an orthonormal
-    basis of these, and `jacobian` the part of `full_jacobian` outside that span. Real and imaginary
-    parts are interleaved, so that rows have 2 K values.
+    The whitened `residual` and its derivatives are included. `columns` are the whitened spectra
+    that the linear parameters multiply, `span` is an orthonormal basis of these, and `jacobian` the
+    part of `full_jacobian` outside that span. Real and imaginary parts are interleaved, so that
+    rows have 2 K values.
     """
 
     residual: NDArray[np.float64]
@@ -432,13 +468,16 @@ class _LinearSolution:
     jacobian: NDArray[np.float64]
 
 
-def _unit_pole(eta: float) -> complex:
-    """Return the root of ``1 + eta q + q²`` with positive imaginary part."""
+def _relative_pole(eta: float) -> complex:
+    """Return the pole of a mode over its undamped frequency in rad/s, for the loss factor eta.
+
+    It is the root of ``1 + eta q + q²`` with positive imaginary part.
+    """
     return complex(-eta / 2, math.sqrt(1 - eta * eta / 4))
 
 
-def _unit_pole_derivative(eta: float) -> complex:
-    """Return the derivative, with respect to eta, of the upper root of ``1 + eta q + q²``."""
+def _relative_pole_derivative(eta: float) -> complex:
+    """Return the derivative of `_relative_pole` with respect to the loss factor eta."""
     return complex(-0.5, -eta / (4 * math.sqrt(1 - eta * eta / 4)))
 
 
@@ -462,10 +501,10 @@ class _ModalProblem:
         self._measured_torque = self._whiten(
             comparison.spectrum(comparison.torque_nm[comparison.retained])
         )
-        background = np.array(
+        background_responses = np.array(
             [(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND_COEFFICIENTS)]
         )
-        self._background = self._predicted_spectra(background)
+        self._background = self._predicted_spectra(background_responses)
 
     def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
@@ -477,192 +516,216 @@ class _ModalProblem:
         return self._whiten(comparison.spectrum(comparison.prediction.in_time(responses)))
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
-        """Return the poles of the modes at a point, with their derivatives by the point."""
+        """Return the poles of the modes, with their derivatives by frequencies and damping.
+
+        `x` is ``(ln omega_1, eta_1, ln omega_2, …)``.
+        """
         poles = []
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
-            omega, q = math.exp(log_omega), _unit_pole(eta)
-            derivative = np.zeros(x.size, dtype=np.complex128)
-            derivative[2 * k] = omega * q
-            derivative[2 * k + 1] = omega * _unit_pole_derivative(eta)
-            poles.append(Pole(self._numbers[k], omega * q, derivative))
+            omega_rad_s, q = math.exp(log_omega), _relative_pole(eta)
+            pole_derivative = np.zeros(x.size, dtype=np.complex128)
+            pole_derivative[2 * k] = omega_rad_s * q
+            pole_derivative[2 * k + 1] = omega_rad_s * _relative_pole_derivative(eta)
+            poles.append(Pole(self._numbers[k], omega_rad_s * q, pole_derivative))
         return poles
 
     def _nuisance_spectra(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return the spectra of all effects of unknown amplitude, not whitened, shape (m, K)."""
+        """Return the torque spectra of all disturbances and effects of unknown amplitude, (m, K).
+
+        They are not whitened.
+        """
         return np.concatenate([self._comparison.nuisance_spectra(poles), self._effect_spectra])
 
     def _drag_change(self, poles: Sequence[Pole]) -> NDArray[np.complex128]:
-        """Return how the drag torque changes with the poles, and its derivatives, shape (1 + k, K).
+        """Return the change of the air-drag torque with the poles, and its derivatives, (1 + k, K).
 
         Row 0 is the change of the spectrum relative to the plant for which the drag was computed.
         """
-        total = np.zeros((1 + 2 * len(poles), self._weight.size), dtype=np.complex128)
-        drag = self._comparison.drag
-        if drag is None:
-            return total
+        change_and_derivatives = np.zeros(
+            (1 + 2 * len(poles), self._weight.size), dtype=np.complex128
+        )
+        drag_expansion = self._comparison.drag
+        if drag_expansion is None:
+            return change_and_derivatives
         reference_poles = {
-            pole.mode: pole.at_rad_s for pole in mode_poles(drag.plant, len(drag.by_pole), ())
+            pole.mode: pole.at_rad_s
+            for pole in mode_poles(drag_expansion.plant, len(drag_expansion.by_pole), ())
         }
         for pole in poles:
-            if pole.mode in drag.by_pole and pole.mode in reference_poles:
-                by_real, by_imaginary = drag.by_pole[pole.mode]
-                difference = pole.at_rad_s - reference_poles[pole.mode]
-                total[0] += difference.real * by_real + difference.imag * by_imaginary
-                total[1:] += np.outer(pole.derivative.real, by_real)
-                total[1:] += np.outer(pole.derivative.imag, by_imaginary)
-        return total
+            if pole.mode in drag_expansion.by_pole and pole.mode in reference_poles:
+                by_real, by_imaginary = drag_expansion.by_pole[pole.mode]
+                pole_difference = pole.at_rad_s - reference_poles[pole.mode]
+                change_and_derivatives[0] += (
+                    pole_difference.real * by_real + pole_difference.imag * by_imaginary
+                )
+                change_and_derivatives[1:] += np.outer(pole.derivative.real, by_real)
+                change_and_derivatives[1:] += np.outer(pole.derivative.imag, by_imaginary)
+        return change_and_derivatives
 
     def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
-        """Solve for the linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
+        """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
         The solutions at the last two points are cached.
         """
         return self._recent.at(x, self._solve_at)
 
     def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
-        """Solve for the linear parameters at a point, without the cache."""
-        modes = x.reshape(-1, 2)
-        rows: list[NDArray[np.complex128]] = []
+        """Return the best linear parameters at a point `x`, computed without the cache."""
+        mode_points = x.reshape(-1, 2)
+        response_rows: list[NDArray[np.complex128]] = []
         derivative_rows: list[NDArray[np.complex128]] = []
-        for log_omega, eta in modes:
-            omega = math.exp(log_omega)
-            q = self._s / omega
+        for log_omega, eta in mode_points:
+            omega_rad_s = math.exp(log_omega)
+            q = self._s / omega_rad_s
             inverse_denominator = 1 / (1 + eta * q + q * q)
             numerators = (q * q * inverse_denominator, q**3 * inverse_denominator)
-            rows += numerators
+            response_rows += numerators
             # Derivatives by ln omega and eta of either numerator over the denominator
-            for power, row in zip((2, 3), numerators, strict=True):
-                derivative_rows.append(row * ((eta * q + 2 * q * q) * inverse_denominator - power))
+            for numerator_power, row in zip((2, 3), numerators, strict=True):
+                derivative_rows.append(
+                    row * ((eta * q + 2 * q * q) * inverse_denominator - numerator_power)
+                )
                 derivative_rows.append(-row * q * inverse_denominator)
-        numerator_count = len(rows)
+        numerator_count = len(response_rows)
         spectra = self._predicted_spectra(
-            np.array(rows + derivative_rows).reshape(-1, self._s.size)
+            np.array(response_rows + derivative_rows).reshape(-1, self._s.size)
         )
         poles = self._poles(x)
         nuisance_spectra = self._whiten(self._nuisance_spectra(poles))
-        drag, *drag_jacobian = self._whiten(self._drag_change(poles))
-        columns = np.concatenate([spectra[:numerator_count], self._background, nuisance_spectra])
-        span, factor = _orthonormal_rows(columns)
-        measured_torque = self._measured_torque - drag
+        drag_spectrum, *drag_jacobian = self._whiten(self._drag_change(poles))
+        linear_spectra = np.concatenate(
+            [spectra[:numerator_count], self._background, nuisance_spectra]
+        )
+        span, triangular_factor = _orthonormal_rows(linear_spectra)
+        measured_torque = self._measured_torque - drag_spectrum
         projections = span @ measured_torque
         residual = projections @ span - measured_torque
-        linear_parameters = np.linalg.solve(factor.T, projections)
+        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
         nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND_COEFFICIENTS :]
         jacobian = np.array(drag_jacobian).reshape(x.size, residual.size)
         if poles:
             jacobian += self._whiten(self._comparison.decay_gradient(poles, nuisance_amplitudes))
-        for k in range(len(modes)):
+        for k in range(len(mode_points)):
             a, b = linear_parameters[2 * k : 2 * k + 2]
             mode_derivatives = spectra[numerator_count + 4 * k : numerator_count + 4 * k + 4]
             jacobian[2 * k] += a * mode_derivatives[0] + b * mode_derivatives[2]
             jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
         projected_jacobian = jacobian - (jacobian @ span.T) @ span
         return _LinearSolution(
-            residual, linear_parameters, columns, span, jacobian, projected_jacobian
+            residual, linear_parameters, linear_spectra, span, jacobian, projected_jacobian
         )
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
-        """Return the modal model at a point, with the best linear parameters."""
+        """Return the modal model with given frequencies and damping `x` and the best residues."""
         linear_parameters = self.solution_at(x).linear_parameters
-        modes = x.reshape(-1, 2)
+        mode_points = x.reshape(-1, 2)
         poles, residues = [], []
-        first_background = 2 * len(modes)
-        background = linear_parameters[
-            first_background : first_background + BACKGROUND_COEFFICIENTS
+        background_start = 2 * len(mode_points)
+        background_coefficients = linear_parameters[
+            background_start : background_start + BACKGROUND_COEFFICIENTS
         ] / self.scale_rad_s ** np.arange(BACKGROUND_COEFFICIENTS)
-        for k, (log_omega, eta) in enumerate(modes):
-            omega, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
-            q = _unit_pole(eta)
-            poles.append(omega * q)
-            residues.append(omega * (a + b * q) * q * q / (2j * q.imag))
+        for k, (log_omega, eta) in enumerate(mode_points):
+            omega_rad_s, (a, b) = math.exp(log_omega), linear_parameters[2 * k : 2 * k + 2]
+            q = _relative_pole(eta)
+            poles.append(omega_rad_s * q)
+            residues.append(omega_rad_s * (a + b * q) * q * q / (2j * q.imag))
             # Add the polynomial part of (a + b q) q² over the denominator.
-            background[0] += a - b * eta
-            background[1] += b / omega
-        return ModalModel(tuple(poles), tuple(residues), tuple(background.tolist()))
+            background_coefficients[0] += a - b * eta
+            background_coefficients[1] += b / omega_rad_s
+        return ModalModel(tuple(poles), tuple(residues), tuple(background_coefficients.tolist()))
 
     def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
         """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
-        first_nuisance = 2 * len(self._numbers) + BACKGROUND_COEFFICIENTS
-        amplitudes = self.solution_at(x).linear_parameters[first_nuisance:]
+        nuisance_start = 2 * len(self._numbers) + BACKGROUND_COEFFICIENTS
+        nuisance_amplitudes = self.solution_at(x).linear_parameters[nuisance_start:]
         poles = self._poles(x)
         comparison = self._comparison
-        torque = comparison.prediction.torque(model)[0]
-        modal_residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
+        predicted_nm = comparison.prediction.torque(model)[0]
+        modal_residual = comparison.spectrum(
+            predicted_nm - comparison.torque_nm[comparison.retained]
+        )
         drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
-        return drag_change + modal_residual + amplitudes @ self._nuisance_spectra(poles)
+        return drag_change + modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
-    def covariance(self, point: _LinearSolution) -> NDArray[np.float64]:
-        """Return the joint covariance of the point and the linear parameters."""
-        _, gram, lengths = _scaled_gram(np.concatenate([point.full_jacobian, point.columns]), 1e-14)
-        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(lengths, lengths)
+    def covariance(self, solution: _LinearSolution) -> NDArray[np.float64]:
+        """Return the joint covariance of frequencies, damping and the linear parameters."""
+        _, gram, row_lengths = _scaled_gram(
+            np.concatenate([solution.full_jacobian, solution.columns]), 1e-14
+        )
+        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
         return covariance
 
-    def ringing(self, point: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
-        """Return the free decay at the beginning of the record, with its chi-square.
+    def ringing(self, solution: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
+        """Return amplitudes and chi-square of the free decay at the beginning of the record.
 
         The decay of each mode has two amplitudes, which are free linear parameters of the fit.
         """
         mode_count = len(self._numbers)
-        first_decay = 2 * mode_count + BACKGROUND_COEFFICIENTS
-        amplitudes = point.linear_parameters[first_decay : first_decay + 2 * mode_count]
-        rows = slice(2 * mode_count + first_decay, 2 * mode_count + first_decay + 2 * mode_count)
+        decay_start = 2 * mode_count + BACKGROUND_COEFFICIENTS
+        decay_amplitudes = solution.linear_parameters[decay_start : decay_start + 2 * mode_count]
+        decay_rows = slice(
+            2 * mode_count + decay_start, 2 * mode_count + decay_start + 2 * mode_count
+        )
         return Ringing(
-            amplitude_nm=tuple(np.hypot(amplitudes[::2], amplitudes[1::2]).tolist()),
-            chi_square=float(amplitudes @ np.linalg.solve(covariance[rows, rows], amplitudes)),
-            degrees_of_freedom=amplitudes.size,
+            amplitude_nm=tuple(np.hypot(decay_amplitudes[::2], decay_amplitudes[1::2]).tolist()),
+            chi_square=float(
+                decay_amplitudes
+                @ np.linalg.solve(covariance[decay_rows, decay_rows], decay_amplitudes)
+            ),
+            degrees_of_freedom=decay_amplitudes.size,
         )
 
     def constants(
-        self, point: _LinearSolution, x: NDArray[np.float64], covariance: NDArray[np.float64]
+        self, solution: _LinearSolution, x: NDArray[np.float64], covariance: NDArray[np.float64]
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the constants of all modes, and their joint covariance with the background.
+        """Return the constants of all modes, and their covariance with the background coefficients.
 
         The constants are `MODE_CONSTANT_NAMES`. The shapes are (4 n,) and (4 n + 5, 4 n + 5).
         """
         mode_count = x.size // 2
-        constants = np.empty(4 * mode_count)
-        first_background = x.size + 2 * mode_count
+        mode_constants = np.empty(4 * mode_count)
+        background_start = x.size + 2 * mode_count
         derivatives = np.zeros(
-            (4 * mode_count + BACKGROUND_COEFFICIENTS, first_background + BACKGROUND_COEFFICIENTS)
+            (4 * mode_count + BACKGROUND_COEFFICIENTS, background_start + BACKGROUND_COEFFICIENTS)
         )
         background_rows = derivatives[4 * mode_count :]
-        background_rows[:, first_background:] = np.diag(
+        background_rows[:, background_start:] = np.diag(
             self.scale_rad_s ** -np.arange(float(BACKGROUND_COEFFICIENTS))
         )
         for k in range(mode_count):
             log_omega, eta = x[2 * k : 2 * k + 2]
-            a, b = point.linear_parameters[2 * k : 2 * k + 2]
-            q = _unit_pole(eta)
-            numerator = a + b * q
+            a, b = solution.linear_parameters[2 * k : 2 * k + 2]
+            q = _relative_pole(eta)
+            residue_numerator = a + b * q
             # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi
-            log_residue = np.log(-numerator * q * q / (2 * q.imag)) + log_omega
-            pole_derivative = _unit_pole_derivative(eta)
+            log_residue = np.log(-residue_numerator * q * q / (2 * q.imag)) + log_omega
+            pole_derivative = _relative_pole_derivative(eta)
             residue_by_eta = (
-                b / numerator + 2 / q
+                b / residue_numerator + 2 / q
             ) * pole_derivative - pole_derivative.imag / q.imag
-            residue_by_a, residue_by_b = 1 / numerator, q / numerator
-            constants[4 * k : 4 * k + 4] = (
+            residue_by_a, residue_by_b = 1 / residue_numerator, q / residue_numerator
+            mode_constants[4 * k : 4 * k + 4] = (
                 log_omega + math.log(q.imag / (2 * math.pi)),
                 math.log(eta / 2),
                 log_residue.real,
                 log_residue.imag,
             )
-            rows = derivatives[4 * k : 4 * k + 4]
+            mode_rows = derivatives[4 * k : 4 * k + 4]
             omega_index, eta_index, a_index, b_index = (
                 2 * k,
                 2 * k + 1,
                 x.size + 2 * k,
                 x.size + 2 * k + 1,
             )
-            rows[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
-            rows[1, eta_index] = 1 / eta
-            rows[2, [omega_index, eta_index, a_index, b_index]] = (
+            mode_rows[0, [omega_index, eta_index]] = 1.0, pole_derivative.imag / q.imag
+            mode_rows[1, eta_index] = 1 / eta
+            mode_rows[2, [omega_index, eta_index, a_index, b_index]] = (
                 1.0,
                 residue_by_eta.real,
                 residue_by_a.real,
                 residue_by_b.real,
             )
-            rows[3, [eta_index, a_index, b_index]] = (
+            mode_rows[3, [eta_index, a_index, b_index]] = (
                 residue_by_eta.imag,
                 residue_by_a.imag,
                 residue_by_b.imag,
@@ -671,13 +734,13 @@ class _ModalProblem:
             background_rows[0, [a_index, b_index, eta_index]] = 1.0, -eta, -b
             background_rows[1, [b_index, omega_index]] = np.array([1.0, -b]) / math.exp(log_omega)
         used_covariance = covariance[: derivatives.shape[1], : derivatives.shape[1]]
-        return constants, derivatives @ used_covariance @ derivatives.T
+        return mode_constants, derivatives @ used_covariance @ derivatives.T
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
-        """Return the normal equations at a point for the descent, with Kaufman's Jacobian."""
-        point = self.solution_at(x)
+        """Return cost, gradient and Hessian at a point `x`, with Kaufman's Jacobian."""
+        solution = self.solution_at(x)
         return NormalEquations(
-            cost=float(point.residual @ point.residual),
-            gradient=point.jacobian @ point.residual,
-            hessian=point.jacobian @ point.jacobian.T,
+            cost=float(solution.residual @ solution.residual),
+            gradient=solution.jacobian @ solution.residual,
+            hessian=solution.jacobian @ solution.jacobian.T,
         )

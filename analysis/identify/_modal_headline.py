@@ -52,7 +52,7 @@ geometry. External damping is among them: it is relative to the inertia of each 
 
 
 def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
-    """Return the reason why values of a uniform beam are invalid; None if they may be valid."""
+    """Return why the values for a uniform beam are invalid; None if they may be valid."""
     if test.status != "refused":
         return None
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
@@ -72,7 +72,7 @@ def replace_by_modal_model(
     *,
     half_width: float = NORMAL_95,
 ) -> _EstimatesT:
-    """Replace the estimates for an exactly uniform beam by those of more general models.
+    """Return the estimates with those of an exactly uniform beam replaced by more general ones.
 
     Modes come from the modal model. Parameters come from the beam with a tolerance of the geometry.
 
@@ -104,14 +104,15 @@ def replace_by_modal_model(
         estimates,
         parameters={
             **{
-                name: quantity
-                for name, quantity in exact_estimates.parameters.items()
-                if name not in PARAMETERS
+                parameter_name: parameter_value
+                for parameter_name, parameter_value in exact_estimates.parameters.items()
+                if parameter_name not in PARAMETERS
             },
             **_reported_parameters(tolerant, doubt, refused=refusal is not None),
         },
         sizes=tuple(
-            each.flagged(doubt) for each in loss_factors_with_geometry_tolerance(test, tolerant)
+            loss_factor_found.flagged(doubt)
+            for loss_factor_found in loss_factors_with_geometry_tolerance(test, tolerant)
         ),
         structures=_structure_status(exact_estimates, tolerant),
         simpler=None,
@@ -141,12 +142,14 @@ def _reported_modes(
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
     visible = modal.visible
-    modes: dict[int, ReportedMode] = {mode.number: mode for mode in estimates.modes}
-    for number in visible:
-        modal_mode = modal.mode(number)
-        inertia, relative_std = modal.inertia(number)
-        mode = ReportedMode(
-            number,
+    modes_by_number: dict[int, ReportedMode] = {
+        mode_estimate.number: mode_estimate for mode_estimate in estimates.modes
+    }
+    for mode_number in visible:
+        modal_mode = modal.mode(mode_number)
+        inertia_kg_m2, relative_std = modal.inertia(mode_number)
+        mode_estimate = ReportedMode(
+            mode_number,
             symmetric_value(
                 modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width
             ),
@@ -155,15 +158,19 @@ def _reported_modes(
             ),
             shown=True,
             source="modal",
-            participation=symmetric_value(inertia, inertia * relative_std, doubt, half_width),
+            participation=symmetric_value(
+                inertia_kg_m2, inertia_kg_m2 * relative_std, doubt, half_width
+            ),
         )
-        if from_beam and number in modes:
-            beam_mode = modes[number]
-            mode = replace(beam_mode, shown=True, participation=mode.participation)
-        modes[number] = mode
+        if from_beam and mode_number in modes_by_number:
+            beam_mode = modes_by_number[mode_number]
+            mode_estimate = replace(
+                beam_mode, shown=True, participation=mode_estimate.participation
+            )
+        modes_by_number[mode_number] = mode_estimate
     return tuple(
-        each if each.number in visible else replace(each, shown=False)
-        for _, each in sorted(modes.items())
+        reported_mode if reported_mode.number in visible else replace(reported_mode, shown=False)
+        for _, reported_mode in sorted(modes_by_number.items())
     )
 
 
@@ -177,56 +184,58 @@ def _reported_parameters(
     by far more than the tolerance.
     """
     return {
-        name: ReportedValue(
-            estimate.values[name],
-            estimate.std[name],
-            estimate.interval[name],
+        parameter_name: ReportedValue(
+            estimate.values[parameter_name],
+            estimate.std[parameter_name],
+            estimate.interval[parameter_name],
             doubt
-            or effective_reason(name, refused=refused)
-            or _reason_undetermined(estimate, name),
+            or effective_reason(parameter_name, refused=refused)
+            or _reason_undetermined(estimate, parameter_name),
         )
-        for name in PARAMETERS
+        for parameter_name in PARAMETERS
     }
 
 
-def _reason_undetermined(estimate: TolerantEstimate, name: str) -> str | None:
-    """Return the reason why the modes do not determine a parameter; None if they do."""
+def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str | None:
+    """Return the reason why the modes do not determine a beam or damping parameter, or None."""
     if estimate.basis == "none":
         return NO_ORDER
-    for order, coefficient in COEFFICIENT_OF.items():
-        if name in (order, coefficient) and not identifiable(estimate, order):
+    for order_name, coefficient_name in COEFFICIENT_OF.items():
+        if parameter_name in (order_name, coefficient_name) and not identifiable(
+            estimate, order_name
+        ):
             return ORDER_NOT_DETERMINED_REASON
     return None
 
 
-def identifiable(estimate: TolerantEstimate, order: str) -> bool:
+def identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
     """Return whether the modes determine a damping order.
 
     Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
     """
-    low, high = estimate.interval[order]
-    widest = MAX_IDENTIFIABLE_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
-    is_significant = estimate.deviance_without_damping[COEFFICIENT_OF[order]] > NORMAL_95**2
-    return high - low <= widest and is_significant
+    order_low, order_high = estimate.interval[order_name]
+    widest_interval = MAX_IDENTIFIABLE_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
+    is_significant = estimate.deviance_without_damping[COEFFICIENT_OF[order_name]] > NORMAL_95**2
+    return order_high - order_low <= widest_interval and is_significant
 
 
 def _structure_status(
     exact: Estimates, estimate: TolerantEstimate
 ) -> tuple[tuple[str, StructureStatus], ...]:
-    """Return the name and status of each damping structure, assessed by the losses of the modes.
+    """Return names and statuses of the damping structures, assessed by the modes' losses.
 
     Mode frequencies do not distinguish structures if the beam may deviate from a uniform one.
     """
 
-    def status_of(name: str, exact_status: StructureStatus) -> StructureStatus:
+    def status_of(structure_name: str, exact_status: StructureStatus) -> StructureStatus:
         if exact_status == "selected":
             return exact_status
-        structure = STRUCTURES[name.partition(",")[0]]
-        for order, coefficient in COEFFICIENT_OF.items():
-            if not structure.has(coefficient):
-                deviance_rise = estimate.deviance_without_damping[coefficient]
-            elif structure.fixed.get(order) == 1.0:  # type: ignore[call-overload]
-                deviance_rise = estimate.deviance_of_order_one[order]
+        structure = STRUCTURES[structure_name.partition(",")[0]]
+        for order_name, coefficient_name in COEFFICIENT_OF.items():
+            if not structure.has(coefficient_name):
+                deviance_rise = estimate.deviance_without_damping[coefficient_name]
+            elif structure.fixed.get(order_name) == 1.0:  # type: ignore[call-overload]
+                deviance_rise = estimate.deviance_of_order_one[order_name]
             else:
                 continue
             if deviance_rise > EXCLUSION_DEVIANCES[0]:
@@ -239,7 +248,7 @@ def _structure_status(
 def loss_factors_with_geometry_tolerance(
     test: UniformBeamTest, estimate: TolerantEstimate
 ) -> tuple[ReportedLossFactor, ...]:
-    """Return the loss factors at the frequencies where they depend least on their orders.
+    """Return the beam's loss factors, each at the frequency where it depends least on its order.
 
     The loss factor of external damping is relative to the inertia, which is an effective value if
     the test refuses a uniform beam.
@@ -251,32 +260,37 @@ def loss_factors_with_geometry_tolerance(
     estimate : TolerantEstimate
         Parameters of a beam with a tolerance of the geometry.
     """
-    values = dict(estimate.values)
-    reported = []
-    for damping, (coefficient, order) in DAMPING_PARAMETER_NAMES.items():
+    parameter_values = dict(estimate.values)
+    reported_factors = []
+    for damping, (coefficient_name, order_name) in DAMPING_PARAMETER_NAMES.items():
         loss_factor = damping_size(
-            coefficient, order, values, PARAMETERS, estimate.covariance, estimate.first_rad_s
+            coefficient_name,
+            order_name,
+            parameter_values,
+            PARAMETERS,
+            estimate.covariance,
+            estimate.first_rad_s,
         )
         if loss_factor is None:
             continue
-        flag = NO_ORDER if estimate.basis == "none" else None
+        flag_reason = NO_ORDER if estimate.basis == "none" else None
         if damping == "external" and test.status == "refused":
-            flag = flag or NOT_UNIFORM
-        reported.append(reported_loss_factor(damping, loss_factor, flag))
-    return tuple(reported)
+            flag_reason = flag_reason or NOT_UNIFORM
+        reported_factors.append(reported_loss_factor(damping, loss_factor, flag_reason))
+    return tuple(reported_factors)
 
 
-def effective_reason(name: str, *, refused: bool) -> str | None:
+def effective_reason(parameter_name: str, *, refused: bool) -> str | None:
     """Return why a parameter is only an effective value; None if it is a property of the beam.
 
     Parameters
     ----------
-    name : str
+    parameter_name : str
         Name of the parameter.
     refused : bool
         Whether the test refused a uniform beam.
     """
-    return NOT_UNIFORM if refused and name in _EFFECTIVE_PARAMETERS else None
+    return NOT_UNIFORM if refused and parameter_name in _EFFECTIVE_PARAMETERS else None
 
 
 def order_verdict_with_geometry_tolerance(
@@ -296,11 +310,11 @@ def order_verdict_with_geometry_tolerance(
     status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
     if reason is not None:
         return OrderVerdict(order, status, None, None, reason, profile)
-    value, interval = estimate.values[order], estimate.interval[order]
+    order_value, order_interval = estimate.values[order], estimate.interval[order]
     doubt = doubt or effective_reason(order, refused=refused)
     if doubt is not None:
-        return OrderVerdict(order, "open", value, interval, doubt, profile)
-    return OrderVerdict(order, status, value, interval, None, profile)
+        return OrderVerdict(order, "open", order_value, order_interval, doubt, profile)
+    return OrderVerdict(order, status, order_value, order_interval, None, profile)
 
 
 def order_status_with_geometry_tolerance(
@@ -321,8 +335,8 @@ def order_status_with_geometry_tolerance(
         return "not identifiable", NO_ORDER
     if not identifiable(estimate, order):
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
-    low, high = estimate.interval[order]
-    if low <= 1 <= high:
+    order_low, order_high = estimate.interval[order]
+    if order_low <= 1 <= order_high:
         return "compatible", None
     is_fractional = estimate.deviance_of_order_one[order] > EXCLUSION_DEVIANCES[0] and not refused
     return ("fractional" if is_fractional else "open"), None

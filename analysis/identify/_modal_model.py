@@ -57,20 +57,20 @@ class ModalModel:
     background: tuple[float, ...]
 
     def response(self, s: NDArray[np.complexfloating[Any, Any]]) -> NDArray[np.complex128]:
-        """Return the transfer function G in N·m/rad, of the shape of `s`.
+        """Return the transfer function from motor angle to torque in N·m/rad, of the shape of `s`.
 
         Parameters
         ----------
         s : ndarray of complex
             Laplace variable in rad/s.
         """
-        total: NDArray[np.complex128] = np.polynomial.polynomial.polyval(
+        total_response: NDArray[np.complex128] = np.polynomial.polynomial.polyval(
             s, np.array(self.background, dtype=np.complex128)
         )
         for pole, residue in zip(self.poles_rad_s, self.residues, strict=True):
-            total = total + residue / (s - pole)
-            total += residue.conjugate() / (s - pole.conjugate())
-        return total
+            total_response = total_response + residue / (s - pole)
+            total_response += residue.conjugate() / (s - pole.conjugate())
+        return total_response
 
     @property
     def frequencies_hz(self) -> tuple[float, ...]:
@@ -94,7 +94,7 @@ class ModalModel:
         )
 
     def as_json(self) -> dict[str, Any]:
-        """Return poles, residues and background as a dictionary for `json.dumps`."""
+        """Return poles, residues and background of the model as a dictionary for `json.dumps`."""
         return {
             "poles_rad_s": [[pole.real, pole.imag] for pole in self.poles_rad_s],
             "residues": [[residue.real, residue.imag] for residue in self.residues],
@@ -105,7 +105,7 @@ class ModalModel:
     def of_constants(
         cls, constants: NDArray[np.float64], background: Sequence[float]
     ) -> ModalModel:
-        """Return the modal model with given constants.
+        """Return the modal model with given mode constants and background coefficients.
 
         Parameters
         ----------
@@ -114,28 +114,31 @@ class ModalModel:
         background : sequence of float
             Coefficients b0 to b4 of the background.
         """
-        rows = constants.reshape(-1, len(MODE_CONSTANT_NAMES)).tolist()
+        mode_constants = constants.reshape(-1, len(MODE_CONSTANT_NAMES)).tolist()
         poles, residues = [], []
-        for ln_frequency, ln_ratio, ln_residue, phase_rad in rows:
-            ratio = math.exp(ln_ratio)
+        for ln_frequency, ln_damping_ratio, ln_residue, phase_rad in mode_constants:
+            damping_ratio = math.exp(ln_damping_ratio)
             damped_rad_s = 2 * math.pi * math.exp(ln_frequency)
-            poles.append(damped_rad_s * complex(-ratio / math.sqrt(1 - ratio * ratio), 1.0))
+            poles.append(
+                damped_rad_s
+                * complex(-damping_ratio / math.sqrt(1 - damping_ratio * damping_ratio), 1.0)
+            )
             residues.append(1j * cmath.rect(math.exp(ln_residue), phase_rad))
         return cls(tuple(poles), tuple(residues), tuple(background))
 
     @classmethod
-    def from_json(cls, content: Mapping[str, Any]) -> ModalModel:
-        """Return the modal model from the content of a JSON document.
+    def from_json(cls, json_content: Mapping[str, Any]) -> ModalModel:
+        """Return the modal model that `as_json` wrote to a JSON document.
 
         Parameters
         ----------
-        content : mapping
+        json_content : mapping
             Result of `as_json`.
         """
         return cls(
-            tuple(complex(*pair) for pair in content["poles_rad_s"]),
-            tuple(complex(*pair) for pair in content["residues"]),
-            tuple(float(value) for value in content["background"]),
+            tuple(complex(*number_pair) for number_pair in json_content["poles_rad_s"]),
+            tuple(complex(*number_pair) for number_pair in json_content["residues"]),
+            tuple(float(coefficient) for coefficient in json_content["background"]),
         )
 
 
@@ -171,84 +174,98 @@ class ModalEstimate:
         """Return the numbers of the beam modes that are visible in the data, in ascending order."""
         return tuple(sorted(number for number in self.numbers if number))
 
-    def rows(self, numbers: Sequence[int]) -> NDArray[np.intp]:
+    def rows(self, mode_numbers: Sequence[int]) -> NDArray[np.intp]:
         """Return the indices of the constants of some modes in `constants`, shape (4 m,).
 
         Parameters
         ----------
-        numbers : sequence of int
+        mode_numbers : sequence of int
             Numbers of m modes.
         """
         mode_indices = np.arange(len(MODE_CONSTANT_NAMES))
-        indices = [
-            mode_indices + mode_indices.size * self.numbers.index(number) for number in numbers
+        constant_indices = [
+            mode_indices + mode_indices.size * self.numbers.index(mode_number)
+            for mode_number in mode_numbers
         ]
-        return np.concatenate(indices) if indices else np.zeros(0, dtype=np.intp)
+        return np.concatenate(constant_indices) if constant_indices else np.zeros(0, dtype=np.intp)
 
-    def mode(self, number: int) -> ModeEstimate:
-        """Return frequency and damping ratio of a mode, with their standard deviations.
+    def mode(self, mode_number: int) -> ModeEstimate:
+        """Return frequency (Hz) and damping ratio of a mode, with their standard deviations.
 
         Parameters
         ----------
-        number : int
+        mode_number : int
             Number of the mode.
         """
-        rows = self.rows([number])[:2]
-        frequency_hz, ratio = np.exp(self.constants[rows]).tolist()
+        constant_indices = self.rows([mode_number])[:2]
+        frequency_hz, damping_ratio = np.exp(self.constants[constant_indices]).tolist()
         relative_frequency_std, relative_ratio_std = np.sqrt(
-            np.diag(self.covariance)[rows]
+            np.diag(self.covariance)[constant_indices]
         ).tolist()
         return ModeEstimate(
-            number,
+            mode_number,
             frequency_hz,
             frequency_hz * relative_frequency_std,
-            ratio,
-            ratio * relative_ratio_std,
+            damping_ratio,
+            damping_ratio * relative_ratio_std,
         )
 
-    def inertia(self, number: int) -> tuple[float, float]:
+    def inertia(self, mode_number: int) -> tuple[float, float]:
         """Return the effective inertia of a mode in kg·m², and its relative standard deviation.
 
         Parameters
         ----------
-        number : int
+        mode_number : int
             Number of the mode.
         """
-        rows = self.rows([number])
+        constant_indices = self.rows([mode_number])
         # The logarithm of the inertia is ln_residue - 3 ln_frequency, plus a constant.
-        weights = np.zeros(len(MODE_CONSTANT_NAMES))
-        weights[MODE_CONSTANT_NAMES.index("ln_frequency")] = -3.0
-        weights[MODE_CONSTANT_NAMES.index("ln_residue")] = 1.0
-        relative_std = math.sqrt(float(weights @ self.covariance[np.ix_(rows, rows)] @ weights))
-        return self.model.effective_inertias_kg_m2[self.numbers.index(number)], relative_std
+        constant_weights = np.zeros(len(MODE_CONSTANT_NAMES))
+        constant_weights[MODE_CONSTANT_NAMES.index("ln_frequency")] = -3.0
+        constant_weights[MODE_CONSTANT_NAMES.index("ln_residue")] = 1.0
+        relative_std = math.sqrt(
+            float(
+                constant_weights
+                @ self.covariance[np.ix_(constant_indices, constant_indices)]
+                @ constant_weights
+            )
+        )
+        return self.model.effective_inertias_kg_m2[self.numbers.index(mode_number)], relative_std
 
     def restrict_to_visible_modes(self) -> ModalEstimate:
         """Return the modal model restricted to the visible modes, with the same background."""
-        rows, indices = self.rows(self.visible), [self.numbers.index(n) for n in self.visible]
-        joint_rows = np.concatenate(
-            [rows, self.constants.size + np.arange(BACKGROUND_COEFFICIENTS)]
+        constant_indices, mode_indices = (
+            self.rows(self.visible),
+            [self.numbers.index(n) for n in self.visible],
+        )
+        joint_indices = np.concatenate(
+            [constant_indices, self.constants.size + np.arange(BACKGROUND_COEFFICIENTS)]
         )
         return ModalEstimate(
             ModalModel(
-                tuple(self.model.poles_rad_s[index] for index in indices),
-                tuple(self.model.residues[index] for index in indices),
+                tuple(self.model.poles_rad_s[mode_index] for mode_index in mode_indices),
+                tuple(self.model.residues[mode_index] for mode_index in mode_indices),
                 self.model.background,
             ),
             self.visible,
-            self.constants[rows],
-            self.joint_covariance[np.ix_(joint_rows, joint_rows)],
+            self.constants[constant_indices],
+            self.joint_covariance[np.ix_(joint_indices, joint_indices)],
         )
 
     def as_json(self) -> dict[str, Any]:
         """Return model, mode numbers and covariance as a dictionary for `json.dumps`."""
-        names = [
-            f"{name}_{k}" for k in range(1, len(self.numbers) + 1) for name in MODE_CONSTANT_NAMES
+        constant_names = [
+            f"{constant_name}_{k}"
+            for k in range(1, len(self.numbers) + 1)
+            for constant_name in MODE_CONSTANT_NAMES
         ]
-        names += [f"background_{power}" for power in range(BACKGROUND_COEFFICIENTS)]
+        constant_names += [
+            f"background_{background_power}" for background_power in range(BACKGROUND_COEFFICIENTS)
+        ]
         return {
             **self.model.as_json(),
             "modes": list(self.numbers),
             "constants": self.constants.tolist(),
-            "names": names,
+            "names": constant_names,
             "covariance": self.joint_covariance.tolist(),
         }

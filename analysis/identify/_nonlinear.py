@@ -75,7 +75,7 @@ _FORCE_TOLERANCE: Final = 1e-3
 
 @dataclass(frozen=True, slots=True)
 class NonlinearTerm:
-    """Nonlinear restoring force of one kind on one mode.
+    """Kind and mode of a nonlinear restoring force of the beam.
 
     Attributes
     ----------
@@ -115,104 +115,121 @@ class NonlinearForceSpectra:
         self._comparison, self._plant, self._samples = comparison, plant, n
         self._length = fast_length(int(np.ceil(_PADDED_LENGTH_RATIO * n)))
         # On s = sigma + j omega the part that wraps around has decayed: see `TorquePredictor`.
-        sigma = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
-        bins = np.arange(self._length // 2 + 1)
-        self._s = sigma + 2j * np.pi * rate_hz / self._length * bins
-        fine_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
-        self._growth = np.exp(sigma * fine_time_s)
+        decay_rate_per_s = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
+        bin_indices = np.arange(self._length // 2 + 1)
+        self._s = decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
+        oversampled_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
+        self._growth = np.exp(decay_rate_per_s * oversampled_time_s)
         damping, density_over_stiffness = plant.damping, plant.beam.density_over_stiffness
         self._inertia_and_external = (
             density_over_stiffness * self._s**2 + damping.gamma * self._s**damping.lambda_
         )
 
-    def column(self, term: NonlinearTerm, size: float = 0.0) -> NDArray[np.complex128]:
-        """Return the torque spectrum of a force divided by its `size`, shape (K,), in N·m.
+    def column(self, term: NonlinearTerm, force_size: float = 0.0) -> NDArray[np.complex128]:
+        """Return the torque spectrum of a nonlinear force per unit of its size, in N·m, shape (K,).
 
         It is not finite if the repeated substitution diverges: the force is then too large.
 
         Parameters
         ----------
-        term : Term
+        term : NonlinearTerm
             Kind and mode of the force.
-        size : float
-            Size e of the force for which the motion of the mode is computed; 0 for the first order.
+        force_size : float
+            Size e of the force for which the motion of the mode is computed; 0 for the first
+            order.
         """
-        k, stiffness = self._modal_stiffness(term.mode)
-        dynamic_stiffness = self._inertia_and_external + stiffness
-        angle = self._comparison.angle_rad
-        decaying_angle = angle / self._growth[::_OVERSAMPLING]
+        k, damped_stiffness = self._modal_stiffness(term.mode)
+        dynamic_stiffness = self._inertia_and_external + damped_stiffness
+        angle_rad = self._comparison.angle_rad
+        decaying_angle = angle_rad / self._growth[::_OVERSAMPLING]
         linear_motion = (
             -self._inertia_and_external
             / dynamic_stiffness
             * np.fft.rfft(decaying_angle, self._length)
         )
-        force = self._force_transform(term.kind, linear_motion, linear_motion)
-        if size:
-            motion_per_force = -size * k / dynamic_stiffness
+        force_transform = self._force_transform(term.kind, linear_motion, linear_motion)
+        if force_size:
+            motion_per_force = -force_size * k / dynamic_stiffness
             with np.errstate(over="ignore", invalid="ignore"):
                 for _ in range(_MAX_SUBSTITUTIONS):
-                    new_force = self._force_transform(
-                        term.kind, linear_motion + motion_per_force * force, linear_motion
+                    new_force_transform = self._force_transform(
+                        term.kind, linear_motion + motion_per_force * force_transform, linear_motion
                     )
-                    change, force_norm = (
-                        np.linalg.norm(new_force - force),
-                        np.linalg.norm(new_force),
+                    force_change, force_norm = (
+                        np.linalg.norm(new_force_transform - force_transform),
+                        np.linalg.norm(new_force_transform),
                     )
-                    force = new_force
+                    force_transform = new_force_transform
                     if not np.isfinite(force_norm):
                         return np.full(self._comparison.frequency_hz.size, np.nan + 0j)
-                    if change < _FORCE_TOLERANCE * force_norm:
+                    if force_change < _FORCE_TOLERANCE * force_norm:
                         break
-        beam = self._plant.beam
-        scale = float(participation(beam, term.mode)[-1]) * beam.bending_stiffness_n_m2
-        torque = (
-            -scale
+        plant_beam = self._plant.beam
+        torque_scale = (
+            float(participation(plant_beam, term.mode)[-1]) * plant_beam.bending_stiffness_n_m2
+        )
+        torque_transform = (
+            -torque_scale
             * k
             * self._inertia_and_external
             / dynamic_stiffness
-            * force
+            * force_transform
             * torque_channel_response(self._plant, self._s)
         )
-        in_time = np.fft.irfft(torque, self._length)[: self._samples]
-        in_time *= self._growth[::_OVERSAMPLING]
-        spectrum: NDArray[np.complex128] = self._comparison.spectrum(
-            in_time[self._comparison.retained]
+        torque_nm = np.fft.irfft(torque_transform, self._length)[: self._samples]
+        torque_nm *= self._growth[::_OVERSAMPLING]
+        torque_spectrum: NDArray[np.complex128] = self._comparison.spectrum(
+            torque_nm[self._comparison.retained]
         )
-        return spectrum
+        return torque_spectrum
 
-    def _modal_stiffness(self, mode: int) -> tuple[float, NDArray[np.complex128]]:
-        """Return k⁴ of a mode in 1/m⁴, and k⁴ with internal damping at each s."""
+    def _modal_stiffness(self, mode_number: int) -> tuple[float, NDArray[np.complex128]]:
+        """Return k⁴ of a mode (wavenumber k) in 1/m⁴, and k⁴ with internal damping at each s."""
         plant = self._plant
-        stiffness = float(clamped_free_eigenvalues(mode)[-1] / plant.beam.length_m) ** 4
-        damped_stiffness = stiffness * (1 + plant.damping.zeta * self._s**plant.damping.alpha)
-        return stiffness, damped_stiffness.astype(np.complex128)
+        wavenumber_fourth_power = (
+            float(clamped_free_eigenvalues(mode_number)[-1] / plant.beam.length_m) ** 4
+        )
+        damped_stiffness = wavenumber_fourth_power * (
+            1 + plant.damping.zeta * self._s**plant.damping.alpha
+        )
+        return wavenumber_fourth_power, damped_stiffness.astype(np.complex128)
 
     def _force_transform(
-        self, kind: ForceKind, motion: NDArray[np.complex128], linear_motion: NDArray[np.complex128]
+        self,
+        force_kind: ForceKind,
+        motion_transform: NDArray[np.complex128],
+        linear_motion_transform: NDArray[np.complex128],
     ) -> NDArray[np.complex128]:
-        """Return the transform of n for a motion of a mode, shape (length // 2 + 1,).
+        """Return the transform of the nonlinear force of a mode's motion, shape (length // 2 + 1,).
 
-        The linear motion determines the largest deflection R and the largest speed V.
+        The force is relative to its size. The linear motion determines the largest deflection R and
+        the largest speed V of the mode.
         """
-        if kind == "quadratic drag":
-            speed = self._oversampled_values(motion * self._s)
-            largest_speed = np.abs(self._oversampled_values(linear_motion * self._s)).max()
-            frequency_rad_s = largest_speed / np.abs(self._oversampled_values(linear_motion)).max()
+        if force_kind == "quadratic drag":
+            speed = self._oversampled_values(motion_transform * self._s)
+            largest_speed = np.abs(
+                self._oversampled_values(linear_motion_transform * self._s)
+            ).max()
+            frequency_rad_s = (
+                largest_speed / np.abs(self._oversampled_values(linear_motion_transform)).max()
+            )
             n = 2 * speed * np.abs(speed) / (largest_speed * frequency_rad_s)
         else:
-            deflection = self._oversampled_values(motion)
-            largest = np.abs(self._oversampled_values(linear_motion)).max()
-            exponent = 3 if kind == "cubic stiffness" else 2
-            n = deflection**exponent / largest ** (exponent - 1)
+            deflection = self._oversampled_values(motion_transform)
+            largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
+            deflection_exponent = 3 if force_kind == "cubic stiffness" else 2
+            n = deflection**deflection_exponent / largest_deflection ** (deflection_exponent - 1)
         n /= self._growth
-        spectrum = np.fft.rfft(n, _OVERSAMPLING * self._length)[: self._s.size]
-        return spectrum / _OVERSAMPLING
+        force_transform = np.fft.rfft(n, _OVERSAMPLING * self._length)[: self._s.size]
+        return force_transform / _OVERSAMPLING
 
-    def _oversampled_values(self, spectrum: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the oversampled time series of a spectrum over the record."""
-        decayed_values = np.fft.irfft(_OVERSAMPLING * spectrum, _OVERSAMPLING * self._length)
-        values: NDArray[np.float64] = decayed_values[: self._growth.size] * self._growth
-        return values
+    def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return the oversampled time series, over the record, of a mode's Laplace transform."""
+        decayed_values = np.fft.irfft(
+            _OVERSAMPLING * motion_transform, _OVERSAMPLING * self._length
+        )
+        oversampled_values: NDArray[np.float64] = decayed_values[: self._growth.size] * self._growth
+        return oversampled_values
 
 
 # Search
@@ -245,7 +262,7 @@ residual has another cause."""
 
 @dataclass(frozen=True, slots=True)
 class NonlinearForce:
-    """Estimated nonlinear restoring force.
+    """Estimated nonlinear restoring force of one mode of the beam.
 
     Attributes
     ----------
@@ -266,7 +283,9 @@ class NonlinearForce:
 def add_nonlinear_forces(
     candidate_set: CandidateSet, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add significant nonlinear forces one by one, and refit all candidates with them.
+    """Return the candidate set refitted with significant nonlinear forces, and these forces.
+
+    They are added one by one.
 
     A mode whose stiffness rises resembles a mode of another frequency, or a fractional order. If
     the best candidate has a fractional order, the search also starts from candidates without one.
@@ -274,11 +293,13 @@ def add_nonlinear_forces(
     trace nothing is tested. `modes` are the visible modes. Return the candidates with the forces,
     or the given candidates and no forces.
     """
-    best = candidate_set.best
-    best_refit = candidate_set.refit(best)
+    best_candidate = candidate_set.best
+    best_refit = candidate_set.refit(best_candidate)
     if (
         _deviance_reduction(
-            best, best_refit.cost, _best_first_order_force(candidate_set, best_refit, modes, [])[1]
+            best_candidate,
+            best_refit.cost,
+            _best_first_order_force(candidate_set, best_refit, modes, [])[1],
         )
         < _MIN_PREDICTED_DEVIANCE_REDUCTION
     ):
@@ -295,47 +316,66 @@ def add_nonlinear_forces(
 
 
 def _start_candidates(candidate_set: CandidateSet) -> tuple[Candidate, ...]:
-    """Return the candidates that the search for forces starts from: simpler ones, then the best."""
-    best = candidate_set.best
-    if "alpha" not in best.structure.free:
-        return (best,)
-    return (*(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL_ORDER), best)
+    """Return the candidates from which the search for nonlinear forces starts.
+
+    This is the best one. If its internal order is free, it comes after those with the order 1.
+    """
+    best_candidate = candidate_set.best
+    if "alpha" not in best_candidate.structure.free:
+        return (best_candidate,)
+    return (
+        *(c for c in candidate_set.candidates if c.structure in INTEGER_INTERNAL_ORDER),
+        best_candidate,
+    )
 
 
 def _add_forces(
     candidate_set: CandidateSet, start_candidate: Candidate, modes: tuple[int, ...]
 ) -> tuple[CandidateSet, tuple[NonlinearForce, ...]]:
-    """Add significant forces to one candidate one by one, then refit all candidates with them."""
-    terms: list[NonlinearTerm] = []
-    sizes = std = np.zeros(0)
-    best = candidate_set.best
+    """Return the candidate set refitted with the nonlinear forces of one candidate, and these.
+
+    Significant forces are added to that candidate one by one.
+    """
+    found_terms: list[NonlinearTerm] = []
+    force_sizes = std = np.zeros(0)
+    best_candidate = candidate_set.best
     refit = candidate_set.refit(start_candidate)
-    while len(terms) < _MAX_FORCES:
-        term, cost = _best_first_order_force(candidate_set, refit, modes, terms)
-        deviance_above_best = _deviance_reduction(best, cost, best.fit.cost)
+    while len(found_terms) < _MAX_FORCES:
+        best_term, cost_with_term = _best_first_order_force(
+            candidate_set, refit, modes, found_terms
+        )
+        deviance_above_best = _deviance_reduction(
+            best_candidate, cost_with_term, best_candidate.fit.cost
+        )
         if (
-            term is None
-            or _deviance_reduction(best, refit.cost, cost) < _MIN_DEVIANCE_REDUCTION
+            best_term is None
+            or _deviance_reduction(best_candidate, refit.cost, cost_with_term)
+            < _MIN_DEVIANCE_REDUCTION
             or deviance_above_best > _GIVE_UP_DEVIANCE
         ):
             break
-        fitted = _fit_with_forces(candidate_set, refit, [*terms, term], np.append(sizes, 0.0))
+        fit_with_term = _fit_with_forces(
+            candidate_set, refit, [*found_terms, best_term], np.append(force_sizes, 0.0)
+        )
         if (
-            fitted is None
-            or _deviance_reduction(best, refit.cost, fitted[0].cost) < _MIN_DEVIANCE_REDUCTION
+            fit_with_term is None
+            or _deviance_reduction(best_candidate, refit.cost, fit_with_term[0].cost)
+            < _MIN_DEVIANCE_REDUCTION
         ):
             break
-        terms.append(term)
-        refit, sizes, std = fitted
-    if not terms:
+        found_terms.append(best_term)
+        refit, force_sizes, std = fit_with_term
+    if not found_terms:
         return candidate_set, ()
     with_forces = candidate_set.refit_with_effect_spectra(refit.columns, refit.residual_noise())
-    forces = zip(terms, sizes.tolist(), std.tolist(), strict=True)
-    return with_forces, tuple(NonlinearForce(term, size, s) for term, size, s in forces)
+    forces = zip(found_terms, force_sizes.tolist(), std.tolist(), strict=True)
+    return with_forces, tuple(
+        NonlinearForce(best_term, force_size, s) for best_term, force_size, s in forces
+    )
 
 
 def _deviance_reduction(candidate: Candidate, cost_before: float, cost_after: float) -> float:
-    """Return the reduction of the deviance between two costs of a candidate."""
+    """Return by how much the deviance of a candidate falls from one cost to another."""
     return candidate.values * math.log(cost_before / cost_after)
 
 
@@ -345,26 +385,32 @@ def _best_first_order_force(
     modes: tuple[int, ...],
     excluded_terms: list[NonlinearTerm],
 ) -> tuple[NonlinearTerm | None, float]:
-    """Return the force with the largest cost reduction to first order, and the cost with it.
+    """Return the nonlinear force that reduces the cost most, and the cost with it.
+
+    Both are predicted to first order. The force is None if there is none left.
 
     Forces in `excluded_terms` are not considered.
     """
-    forces = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
+    force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
     # If drag on the whole beam is significant, drag on a single mode is not tested.
-    kinds = (
+    tested_kinds = (
         FORCE_KINDS
         if candidate_set.drag is None
         else tuple(k for k in FORCE_KINDS if k != "quadratic drag")
     )
-    terms = [NonlinearTerm(kind, mode) for kind in kinds for mode in modes]
-    terms = [term for term in terms if term not in excluded_terms]
-    if not terms:
+    tested_terms = [
+        NonlinearTerm(force_kind, mode_number)
+        for force_kind in tested_kinds
+        for mode_number in modes
+    ]
+    tested_terms = [force_term for force_term in tested_terms if force_term not in excluded_terms]
+    if not tested_terms:
         return None, refit.cost
     cost_reductions = refit.cost_reduction_by_spectrum(
-        np.array([forces.column(term) for term in terms])
+        np.array([force_spectra.column(force_term) for force_term in tested_terms])
     )
     best_index = int(np.argmax(cost_reductions))
-    return terms[best_index], max(
+    return tested_terms[best_index], max(
         refit.cost - float(cost_reductions[best_index]), 1e-3 * refit.cost
     )
 
@@ -372,18 +418,21 @@ def _best_first_order_force(
 def _fit_with_forces(
     candidate_set: CandidateSet,
     refit: Refit,
-    terms: list[NonlinearTerm],
-    sizes: NDArray[np.float64],
+    force_terms: list[NonlinearTerm],
+    force_sizes: NDArray[np.float64],
 ) -> tuple[Refit, NDArray[np.float64], NDArray[np.float64]] | None:
     """Fit a plant with the given forces, starting from given sizes of the forces.
 
     The torque spectra of the forces are updated with the sizes. Return the fit, the sizes and their
     standard deviations, or None if a size is so large that its torque cannot be computed.
     """
-    std = np.zeros(sizes.size)
+    std = np.zeros(force_sizes.size)
     for _ in range(_MAX_SIZE_ITERATIONS):
-        forces = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
-        spectra = [forces.column(term, e) for term, e in zip(terms, sizes.tolist(), strict=True)]
+        force_spectra = NonlinearForceSpectra(candidate_set.comparison, refit.plant)
+        spectra = [
+            force_spectra.column(force_term, e)
+            for force_term, e in zip(force_terms, force_sizes.tolist(), strict=True)
+        ]
         if not np.isfinite(spectra).all():
             return None
         columns = np.concatenate([candidate_set.columns, spectra])
@@ -394,20 +443,27 @@ def _fit_with_forces(
             candidate_set.noise,
             columns,
         )
-        last_sizes = sizes
-        sizes, std = (values[len(candidate_set.columns) :] for values in refit.amplitudes())
+        last_force_sizes = force_sizes
+        force_sizes, std = (
+            force_values[len(candidate_set.columns) :] for force_values in refit.amplitudes()
+        )
         if np.all(
-            np.abs(sizes - last_sizes)
-            < np.maximum(0.3 * std, _RELATIVE_SIZE_TOLERANCE * np.abs(sizes))
+            np.abs(force_sizes - last_force_sizes)
+            < np.maximum(0.3 * std, _RELATIVE_SIZE_TOLERANCE * np.abs(force_sizes))
         ):
             break
-    return refit, sizes, std
+    return refit, force_sizes, std
 
 
 def _forces_explain_residual(linear_set: CandidateSet, set_with_forces: CandidateSet) -> bool:
-    """Return whether the forces explain half of the residual beyond noise, or leave only noise."""
-    power = np.abs(linear_set.best.fit.residual) ** 2
-    excess_without = linear_set.best.fit.cost - linear_set.best.fit.degrees_of_freedom
-    largest_by_chance = SIGNIFICANT_STD * math.sqrt(2 * power.size * 2)
-    excess_with = set_with_forces.best.fit.cost - set_with_forces.best.fit.degrees_of_freedom
-    return excess_with < max(_MIN_EXPLAINED_FRACTION * excess_without, largest_by_chance)
+    """Return whether nonlinear forces explain half of the residual beyond noise.
+
+    Return True also if they leave only noise.
+    """
+    residual_power = np.abs(linear_set.best.fit.residual) ** 2
+    excess_without_forces = linear_set.best.fit.cost - linear_set.best.fit.degrees_of_freedom
+    largest_by_chance = SIGNIFICANT_STD * math.sqrt(2 * residual_power.size * 2)
+    excess_with_forces = set_with_forces.best.fit.cost - set_with_forces.best.fit.degrees_of_freedom
+    return excess_with_forces < max(
+        _MIN_EXPLAINED_FRACTION * excess_without_forces, largest_by_chance
+    )

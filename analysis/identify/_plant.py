@@ -26,14 +26,14 @@ the age of the torque relative to the angle, and the inertia between torque sens
 
 
 def free_settings(fixed: Collection[Setting]) -> tuple[Setting, ...]:
-    """Return the `SETTINGS` that are not fixed, in their order.
+    """Return the names of the plant's `SETTINGS` that are not fixed, in the order of `SETTINGS`.
 
     Parameters
     ----------
     fixed : collection of str
         Names of the fixed settings.
     """
-    return tuple(name for name in SETTINGS if name not in fixed)
+    return tuple(setting_name for setting_name in SETTINGS if setting_name not in fixed)
 
 
 OPTIONAL_PARAMETERS: Final = (
@@ -54,7 +54,7 @@ LOGARITHMIC_PARAMETERS: Final = frozenset({"zeta", "gamma", *BEAM_PARAMETERS})
 
 @dataclass(frozen=True, slots=True)
 class Plant:
-    """All parameters that determine the torque predicted from the angle; one point of a search.
+    """Rig and beam: all parameters that determine the torque predicted from the motor angle.
 
     Attributes
     ----------
@@ -92,12 +92,14 @@ class Plant:
 
     @property
     def optional_parameters(self) -> dict[str, float]:
-        """Return the values of all `OPTIONAL_PARAMETERS` by name."""
-        return {name: getattr(self, name) for name in OPTIONAL_PARAMETERS}
+        """Return the values of the plant's `OPTIONAL_PARAMETERS` by name, zeros included."""
+        return {
+            parameter_name: getattr(self, parameter_name) for parameter_name in OPTIONAL_PARAMETERS
+        }
 
     @property
     def parameters(self) -> dict[str, float]:
-        """Return the parameters by name.
+        """Return the values of the plant's parameters by name.
 
         The names are zeta, alpha, gamma, lambda, the `SETTINGS`, stiffness_offset_2, …, and those
         of the `OPTIONAL_PARAMETERS` that are not 0.
@@ -112,8 +114,12 @@ class Plant:
             "delay_s": self.delay_s,
             "tool_inertia_kg_m2": self.tool_inertia_kg_m2,
             **{
-                f"stiffness_offset_{mode}": offset
-                for mode, offset in enumerate(self.stiffness_offsets, start=2)
+                f"stiffness_offset_{mode_number}": stiffness_offset
+                for mode_number, stiffness_offset in enumerate(self.stiffness_offsets, start=2)
             },
-            **{name: value for name, value in self.optional_parameters.items() if value},
+            **{
+                parameter_name: parameter_value
+                for parameter_name, parameter_value in self.optional_parameters.items()
+                if parameter_value
+            },
         }

@@ -38,7 +38,9 @@ if TYPE_CHECKING:
 
 @lru_cache(maxsize=16)
 def eigenvalues(count: int) -> NDArray[np.float64]:
-    """Return the first roots of ``1 + cos z cosh z = 0``: clamped-free eigenvalues, shape (count,).
+    """Return the first eigenvalues k L of a clamped-free beam, shape (count,).
+
+    They are the roots of ``1 + cos z cosh z = 0``.
 
     The array is cached and read-only.
     """
@@ -57,7 +59,9 @@ _BUTTERWORTH_LOSS: Final = 2**0.5
 def torque_channel_response(
     plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
 ) -> NDArray[np.complex128]:
-    """Return the transfer function of delay and filters of the torque channel, of the shape of `s`.
+    """Return the dimensionless transfer function of the torque channel's delay and filters.
+
+    It has the shape of `s`.
 
     Parameters
     ----------
@@ -66,26 +70,28 @@ def torque_channel_response(
     s : ndarray of complex
         Laplace variable in rad/s.
     """
-    at = s.astype(np.complex128, copy=False)
-    response: NDArray[np.complex128] = np.exp(-plant.delay_s * at)
-    for name in _FILTER_TIME_CONSTANTS:
-        constant_s = plant.optional_parameters[name]
-        if constant_s:
-            response /= _filter_denominator(name, constant_s, at)
-    return response
+    complex_s = s.astype(np.complex128, copy=False)
+    channel_response: NDArray[np.complex128] = np.exp(-plant.delay_s * complex_s)
+    for filter_name in _FILTER_TIME_CONSTANTS:
+        time_constant_s = plant.optional_parameters[filter_name]
+        if time_constant_s:
+            channel_response /= _filter_denominator(filter_name, time_constant_s, complex_s)
+    return channel_response
 
 
 def _filter_denominator(
-    name: str, constant_s: float, s: NDArray[np.complex128]
+    filter_name: str, time_constant_s: float, s: NDArray[np.complex128]
 ) -> NDArray[np.complex128]:
-    """Return the denominator of the transfer function of a filter at `s` in rad/s."""
-    if name == "filter_time_constant_s":
-        return 1 + constant_s * s
-    return 1 + constant_s * (_BUTTERWORTH_LOSS * s + constant_s * s * s)
+    """Return the denominator of the transfer function of a torque filter, at `s` in rad/s."""
+    if filter_name == "filter_time_constant_s":
+        return 1 + time_constant_s * s
+    return 1 + time_constant_s * (_BUTTERWORTH_LOSS * s + time_constant_s * s * s)
 
 
 class ResponseGrid:
-    """Evaluates the transfer function from angle to torque, and its derivatives, on one grid of s.
+    """Evaluates the transfer function from motor angle to torque on a grid of the variable s.
+
+    It also evaluates the derivatives of the transfer function by parameters of the plant.
 
     Parameters
     ----------
@@ -110,9 +116,9 @@ class ResponseGrid:
         self,
         plant: Plant,
         wrt: Sequence[str] = (),
-        angle: NDArray[np.complex128] | float = 1.0,
+        angle_transform: NDArray[np.complex128] | float = 1.0,
     ) -> NDArray[np.complex128]:
-        """Return the transform of the torque of a plant for an angle, and its derivatives.
+        """Return the Laplace transform of a plant's torque for a motor angle, and its derivatives.
 
         With the angle 1 this is the transfer function in N·m/rad.
 
@@ -123,7 +129,7 @@ class ResponseGrid:
         wrt : sequence of str
             Names of k parameters from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2".
             The torque is differentiated with respect to each while all others are constant.
-        angle : ndarray of complex, shape (n,), or float
+        angle_transform : ndarray of complex, shape (n,), or float
             Transform of the angle.
 
         Returns
@@ -131,30 +137,35 @@ class ResponseGrid:
         ndarray of complex, shape (1 + k, n)
             Transform of the torque, then the derivatives in the order of `wrt`.
         """
-        response, derivatives = self._beam_response(plant, wrt)
+        total_response, derivatives = self._beam_response(plant, wrt)
         if plant.root_compliance_rad_per_nm:
-            clamp_factor = 1 / (1 + plant.root_compliance_rad_per_nm * response)
-            for name in derivatives:
-                derivatives[name] = derivatives[name] * clamp_factor**2
-            response = response * clamp_factor
-        response += plant.tool_inertia_kg_m2 * self._s_squared
+            clamp_factor = 1 / (1 + plant.root_compliance_rad_per_nm * total_response)
+            for parameter_name in derivatives:
+                derivatives[parameter_name] = derivatives[parameter_name] * clamp_factor**2
+            total_response = total_response * clamp_factor
+        total_response += plant.tool_inertia_kg_m2 * self._s_squared
         derivatives["tool_inertia_kg_m2"] = self._s_squared
-        channel_times_angle = torque_channel_response(plant, self._s) * angle
+        channel_times_angle = torque_channel_response(plant, self._s) * angle_transform
         if "delay_s" in wrt:
-            derivatives["delay_s"] = -self._s * response
+            derivatives["delay_s"] = -self._s * total_response
         spectra = np.empty((1 + len(wrt), channel_times_angle.size), dtype=np.complex128)
-        for out, row in zip(spectra, [response, *(derivatives[name] for name in wrt)], strict=True):
-            np.multiply(row, channel_times_angle, out=out)
+        for out, response_row in zip(
+            spectra,
+            [total_response, *(derivatives[parameter_name] for parameter_name in wrt)],
+            strict=True,
+        ):
+            np.multiply(response_row, channel_times_angle, out=out)
         return spectra
 
     def _beam_response(
         self, plant: Plant, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """Return the response G of the beam on a rigid clamp, and its derivatives by name.
+        """Return the transfer function G of the beam on a rigid clamp, and derivatives by name.
 
-        Only the names in `wrt` on which G depends are included.
+        G is the torque over the motor angle, in N·m/rad. The derivatives are those by the
+        parameters in `wrt` on which G depends.
         """
-        beam_names = [name for name in wrt if name in PARAMETERS]
+        beam_names = [parameter_name for parameter_name in wrt if parameter_name in PARAMETERS]
         if plant.tip_mass_kg or plant.stiffness_offsets:
             loaded_response, derivatives = differentiated_response(
                 self._log_s,
@@ -164,13 +175,15 @@ class ResponseGrid:
                 plant.tip_mass_kg,
                 plant.stiffness_offsets,
             )
-            return loaded_response.response, {name: derivatives[name]() for name in beam_names}
+            return loaded_response.response, {
+                parameter_name: derivatives[parameter_name]() for parameter_name in beam_names
+            }
         if not beam_names:
             return self._beam.evaluate(plant.beam, plant.damping), {}
-        response, gradient = self._beam.evaluate_with_gradient(
+        beam_response, derivative_rows = self._beam.evaluate_with_gradient(
             plant.beam, plant.damping, beam_names
         )
-        return response, dict(zip(beam_names, gradient, strict=True))
+        return beam_response, dict(zip(beam_names, derivative_rows, strict=True))
 
 
 # Prediction
@@ -187,7 +200,7 @@ what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
 
 
 class TorquePredictor:
-    """Prediction of the torque from one angle, with derivatives by the parameters.
+    """Prediction of the torque from one motor angle, with derivatives by the plant's parameters.
 
     A finite convolution by discrete transforms wraps around, and a lightly damped beam rings longer
     than any padding. So the angle is multiplied with exp(-sigma t) before the transform, which
@@ -220,16 +233,18 @@ class TorquePredictor:
         self.rate_hz = rate_hz
         self._retained = retained
         self._length = fast_length(int(np.ceil(_PADDED_LENGTH_RATIO * angle_rad.size)))
-        self._sigma = sigma = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
+        self._sigma = decay_rate_per_s = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
         time_s = np.arange(angle_rad.size) / rate_hz
-        bins = np.arange(self._length // 2 + 1)
-        self._response = ResponseGrid(sigma + 2j * np.pi * rate_hz / self._length * bins)
-        self._decay = np.exp(-sigma * time_s)
+        bin_indices = np.arange(self._length // 2 + 1)
+        self._response = ResponseGrid(
+            decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
+        )
+        self._decay = np.exp(-decay_rate_per_s * time_s)
         self._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
-        self._growth = np.exp(sigma * time_s[retained])
+        self._growth = np.exp(decay_rate_per_s * time_s[retained])
 
     def with_angle(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
-        """Return the predictor for another angle of the same length, shape (n,)."""
+        """Return the torque predictor for another motor angle of the same length, shape (n,)."""
         predictor = copy(self)
         predictor._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
         return predictor
@@ -240,16 +255,18 @@ class TorquePredictor:
         return self._response.s
 
     def in_time(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
-        """Return the torque that transfer functions predict from the angle, shape (..., m).
+        """Return the torques in N·m that transfer functions predict from the angle, shape (..., m).
 
         Parameters
         ----------
         responses : ndarray of complex, shape (..., n)
             Transfer functions on the grid `s`.
         """
-        spectra = responses * self._spectrum
-        torque: NDArray[np.float64] = np.fft.irfft(spectra, self._length)[..., self._retained]
-        return torque * self._growth
+        torque_spectra = responses * self._spectrum
+        torque_nm: NDArray[np.float64] = np.fft.irfft(torque_spectra, self._length)[
+            ..., self._retained
+        ]
+        return torque_nm * self._growth
 
     def torque(
         self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
@@ -268,14 +285,16 @@ class TorquePredictor:
         torque : ndarray, shape (m,)
         gradient : ndarray, shape (k, m)
         """
-        spectra = self._torque_spectra(plant, wrt)
-        in_time = np.fft.irfft(spectra, self._length)[:, self._retained] * self._growth
-        return in_time[0], in_time[1:]
+        torque_spectra = self._torque_spectra(plant, wrt)
+        torque_and_derivatives = (
+            np.fft.irfft(torque_spectra, self._length)[:, self._retained] * self._growth
+        )
+        return torque_and_derivatives[0], torque_and_derivatives[1:]
 
     def _torque_spectra(
         self, plant: Plant | ModalModel, wrt: Sequence[str]
     ) -> NDArray[np.complex128]:
-        """Return the transforms of the torque and of its derivatives, shape (1 + k, n)."""
+        """Return the transforms of the predicted torque and its k derivatives, shape (1 + k, n)."""
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
         return self._response.evaluate(plant, wrt, self._spectrum)
@@ -283,19 +302,19 @@ class TorquePredictor:
     def torque_at_fine_samples(
         self,
         plant: Plant | ModalModel,
-        factor: int,
-        indices: NDArray[np.intp],
+        rate_factor: int,
+        fine_indices: NDArray[np.intp],
         wrt: Sequence[str] = (),
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return the predicted torque at single samples of a higher rate, and its derivatives.
+        """Return the torque in N·m predicted at fine samples of a higher rate, and derivatives.
 
         Parameters
         ----------
         plant : Plant or ModalModel
             Plant or model whose torque is computed.
-        factor : int
+        rate_factor : int
             Higher rate, in multiples of `rate_hz`.
-        indices : ndarray of int, shape (p,)
+        fine_indices : ndarray of int, shape (p,)
             Samples at the higher rate, counted from the angle's first sample.
         wrt : sequence of str
             Names of the k parameters with respect to which the torque is differentiated.
@@ -305,20 +324,22 @@ class TorquePredictor:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        growth = np.exp(self._sigma * indices / (factor * self.rate_hz))
-        spectra = self._torque_spectra(plant, wrt)
+        sample_growth = np.exp(self._sigma * fine_indices / (rate_factor * self.rate_hz))
+        torque_spectra = self._torque_spectra(plant, wrt)
         # One short transform for each sample of the higher rate within a sample of the lower one:
         # they fit into the cache, and take less than half the time of one long transform.
-        shift_factors = np.ones((factor, spectra.shape[1]), dtype=np.complex128)
+        shift_factors = np.ones((rate_factor, torque_spectra.shape[1]), dtype=np.complex128)
         shift_factors[1:] = np.exp(
-            2j * np.pi / (factor * self._length) * np.arange(spectra.shape[1])
+            2j * np.pi / (rate_factor * self._length) * np.arange(torque_spectra.shape[1])
         )
         np.cumprod(shift_factors, axis=0, out=shift_factors)
         if self._length % 2 == 0:
             # At the higher rate this bin and its mirror image are distinct.
             shift_factors[:, -1] *= 2
-        values = np.empty((len(spectra), indices.size))
-        for row, spectrum in zip(values, spectra, strict=True):
-            row[:] = np.fft.irfft(shift_factors * spectrum, self._length).T.ravel()[indices]
-        values *= growth
-        return values[0], values[1:]
+        torque_and_derivatives = np.empty((len(torque_spectra), fine_indices.size))
+        for row, torque_spectrum in zip(torque_and_derivatives, torque_spectra, strict=True):
+            row[:] = np.fft.irfft(shift_factors * torque_spectrum, self._length).T.ravel()[
+                fine_indices
+            ]
+        torque_and_derivatives *= sample_growth
+        return torque_and_derivatives[0], torque_and_derivatives[1:]

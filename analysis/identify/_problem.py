@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class Linearisation:
-    """Residual spectrum (prediction minus measurement) and its derivatives at one point.
+    """Torque residual spectrum (prediction minus measurement), and its derivatives, at one point.
 
     Attributes
     ----------
@@ -69,16 +69,16 @@ class Projected:
         return float(np.vdot(self.residual, self.residual).real)
 
     def normal_equations(self) -> NormalEquations:
-        """Return the normal equations of a Gauss-Newton step."""
-        jacobian = _as_real_rows(self.jacobian)
+        """Return cost, gradient and Hessian for a Gauss-Newton step of the unknowns."""
+        real_jacobian = _as_real_rows(self.jacobian)
         return NormalEquations(
             cost=self.cost,
-            gradient=jacobian @ _as_real_rows(self.residual),
-            hessian=jacobian @ jacobian.T,
+            gradient=real_jacobian @ _as_real_rows(self.residual),
+            hessian=real_jacobian @ real_jacobian.T,
         )
 
 
-_MAX_FILLINGS: Final = 8
+_MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
 _UNKNOWNS_TOLERANCE: Final = 1e-6
@@ -107,32 +107,37 @@ class Objective:
         self,
         comparison: Comparison,
         unknowns: Unknowns,
-        columns: NDArray[np.complex128] | None = None,
+        effect_spectra: NDArray[np.complex128] | None = None,
     ) -> None:
         no_columns = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
         self.comparison = comparison
         self.unknowns = unknowns
-        self.columns = no_columns if columns is None else columns
+        self.columns = no_columns if effect_spectra is None else effect_spectra
         self._recent: RecentValues[Linearisation] = RecentValues()
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Return residual and derivatives at `x`; the results at the last two points are cached."""
+        """Return the torque residual and its derivatives for the unknowns `x`.
+
+        The results at the last two points are cached.
+        """
         return self._recent.at(x, self._linearise)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
-        """Return residual and derivatives at `x`, without the cache."""
+        """Return torque residual and derivatives for the unknowns `x`, without the cache."""
         comparison, unknowns = self.comparison, self.unknowns
-        names = unknowns.gradient_names
+        gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        torque, gradient = comparison.prediction.torque(plant, names)
+        predicted_nm, torque_gradient = comparison.prediction.torque(plant, gradient_names)
         poles = tuple(
-            Pole(pole.mode, pole.at_rad_s, pole.derivative @ parameters_by_unknowns)
-            for pole in comparison.poles(plant, names)
+            Pole(
+                plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
+            )
+            for plant_pole in comparison.poles(plant, gradient_names)
         )
-        residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
-        jacobian = (parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(gradient))).view(
-            np.complex128
-        )
+        residual = comparison.spectrum(predicted_nm - comparison.torque_nm[comparison.retained])
+        jacobian = (
+            parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(torque_gradient))
+        ).view(np.complex128)
         if comparison.drag is not None:
             drag_change, drag_derivatives = comparison.drag.change_to(
                 plant, poles, unknowns.names, parameters_by_unknowns
@@ -146,41 +151,47 @@ class Objective:
             columns=np.concatenate([comparison.nuisance_spectra(poles), self.columns]),
         )
 
-    def project(self, at: Linearisation, weight: NDArray[np.float64] | float) -> Projected:
-        """Whiten residual and derivatives, and project out the torques of unknown amplitude.
+    def project(
+        self, linearisation: Linearisation, weight: NDArray[np.float64] | float
+    ) -> Projected:
+        """Return whitened residual and derivatives without the torques of unknown amplitude.
+
+        These torques are projected out.
 
         This is variable projection: the best amplitudes at each point are linear in the residual.
         The Jacobian is Kaufman's (BIT 15 (1975) 49-57), with the motion of the poles.
 
         Parameters
         ----------
-        at : Linearisation
+        linearisation : Linearisation
             Residual and derivatives at one point.
         weight : ndarray, shape (K,), or float
             Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
-        residual, jacobian = at.residual * weight, at.jacobian * weight
-        columns = _as_real_rows(at.columns * weight)
-        lengths = np.sqrt(np.einsum("ij,ij->i", columns, columns))
-        lengths[lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-        columns /= lengths[:, None]
-        gram = columns @ columns.T
-        inverse_gram = np.linalg.inv(gram + 1e-12 * np.eye(lengths.size))
-        amplitudes = -inverse_gram @ (columns @ _as_real_rows(residual))
-        jacobian += weight * self.comparison.decay_gradient(at.poles, amplitudes / lengths)
+        residual, jacobian = linearisation.residual * weight, linearisation.jacobian * weight
+        unit_columns = _as_real_rows(linearisation.columns * weight)
+        column_lengths = np.sqrt(np.einsum("ij,ij->i", unit_columns, unit_columns))
+        column_lengths[column_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
+        unit_columns /= column_lengths[:, None]
+        column_gram = unit_columns @ unit_columns.T
+        inverse_gram = np.linalg.inv(column_gram + 1e-12 * np.eye(column_lengths.size))
+        amplitudes = -inverse_gram @ (unit_columns @ _as_real_rows(residual))
+        jacobian += weight * self.comparison.decay_gradient(
+            linearisation.poles, amplitudes / column_lengths
+        )
         real_jacobian = _as_real_rows(jacobian)
-        real_jacobian -= ((real_jacobian @ columns.T) @ inverse_gram) @ columns
+        real_jacobian -= ((real_jacobian @ unit_columns.T) @ inverse_gram) @ unit_columns
         return Projected(
-            residual=residual + (amplitudes @ columns).view(np.complex128),
+            residual=residual + (amplitudes @ unit_columns).view(np.complex128),
             jacobian=jacobian,
-            amplitudes=amplitudes / lengths,
-            amplitude_gram=gram * np.outer(lengths, lengths),
+            amplitudes=amplitudes / column_lengths,
+            amplitude_gram=column_gram * np.outer(column_lengths, column_lengths),
         )
 
     def normal_equations(
         self, x: NDArray[np.float64], weight: NDArray[np.float64]
     ) -> NormalEquations:
-        """Return the cost at `x`, with gradient and Hessian of a Gauss-Newton step.
+        """Return the cost for the unknowns `x`, with gradient and Hessian of a Gauss-Newton step.
 
         Parameters
         ----------
@@ -193,7 +204,7 @@ class Objective:
 
     def minimum(
         self,
-        start: NDArray[np.float64],
+        start_unknowns: NDArray[np.float64],
         weight: NDArray[np.float64],
         region: Region,
         *,
@@ -201,11 +212,13 @@ class Objective:
         max_evaluations: int = 200,
         hopeless: tuple[int, float] | None = None,
     ) -> tuple[Objective, Minimum]:
-        """Descend to a minimum of the cost; repeat while filling unknown torques moves the minimum.
+        """Return the minimum of the cost reached by descents from `start_unknowns`.
+
+        The descent is repeated while filling unknown torques moves the minimum.
 
         Parameters
         ----------
-        start : ndarray, shape (k,)
+        start_unknowns : ndarray, shape (k,)
             Unknowns at which the descent starts.
         weight : ndarray, shape (K,)
             Weight of `NoiseSpectrum`.
@@ -219,8 +232,8 @@ class Objective:
         minimum : Minimum
             Minimum of that objective.
         """
-        x = start
-        for _ in range(_MAX_FILLINGS):
+        x = start_unknowns
+        for _ in range(_MAX_TORQUE_FILLINGS):
             objective = self._fill_unknown_torque(x)
             minimum = descend(
                 partial(objective.normal_equations, weight=weight),
@@ -230,26 +243,29 @@ class Objective:
                 max_evaluations=max_evaluations,
                 hopeless=hopeless,
             )
-            converged = objective is self or np.abs(minimum.x - x).max() < _UNKNOWNS_TOLERANCE
+            has_converged = objective is self or np.abs(minimum.x - x).max() < _UNKNOWNS_TOLERANCE
             x = minimum.x
             # A descent that did not converge does not converge with new fills either.
-            given_up = hopeless is not None and minimum.equations.cost > hopeless[1]
-            if converged or given_up or minimum.evaluations >= max_evaluations:
+            is_given_up = hopeless is not None and minimum.equations.cost > hopeless[1]
+            if has_converged or is_given_up or minimum.evaluations >= max_evaluations:
                 break
         return objective, minimum
 
     def _fill_unknown_torque(self, x: NDArray[np.float64]) -> Objective:
-        """Fill unknown torques with the prediction at `x`; return `self` if all are known."""
+        """Return the objective with unmeasured torques filled by the prediction at `x`.
+
+        Return `self` if all torques were measured.
+        """
         comparison = self.comparison.fill_unknown_torque(self.unknowns.plant(x))
         if comparison is self.comparison:
             return self
         return Objective(comparison, self.unknowns, self.columns)
 
 
-def _as_real_rows(values: NDArray[np.complex128]) -> NDArray[np.float64]:
-    """Return a view with real and imaginary parts interleaved, shape (..., 2 K).
+def _as_real_rows(complex_rows: NDArray[np.complex128]) -> NDArray[np.float64]:
+    """Return a real view of complex rows, parts interleaved, with the shape (..., 2 K).
 
     Products of such rows are the real parts of complex products, at half the cost.
     """
-    real_rows: NDArray[np.float64] = np.ascontiguousarray(values).view(np.float64)
+    real_rows: NDArray[np.float64] = np.ascontiguousarray(complex_rows).view(np.float64)
     return real_rows
