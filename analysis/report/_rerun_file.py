@@ -217,7 +217,13 @@ def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
         for order, curve in enumerate(graph.curves):
             strips = thinning.strips(curve.values)
             graph.chart.draw_curve(
-                stream, curve.name, strips, curve.key, static=True, dotted=curve.dotted, order=order
+                stream,
+                curve.name,
+                strips,
+                curve.key,
+                static=True,
+                dotted=curve.dotted,
+                curve_order=order,
             )
 
 
@@ -236,7 +242,7 @@ def _page_view(page: ChartPage) -> rrb.Container:
         chart = graph.chart
         return chart_view(graph.title, chart.entity, (chart.width, chart.height))
 
-    return chart_page(*map(view, page.graphs), name=page.title)
+    return chart_page(*map(view, page.graphs), tab_title=page.title)
 
 
 def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
@@ -640,7 +646,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
-            draw_session(stream, session, timings, front=tabs)
+            draw_session(stream, session, timings, front_tabs=tabs)
             if whole_record is not None:
                 draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
             if welch_analysis is not None:
