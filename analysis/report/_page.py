@@ -17,12 +17,12 @@ Facts = tuple[str, list[tuple[str, str]]]
 """Title of a group of facts, and the name and value of each fact."""
 
 
-def page(template: str, **content: Any) -> str:  # noqa: ANN401 - what the template asks for
+def page(template_name: str, **template_content: Any) -> str:  # noqa: ANN401 - what the template asks for
     """Return a template of this package as HTML, filled with content.
 
     It raises an error if the template uses a name that is not in the content.
     """
-    return _environment().get_template(template).render(content)
+    return _environment().get_template(template_name).render(template_content)
 
 
 @cache

@@ -281,7 +281,7 @@ def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
     ----------
     angle_rad
         Angle of the motor.
-    deflection
+    deflection_per_length
         Deflection at evenly spaced points of the beam, shape (points,), relative to the undeformed
         line, in beam lengths.
 
@@ -303,7 +303,7 @@ def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
 
     Parameters
     ----------
-    angle_rad, deflection
+    angle_rad, deflection_per_length
         As for `enlarged_lines`.
     """
     along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
@@ -317,8 +317,10 @@ def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
 def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
     """Return the text with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
-    deflection_text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
-    return f"tip deflection ± {deflection_text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
+    mm_text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
+    return (
+        f"tip deflection ± {mm_text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
+    )
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
@@ -329,8 +331,8 @@ def touch_label(touch: Mapping[str, Any]) -> str:
     touch
         Touch as in JSON documents.
     """
-    touch_position = touch["x_m"]
-    return f"touch {touch['number']}: {with_half_width(touch_position['value'], touch_position['interval_95'])} m"
+    x_m = touch["x_m"]
+    return f"touch {touch['number']}: {with_half_width(x_m['value'], x_m['interval_95'])} m"
 
 
 def _assumed_damping(beam: Beam) -> Damping:

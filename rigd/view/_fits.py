@@ -68,9 +68,9 @@ def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
 
     Parameters
     ----------
-    modes
+    mode_count
         Number of modes.
-    with_targets
+    with_target_std
         Whether the session may have target precisions.
     """
     plots = (
@@ -124,7 +124,7 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
     ----------
     fit
         Fit as in JSON documents; None if there is no fit yet.
-    modes
+    mode_count
         Number of modes in the plots; further modes of the fit are omitted.
     """
     dtype_fields = [

@@ -104,7 +104,7 @@ class Gauges:
 
         Parameters
         ----------
-        values
+        magnitudes
             Magnitudes by signal name. A signal that is absent has an unknown magnitude.
         """
         return {

@@ -137,7 +137,7 @@ def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
 
     Parameters
     ----------
-    source
+    fit_plots
         Source of the plots, two for each mode.
     """
     row_count = max(1, len(fit_plots.plots) // 2)
@@ -155,12 +155,12 @@ def blueprint(
 
     Parameters
     ----------
-    absent
+    absent_components
         Component names of plots to omit, because the session has no values for them.
     fit_modes
         Number of modes whose fits are plotted over time. 0: only a table of the last fit. None: no
         tab Fit.
-    fit_targets
+    with_target_std
         Whether the session may have target precisions.
     """
     import rerun.blueprint as rrb
@@ -341,11 +341,11 @@ def chart_view(
 
     Parameters
     ----------
-    name
+    view_title
         Title of the view.
-    entity
+    entity_path
         Entity path of the chart.
-    size
+    chart_size
         Width and height of its canvas, in points.
     """
     import rerun.blueprint as rrb
@@ -365,11 +365,11 @@ def chart_page(
 
     Parameters
     ----------
-    wide
+    wide_view
         View at the top, with four sevenths of the height.
-    *narrow
+    *narrow_views
         Views below it, from left to right.
-    name
+    tab_title
         Title of the tab; None: no title.
     """
     import rerun.blueprint as rrb
@@ -567,9 +567,9 @@ def missing_ticks(
 
     Parameters
     ----------
-    low, high
+    lowest_value, highest_value
         Least and greatest plotted value.
-    height
+    height_pt
         Height of the plot, in points.
     least_span
         Least length of the axis, in the unit of the values.

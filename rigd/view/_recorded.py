@@ -63,9 +63,9 @@ def subject_of_session(
     ----------
     session
         Session as read from its file.
-    timings
+    tick_timings
         Ages (n,) of the readings, of ``TIMING_DTYPE``; None if the file has none.
-    fitted
+    has_fit
         Whether the file contains a fit of the session's record (`rigd.session.fit_of`).
 
     Raises
@@ -185,9 +185,9 @@ def draw_session(
         Stream for the drawings.
     session
         Session to draw.
-    timings
+    tick_timings
         Ages (n,) of the readings, of ``TIMING_DTYPE``; may be empty.
-    front
+    front_tabs
         Tabs to show before those of the live view.
     on_progress
         Function that is called from time to time with the fraction of the session that is drawn.
@@ -260,9 +260,9 @@ def recorded_blueprint(
 
     Parameters
     ----------
-    front
+    front_tabs
         Tabs to show before those of the live view.
-    absent
+    absent_components
         Component names of plots to omit, because the session has no values for them.
     fit_modes
         0: add a tab with a table of the last fit. None: no tab Fit.
@@ -285,8 +285,8 @@ def _number_in_range(
     stated_number = session.number(metadata_key)
     if not least_value <= stated_number <= greatest_value:
         raise SessionError(
-            f"{session.path}: {metadata_key} is {stated_number:g} {unit_of(metadata_key)}, but must be from {least_value:g} to "
-            f"{greatest_value:g} {unit_of(metadata_key)}. The writing program must correct it."
+            f"{session.path}: {metadata_key} is {stated_number:g} {unit_of(metadata_key)}, "
+            f"but must be from {least_value:g} to {greatest_value:g} {unit_of(metadata_key)}. The writing program must correct it."
         )
     return stated_number
 

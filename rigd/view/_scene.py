@@ -66,9 +66,9 @@ class Scene:
     ----------
     subject
         The session.
-    layout
+    make_layout
         Function that returns the layout of the window; None: the layout of the live view.
-    last
+    last_response
         Response of the last session of the same specimen, which is drawn for comparison.
     """
 
@@ -191,7 +191,7 @@ class Scene:
         ----------
         t_ns
             Time since the session's start.
-        state
+        banner_state
             State of the session.
         """
         if banner_state == self._state:
@@ -206,7 +206,7 @@ class Scene:
         ----------
         t_ns
             Time since the session's start.
-        health
+        health_reading
             Health reading, which arrives a few times per second.
         """
         self._health, self._health_ns = health_reading, t_ns

@@ -137,7 +137,7 @@ def linear_sweep_band_hz(
 
     Parameters
     ----------
-    kind, parameters
+    excitation_kind, parameters
         Name of the excitation and its parameters, as numbers or as texts of a session file.
     """
     if excitation_kind != "chirp":

@@ -98,7 +98,7 @@ def ended(outcome_name: str, reason: str) -> BannerState:
 
     Parameters
     ----------
-    outcome, reason
+    outcome_name, reason
         Outcome of the session and the reason for it. An empty outcome means unknown.
     """
     state_name = outcome_name.upper() or "ENDED"
@@ -230,7 +230,7 @@ def gauge_text(gauge_label: str, gauge: Gauge) -> str:
 
     Parameters
     ----------
-    label
+    gauge_label
         Label of the signal.
     gauge
         Value and limit of the signal.

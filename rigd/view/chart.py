@@ -224,7 +224,7 @@ class Chart:
             Whether the curve never changes. Static curves lie beneath all others.
         dotted
             Whether to draw points only, because a line between them would have no meaning.
-        order
+        curve_order
             Position in the stack of static curves or of other curves; higher numbers lie above.
         """
         import rerun as rr
@@ -257,9 +257,9 @@ class Chart:
         ----------
         stream
             Recording to draw into.
-        text
+        note_text
             Text to show.
-        color
+        text_color
             Colour of the text.
         """
         import rerun as rr
@@ -287,7 +287,7 @@ class Chart:
         ----------
         stream
             Recording to draw into.
-        name
+        shade_name
             Name of the shaded area under the chart's entity path.
         """
         import rerun as rr
@@ -316,9 +316,9 @@ class Chart:
         ----------
         stream
             Recording to draw into.
-        name
+        shade_name
             Name of the shaded area under the chart's entity path.
-        first, last
+        first_x, last_x
             Values of the horizontal axis at the left and right end of the area.
         """
         _, frame_top, _, frame_bottom = self.frame
@@ -458,7 +458,7 @@ def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], t
 
     Parameters
     ----------
-    first, last
+    first_value, last_value
         Values at both ends of the axis, above 0.
 
     Examples
@@ -487,13 +487,13 @@ def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], t
 
 
 def steps(first_value: float, last_value: float, most_steps: int) -> tuple[float, ...]:
-    """Return at most `most_steps` evenly spaced round values from `first_value` to `last_value`, for axis ticks.
+    """Return at most `most_steps` evenly spaced round values within a range, for axis ticks.
 
     Parameters
     ----------
-    first, last
+    first_value, last_value
         Values at both ends of the axis.
-    most
+    most_steps
         Largest number of values.
 
     Examples
@@ -546,9 +546,9 @@ class CurveDecimation:
         ----------
         grid
             Frequencies of the points, increasing, shape (n,).
-        first, last
+        first_hz, last_hz
             Lowest and highest frequency. Points outside are dropped.
-        groups
+        most_groups
             Largest number of groups.
         """
         group_edges = np.geomspace(first_hz, last_hz, most_groups + 1)
@@ -571,7 +571,7 @@ class CurveDecimation:
 
         Parameters
         ----------
-        values
+        curve_values
             Values of the curve on the grid, shape (n,); NaN if unknown.
         """
         group_indices, extreme_indices = self._extremes(curve_values)
@@ -588,7 +588,7 @@ class CurveDecimation:
 
         Parameters
         ----------
-        values
+        curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
         return np.unique(self._extremes(curve_values)[1])
@@ -598,7 +598,7 @@ class CurveDecimation:
 
         Parameters
         ----------
-        values
+        curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
         group_indices, _ = self._extremes(curve_values)

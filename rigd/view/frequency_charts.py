@@ -43,7 +43,7 @@ class SweepResponse:
         The session.
     last_hz
         Highest frequency of the estimated response.
-    every
+    resolution_divisor
         Divisor of the FFT length that `analyze` uses. The FFT is never shorter than a segment.
     """
 
@@ -207,7 +207,7 @@ class ResponseCharts:
     ----------
     subject
         The session.
-    last
+    last_response
         Response of the last session of the specimen, which is drawn beneath the present one; None
         if there is none.
     """
@@ -505,15 +505,15 @@ def response_chart(
 
     Parameters
     ----------
-    entity
+    entity_path
         Entity path of the chart in Rerun.
-    size
+    chart_size
         Width and height of the canvas, in points.
     band_hz
         Lowest and highest frequency of the axis, above 0.
-    y
+    vertical_axis
         Vertical axis.
-    *keys
+    *legend_entries
         Entries of the legend, in reading order.
     """
     tick_values, grid_lines = decades(*band_hz)
@@ -626,7 +626,7 @@ class SpectrogramChart:
         ----------
         t_ns
             Time since the start of the session.
-        columns
+        level_columns
             Time in s of the middle of each column's window, and the column's levels (m,) in dB re 1
             N·m.
         """
@@ -650,8 +650,8 @@ def _position_image(
 ) -> None:
     """Send the position and colour map of an image of levels (0–255).
 
-    `image_corners` contains the bottom left and the top right corner on the canvas, shape (2, 2). `image_shape`
-    contains the number of rows and columns.
+    `image_corners` contains the bottom left and the top right corner on the canvas, shape (2, 2).
+    `image_shape` contains the number of rows and columns.
     """
     import rerun as rr
 

@@ -173,7 +173,10 @@ def _column(component_name: str, component_values: Values) -> "ComponentColumn":
 
 
 def _axes(field_pattern: str, axis_symbol: str, unit: str) -> tuple[PlotCurve, ...]:
-    """Return the curves of the sensor's three axes. `field_pattern` is a name pattern such as ``f{}_n``."""
+    """Return the curves of one signal of the sensor, one for each axis x, y and z.
+
+    `field_pattern` is the name of the samples' fields, such as ``f{}_n``, with {} for the axis.
+    """
     return tuple(
         PlotCurve(
             f"{axis_symbol}{axis_letter} ({unit})",
