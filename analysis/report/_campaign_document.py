@@ -108,7 +108,8 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
 def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str) -> dict[str, Any]:
     """Return the keys that identify a session's fit: file, estimator, type and weighting."""
     return {
-        "file": str(session.path), "estimator": estimator, "type": structure_name, "weighting": None,
+        "file": str(session.path), "estimator": estimator, "type": structure_name,
+        "weighting": None,
     }  # fmt: skip
 
 

@@ -98,7 +98,9 @@ def index_figure(campaign: CampaignResult) -> Figure:
         Line2D([], [], color="#C00000", label="median"),
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
     ]
-    style.legend(figure, [*weighting_entries, *mark_entries], columns=len(weighting_entries) + 2)
+    style.legend(
+        figure, [*weighting_entries, *mark_entries], column_count=len(weighting_entries) + 2
+    )
     return figure
 
 
@@ -162,7 +164,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
         Patch(facecolor=style.SHADE_COLOR, label="95 % prediction interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=4)
+    style.legend(figure, legend_entries, column_count=4)
     return figure
 
 
@@ -283,7 +285,7 @@ def best_figure(campaign: CampaignResult) -> Figure:
     )
     magnitude_axes.set_ylim(_db_limits(campaign, drawn_models))
     style.response_axes(magnitude_axes, phase_axes)
-    style.frequency_axis(magnitude_axes, campaign.settings.band_hz, labels=False)
+    style.frequency_axis(magnitude_axes, campaign.settings.band_hz, with_labels=False)
     style.frequency_axis(phase_axes, campaign.settings.band_hz)
     phase_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     _add_legend(figure, line_by_label)
@@ -360,7 +362,8 @@ def draw_session(
 ) -> Line2D:
     """Draw one session's response in the background and return the line of its magnitude."""
     (magnitude_line,) = magnitude_axes.plot(
-        *_decimated_line(frequency_hz, magnitude_db(response), decimation_columns), color=SESSION_COLOR,
+        *_decimated_line(frequency_hz, magnitude_db(response), decimation_columns),
+        color=SESSION_COLOR,
         linewidth=0.5, alpha=opacity, rasterized=True,
     )  # fmt: skip
     point_indices = style.log_spaced_indices(frequency_hz, most_dots)
@@ -382,7 +385,7 @@ def _decimated_line(
 def _add_legend(figure: Figure, line_by_label: dict[str, Line2D]) -> None:
     """Add a legend to a figure and thicken the line of the measured responses in it."""
     figure_legend = style.legend(
-        figure, list(line_by_label.values()), list(line_by_label), columns=len(line_by_label)
+        figure, list(line_by_label.values()), list(line_by_label), column_count=len(line_by_label)
     )
     figure_legend.get_lines()[0].set_linewidth(1.5)
 
@@ -426,7 +429,8 @@ def validation_figure(campaign: CampaignResult) -> Figure:
         color = style.GREEN if weighting is None else color_by_weighting[weighting]
         session_errors = 100 * np.array([session_error.error for session_error in model_errors])
         axes.plot(
-            session_errors, row + rng.uniform(-0.18, 0.18, session_errors.size), "o", color=color, markersize=2.6,
+            session_errors, row + rng.uniform(-0.18, 0.18, session_errors.size), "o", color=color,
+            markersize=2.6,
             alpha=0.6,
         )  # fmt: skip
         expected_errors = [
@@ -460,7 +464,7 @@ def validation_figure(campaign: CampaignResult) -> Figure:
         *(Line2D([], [], color=color_by_weighting[w], marker="o", linestyle="", markersize=3.5,
                  label=f"nominal model, weights {w}") for w in weightings),
     ]  # fmt: skip
-    style.legend(figure, legend_handles, columns=2)
+    style.legend(figure, legend_handles, column_count=2)
     return figure
 
 

@@ -221,7 +221,8 @@ def _modal_equation() -> Formula:
         )
     first_term, second_term = modal_terms
     return _join(
-        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, sum_over_modes, _OPENING_BRACKET, first_term, _PLUS_SIGN, second_term,
+        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, sum_over_modes, _OPENING_BRACKET, first_term, _PLUS_SIGN,
+        second_term,
         _CLOSING_BRACKET, _PLUS_SIGN,
         sum_over_powers, _subscript(_variable("b"), n), _power(_S_SYMBOL, n),
     )  # fmt: skip

@@ -271,7 +271,8 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
                 table_column
                 for value_name in _INDEX_NAMES
                 for table_column in (
-                    Column(value_name.upper(), value_name), Column("std", f"{value_name}_std", std_of_previous=True),
+                    Column(value_name.upper(), value_name),
+                    Column("std", f"{value_name}_std", std_of_previous=True),
                 )
             ),
         ),

@@ -73,7 +73,9 @@ def frf_figure(analysis: WelchAnalysis) -> Figure:
     coherence_axes = figure.add_subplot(grid[panel_rows, :])
     _draw_coherence(coherence_axes, analysis)
     panel_columns = min(len(line_by_label), _LEGEND_COLUMNS)
-    style.legend(figure, list(line_by_label.values()), list(line_by_label), columns=panel_columns)
+    style.legend(
+        figure, list(line_by_label.values()), list(line_by_label), column_count=panel_columns
+    )
     return figure
 
 

@@ -294,7 +294,8 @@ def indices_table(campaign: CampaignResult) -> Table:
                 value_column
                 for index_name, index_heading in _INDEX_HEADINGS.items()
                 for value_column in (
-                    Column(index_heading, index_name), Column("std", f"{index_name}_std", std_of_previous=True)
+                    Column(index_heading, index_name),
+                    Column("std", f"{index_name}_std", std_of_previous=True)
                 )
             ),
         ),

@@ -114,7 +114,8 @@ def damping_figure(campaign: CampaignResult) -> Figure:
         "between the modes  ·  below: each mode, frequency from the pooled mean",
     )  # fmt: skip
     grid = figure.add_gridspec(
-        2, len(pooled_modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
+        2, len(pooled_modes), left=0.075, right=0.985, top=1 - 0.95 / height_in,
+        bottom=0.5 / height_in,
         height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
     )  # fmt: skip
     upper_axes = figure.add_subplot(grid[0, :])
@@ -148,7 +149,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
         Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=3)
+    style.legend(figure, legend_entries, column_count=3)
     return figure
 
 
@@ -312,7 +313,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
     width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     for response_panel in (magnitude_axes, phase_axes, width_axes):
         style.frequency_axis(
-            response_panel, (first_hz, last_hz), labels=response_panel is width_axes
+            response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
         )
     figure.align_ylabels()
     legend_entries = [
@@ -321,7 +322,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
         Line2D([], [], color=style.BLUE, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % band"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=3)
+    style.legend(figure, legend_entries, column_count=3)
     return figure
 
 

@@ -145,7 +145,7 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
     width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     for response_panel in (magnitude_axes, phase_axes, width_axes):
         style.frequency_axis(
-            response_panel, (first_hz, last_hz), labels=response_panel is width_axes
+            response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
         )
     for panel_number, visible_mode in enumerate(visible_modes):
         detail_axes = figure.add_subplot(grid[1, panel_number])
@@ -174,7 +174,8 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
         if panel_number == 0:
             detail_axes.set_ylabel("Magnitude (dB)")
     figure.legend(
-        *magnitude_axes.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.995),
+        *magnitude_axes.get_legend_handles_labels(), loc="upper right",
+        bbox_to_anchor=(0.985, 0.995),
         ncols=3, borderaxespad=0.0,
     )  # fmt: skip
     return figure
@@ -554,8 +555,10 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         frf,
         frf_figure(measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
-        f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; half-width "
-        f"of the model's 95 % band; details of the modes ({modes_text} Hz). The band is narrower than "
+        f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; "
+        "half-width "
+        f"of the model's 95 % band; details of the modes ({modes_text} Hz). The band is narrower "
+        "than "
         "the line where it is not seen.",
     )
     uniformity_test = headline.uniform_beam
@@ -577,14 +580,15 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         ),
         _loss_description(whole_record, has_curves=loss_model is not None),
     )
-    bin_powerratio = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
+    mean_power_ratio = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
         residual_name,
         residual_figure(model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
         "records or more if only noise is left; and its power through the record. Excess at a "
-        f"mode or at one time is what the model lacks. Mean power {bin_powerratio:.4g} times that of the "
+        f"mode or at one time is what the model lacks. Mean power {mean_power_ratio:.4g} times "
+        "that of the "
         "noise.",
     )
     yield Illustration(
@@ -603,7 +607,8 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
     reasons_text = _reasons_of_hollow_points(whole_record.headline)
     if not has_curves:
         return (
-            f"Loss factor over frequency: {points_text}. There is no curve, because no beam with one "
+            f"Loss factor over frequency: {points_text}. There is no curve, because no beam with "
+            "one "
             f"internal and one external order explains the losses.{reasons_text}"
         )
     curves_text = (

@@ -161,7 +161,8 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     ]
     if other_resonances_hz:
         yield (
-            f"The modal model has a further resonance at {listed(other_resonances_hz)} Hz, which is not one "
+            f"The modal model has a further resonance at {listed(other_resonances_hz)} Hz, which "
+            "is not one "
             "of the beam's (sensor, mount)."
         )
 
@@ -225,7 +226,7 @@ _UNCERTAINTY_NOTE: Final = (
 def parameter_names(headline: Headline) -> tuple[str, ...]:
     """Return the names of the reported parameters in the order damping, beam, rig."""
     exact_parameters = () if headline.exact is None else headline.exact.parameters
-    return tuple(dict.fromkeys((*(parameter_name for parameter_name in exact_parameters if parameter_name in headline.parameters),
+    return tuple(dict.fromkeys((*(key for key in exact_parameters if key in headline.parameters),
                                 *headline.parameters)))  # fmt: skip
 
 
@@ -351,7 +352,8 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
         )
     return Table.of(
         "on_condition",
-        f"If {assumption_text or 'the rest'} is assumed: type {simpler_estimates.name} (sufficient)",
+        f"If {assumption_text or 'the rest'} is assumed: type {simpler_estimates.name} "
+        "(sufficient)",
         (
             Column("Parameter", "parameter", TEXT_FORMAT),
             Column("Unit", "unit", TEXT_FORMAT),

@@ -286,7 +286,8 @@ def _number_in_range(
     if not least_value <= stated_number <= greatest_value:
         raise SessionError(
             f"{session.path}: {metadata_key} is {stated_number:g} {unit_of(metadata_key)}, "
-            f"but must be from {least_value:g} to {greatest_value:g} {unit_of(metadata_key)}. The writing program must correct it."
+            f"but must be from {least_value:g} to {greatest_value:g} {unit_of(metadata_key)}. The "
+            "writing program must correct it."
         )
     return stated_number
 
