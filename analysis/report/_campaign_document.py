@@ -114,7 +114,7 @@ def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str)
 
 
 def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
-    """Return the JSON object of a session's Welch fit."""
+    """Return the JSON object of the model that is fitted to a session's Welch response."""
     return {
         **_fit_identity(session, "welch", fit.structure),
         "weighting": fit.weighting,
@@ -127,7 +127,7 @@ def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
 
 
 def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
-    """Return the JSON object of a session's whole-record fit."""
+    """Return the JSON object of the model that is fitted to a session's whole record."""
     return {
         **_fit_identity(session, "record", fit.structure),
         "candidate": fit.name,
@@ -142,7 +142,7 @@ def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str,
 def _std_of_free_parameters(
     std: Mapping[str, float | None], free_parameters: Collection[str]
 ) -> dict[str, float | None]:
-    """Return standard deviations with None for fixed parameters, which were not estimated."""
+    """Return the parameters' standard deviations by name, with None for fixed parameters."""
     return {
         parameter_name: parameter_std if parameter_name in free_parameters else None
         for parameter_name, parameter_std in std.items()

@@ -38,7 +38,7 @@ _MARK_SIZE_PT: Final = 3.0
 
 
 def index_figure(campaign: CampaignResult) -> Figure:
-    """Draw MSE, WMSE and MD of every nominal model over the sessions (Eqs. 28-30)."""
+    """Draw how far each session is from each nominal model: MSE, WMSE and MD (Eqs. 28-30)."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
@@ -111,9 +111,9 @@ INTERVAL_COLOR: Final = "#C3DCED"
 
 
 def pooled_figure(campaign: CampaignResult) -> Figure:
-    """Draw each session's estimate of every parameter with its interval, over the pooled one.
+    """Draw each session's estimate of every parameter over the pooled estimate, with intervals.
 
-    The figure shows the freest structure that the sessions support.
+    The parameters are those of the reported pooled estimate.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -176,7 +176,11 @@ def _draw_parameter_panel(
     *,
     reported: bool,
 ) -> None:
-    """Draw the sessions' estimates of a parameter over its pooled and prediction interval."""
+    """Draw the sessions' estimates of one parameter.
+
+    Behind them are the interval of the pooled value and the interval in which the next session's
+    estimate is expected.
+    """
     parameter_symbol, display_factor, _ = label(parameter.name)
     session_positions, session_values, half_widths = [], [], []
     for session_number, session in enumerate(campaign.sessions, start=1):
@@ -479,5 +483,5 @@ def _predicted_sessions_text(campaign: CampaignResult) -> str:
 
 
 def _model_label(_method: str, structure: str, weighting: str | None) -> str:
-    """Return the label of a model in the validation figure."""
+    """Return the label of a fitted model in the validation figure: its type and weighting."""
     return f"{structure}: {'whole record' if weighting is None else f'Welch, {weighting}'}"

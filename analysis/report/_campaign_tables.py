@@ -279,7 +279,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Return the table of verdicts on single sessions, then the files that were left out."""
+    """Return the table with one row for each session's verdict and for each excluded file."""
     leading_quantity = campaign.homogeneity.leading
     session_groups = leading_quantity.groups if leading_quantity else ()
     group_by_file = {

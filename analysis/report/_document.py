@@ -48,7 +48,10 @@ NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 def indices_of_record_fit(
     fit: RecordFit, welch_analysis: WelchAnalysis
 ) -> tuple[IndexValues, IndexValues]:
-    """Return the paper's indices of a whole-record fit, in the band of the Welch fits.
+    """Return the errors MSE, WMSE and MD of a whole-record fit in the band of the Welch fits.
+
+    The first errors are against Welch's response, the second against the ratio of the whole
+    record's transforms.
 
     Parameters
     ----------
@@ -77,7 +80,7 @@ def indices_of_record_fit(
 
 
 def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
-    """Return the indices of each Welch fit against the ratio of the whole record's transforms."""
+    """Return MSE, WMSE and MD of each Welch fit against the ratio of the record's transforms."""
     measured_frf, record = welch_analysis.whole_record, welch_analysis.record
     grid = FrequencyResponseModel(measured_frf.frequency_hz, record.beam, record.tool_inertia_kg_m2)
     return [
@@ -87,7 +90,7 @@ def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
 
 
 def _fit_indices(measured_frf: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
-    """Return the paper's indices MSE, WMSE and MD of a model, against a measured response."""
+    """Return the errors MSE, WMSE and MD of a model's response against a measured response."""
     is_finite = np.isfinite(measured_frf.response)
     if not is_finite.any():
         return NOT_COMPARED
@@ -225,7 +228,7 @@ def record_entries(
 
 
 def _damping_size_json(damping_size: DampingSize | None) -> dict[str, Any] | None:
-    """Return a damping size as a JSON object; null if there is none."""
+    """Return the size of a damping (loss factor or coefficient) for JSON; None if unknown."""
     return None if damping_size is None else asdict(damping_size)
 
 
@@ -263,7 +266,7 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
 
 
 def _loss_factor_json(loss_factor: LossFactor | None) -> dict[str, list[float]] | None:
-    """Return a loss factor with its 95 % band as JSON lists; null if there is none."""
+    """Return a loss factor over frequency and its 95 % band as lists; None without one."""
     if loss_factor is None:
         return None
     lower_limit, upper_limit = loss_factor.limits()

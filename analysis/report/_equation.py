@@ -116,7 +116,10 @@ def _damping_term(
 
 
 def _elastic_factor(structure: Structure) -> Formula | None:
-    """Return the factor ``1 + zeta s^alpha`` of a structure; None without internal damping."""
+    """Return ``1 + zeta s^alpha`` of a damping structure as a formula.
+
+    It is None without internal damping.
+    """
     if not structure.internal:
         return None
     return _join(
@@ -144,7 +147,10 @@ def _inertial_terms(structure: Structure) -> Formula:
 
 
 def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
-    """Return Eq. 25 of the reference paper, and the equation of its beta."""
+    """Return the equation of the beam's response and that of the wave number beta in it.
+
+    The first is Eq. 25 of the reference paper.
+    """
     elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
     sin, cos, sinh, cosh = (
         _function_of(function_word, z) for function_word in ("sin", "cos", "sinh", "cosh")
@@ -253,9 +259,10 @@ def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
 
 
 def _reported_structure(whole_record: WholeRecord) -> Structure:
-    """Return the structure of the reported parameters.
+    """Return the damping structure to which the reported parameters belong.
 
-    With a tolerance of the geometry it is the structure with both orders free.
+    If the parameters are estimated with a tolerance of the beam's geometry, the orders of internal
+    and external damping are both free.
     """
     return (
         whole_record.fit.structure if whole_record.headline.tolerant is None else STRUCTURES["VI"]

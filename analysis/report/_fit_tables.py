@@ -40,7 +40,10 @@ _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by t
 
 
 def structures_table(whole_record: WholeRecord) -> Table:
-    """Return the table of all whole-record fits; orders without support are marked."""
+    """Return the table of all whole-record fits, with one row for each damping structure.
+
+    Fractional orders that the data do not determine are marked.
+    """
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
     unsupported_orders = whole_record.unsupported
     delta_bic = whole_record.delta_bic
@@ -101,7 +104,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
 
 
 def _marked_row(whole_record: WholeRecord) -> str:
-    """Return to which values the marked row belongs, for the note of the table."""
+    """Return what the highlighted row of the table of fits contains, as part of a note."""
     return (
         "the one reported"
         if whole_record.headline.exact is None
@@ -110,7 +113,7 @@ def _marked_row(whole_record: WholeRecord) -> str:
 
 
 def _hidden_cell(cell: Cell) -> Cell:
-    """Return a cell that shows a dash to people but contains its number for programs."""
+    """Return a cell that is displayed as a dash, and has its number in the CSV file."""
     return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
 
 
@@ -331,7 +334,7 @@ _FAR_MODE_MARK: Final = "‡"
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     """Return the table of modes from each Welch fit's poles; None if no fit has modes.
 
-    Modes that are not the antenna's are marked or omitted.
+    A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
     """
     fitted_models = analysis.models
     most_modes = max((len(model.modes) for model in fitted_models), default=0)

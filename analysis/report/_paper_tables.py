@@ -44,9 +44,10 @@ FIT_NAME_COLUMNS: Final = (
 
 
 def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
-    """Return the paper's tables from the campaign's Welch fits; nothing without Welch fits.
+    """Return the reference paper's tables with the numbers of the campaign's Welch fits.
 
-    On request they contain the paper's own numbers in parentheses.
+    There are none without Welch fits. With `with_paper` the tables also contain the paper's own
+    numbers in parentheses.
     """
     if not campaign.nominal:
         return ()
@@ -151,7 +152,10 @@ _PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{}
 
 
 def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Return the table of the resonance peaks' mean deviations (Table 4)."""
+    """Return the table of mean deviations of the models' resonance peaks from the measured ones.
+
+    It corresponds to the paper's Table 4.
+    """
     type_names = list(dict.fromkeys(nominal_model.structure for nominal_model in campaign.nominal))
     weightings = list(dict.fromkeys(nominal_model.weighting for nominal_model in campaign.nominal))
     deviations = {

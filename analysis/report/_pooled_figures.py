@@ -56,7 +56,7 @@ class _PooledFit:
 
     @classmethod
     def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
-        """Return the estimate to which a campaign's parameters belong; None if there is none."""
+        """Return the pooled estimate whose parameters a campaign reports; None without one."""
         modal_result, pooled_estimate = campaign.modal, campaign.headline
         tolerant_estimate = modal_result.tolerant if modal_result else None
         if tolerant_estimate is None:
@@ -73,7 +73,11 @@ class _PooledFit:
 
     @classmethod
     def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
-        """Return a pooled estimate with its covariance enlarged for a small number of sessions."""
+        """Return a pooled estimate with an enlarged covariance.
+
+        With it, intervals of 1.96 standard deviations are as wide as those of Student's t for the
+        number of sessions.
+        """
         # Bands are 1.96 standard deviations wide, but Student's t of a few sessions is larger.
         interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
@@ -172,7 +176,7 @@ def _session_count_of_modes(campaign: CampaignResult, pooled_estimate: PooledEst
 def _session_estimates_of_mode(
     campaign: CampaignResult, pooled_estimate: PooledEstimate, mode: PooledMode
 ) -> list[ModeEstimate]:
-    """Return the estimates of one mode from every session, by the pooled mode's model."""
+    """Return each session's estimate of one mode, from the same model as the pooled mode."""
     if mode.source == "modal":
         modal_fits = (session.modal for session in campaign.sessions)
         return [

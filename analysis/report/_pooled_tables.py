@@ -98,7 +98,10 @@ def structures_table(campaign: CampaignResult) -> Table:
 
 
 def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
-    """Return the reported pooled estimate, and the one with the lowest BIC if it differs."""
+    """Return the reported pooled estimate, and that of the structure with the lowest BIC.
+
+    BIC is the Bayesian information criterion. There is one estimate if both are the same.
+    """
     estimates_by_name = {
         estimate.name: estimate
         for estimate in (campaign.headline, *campaign.pooled[:1])
@@ -117,7 +120,10 @@ def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> st
 
 
 def exact_condition_text(campaign: CampaignResult) -> str:
-    """Return the condition under which a pooled estimate holds; empty without a condition."""
+    """Return the words for the condition that the beam is exactly uniform.
+
+    They are empty if the pooled estimate does not depend on it.
+    """
     return f", {EXACTLY_UNIFORM_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
@@ -241,10 +247,10 @@ def _pooled_row(
 
 
 def tolerance_table(campaign: CampaignResult) -> Table:
-    """Return the table of parameters with a tolerance of the geometry.
+    """Return the table of a campaign's parameters if the beam is uniform within a tolerance.
 
-    It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance is
-    stated.
+    It also contains the parameters that an exactly uniform beam would have. It has no rows if no
+    tolerance of the beam's geometry is stated.
     """
     modal_result, reported_numbers = campaign.modal, campaign_numbers(campaign)
     tolerant_estimate = modal_result.tolerant if modal_result else None
@@ -438,7 +444,7 @@ def specimens_table(campaign: CampaignResult) -> Table:
 
 
 def homogeneity_table(campaign: CampaignResult) -> Table:
-    """Return the table of each mode's and parameter's scatter between the sessions."""
+    """Return the table of each quantity's scatter between sessions: of modes and parameters."""
     homogeneity = campaign.homogeneity
 
     def row(scatter: Heterogeneity) -> Row:
@@ -480,7 +486,11 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
 
 
 def _decimals_of_scatter(scatter: Heterogeneity) -> int:
-    """Return the number of decimals that show the scatter or the sessions' own uncertainty."""
+    """Return the number of decimals for the mean of a quantity over the sessions.
+
+    It follows from the larger one of the scatter between the sessions and their smallest standard
+    deviation.
+    """
     _, display_factor, _ = label(scatter.quantity)
     shown_std = display_factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
     return min(decimals(shown_std), 9)
@@ -492,5 +502,8 @@ def chance_cell(p_value: float) -> Cell:
 
 
 def with_mark(cell_text: str, quantity_name: str, homogeneity: Homogeneity) -> str:
-    """Return a text with the mark of a mixture, if the sessions differ in kind in the quantity."""
+    """Return a text, with a symbol if the sessions form groups with different values.
+
+    `quantity_name` is the name of the quantity in which the groups differ.
+    """
     return f"{cell_text} {MIXTURE_MARK}" if homogeneity.is_mixed(quantity_name) else cell_text

@@ -317,7 +317,10 @@ def _draw_loss_factors(
     supported_hz: tuple[float, float] | None,
     unsupported_orders: Collection[str],
 ) -> list[NDArray[np.float64]]:
-    """Draw the loss factors where the data support them, and return the drawn values."""
+    """Draw the loss factors in the band in which the data determine them.
+
+    Returns the values of each curve.
+    """
     if supported_hz is None or loss_model is None:
         return []
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
@@ -556,10 +559,9 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         frf_figure(measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
         f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; "
-        "half-width "
-        f"of the model's 95 % band; details of the modes ({modes_text} Hz). The band is narrower "
-        "than "
-        "the line where it is not seen.",
+        f"half-width of the model's 95 % band; details of the modes ({modes_text} Hz). The band is "
+        "narrower "
+        "than the line where it is not seen.",
     )
     uniformity_test = headline.uniform_beam
     if uniformity_test is not None and uniformity_test.p_value is not None:
@@ -588,8 +590,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
         "records or more if only noise is left; and its power through the record. Excess at a "
         f"mode or at one time is what the model lacks. Mean power {mean_power_ratio:.4g} times "
-        "that of the "
-        "noise.",
+        "that of the noise.",
     )
     yield Illustration(
         signals_name,
@@ -608,8 +609,7 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
     if not has_curves:
         return (
             f"Loss factor over frequency: {points_text}. There is no curve, because no beam with "
-            "one "
-            f"internal and one external order explains the losses.{reasons_text}"
+            f"one internal and one external order explains the losses.{reasons_text}"
         )
     curves_text = (
         f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
@@ -629,7 +629,7 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
 
 
 def _describe_curve_model(whole_record: WholeRecord) -> str:
-    """Return to which beam the curves of the loss factors belong, for the figure's caption."""
+    """Return of which beam model the curves of the loss factors are, for the figure's caption."""
     tolerant_estimate = whole_record.headline.tolerant
     if tolerant_estimate is None:
         return f"type {whole_record.headline.name}"
@@ -640,7 +640,7 @@ def _describe_curve_model(whole_record: WholeRecord) -> str:
 
 
 def _reasons_of_hollow_points(headline: Headline) -> str:
-    """Return why points are hollow, for the figure's caption; empty if none are."""
+    """Return why damping ratios are drawn as hollow points, for a caption; empty if none are."""
     flag_texts = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )

@@ -162,16 +162,16 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
     if other_resonances_hz:
         yield (
             f"The modal model has a further resonance at {listed(other_resonances_hz)} Hz, which "
-            "is not one "
-            "of the beam's (sensor, mount)."
+            "is not one of the beam's (sensor, mount)."
         )
 
 
 def parameters_table(whole_record: WholeRecord) -> Table:
-    """Return the table of all parameters with uncertainties; flagged ones are marked.
+    """Return the table of all reported parameters with uncertainties.
 
     If the file states the uncertainties of the scales, the table also contains intervals that
-    include them. The last column states the reason for a mark.
+    include them. Parameters that are not properties of the antenna are marked, and the last column
+    states why.
     """
     headline = whole_record.headline
     parameters_with_scales = whole_record.combined
@@ -312,9 +312,9 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
 
 
 def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
-    """Return the table that compares reported values with a simpler structure's.
+    """Return the table of the parameters of a simpler damping structure beside the reported ones.
 
-    It is None if no simpler structure is sufficient.
+    It is None if no structure with fewer free parameters is sufficient for the record.
     """
     headline: Estimates = whole_record.headline.exact or whole_record.headline
     simpler_estimates = headline.simpler
@@ -487,7 +487,7 @@ def _interval_ends(reported_value: ReportedValue) -> tuple[float | None, float |
 
 
 def _reason_notes(reported_values: Iterable[ReportedValue]) -> tuple[str, ...]:
-    """Return a note for each reason for which quantities are marked."""
+    """Return one note for each different reason for which values are marked as not reported."""
     flag_texts = dict.fromkeys(
         reported_value.flag for reported_value in reported_values if reported_value.flag is not None
     )

@@ -186,7 +186,7 @@ def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
 
 
 def draw_welch_fits(analysis: WelchAnalysis, tables_markdown: str, stream: RecordingStream) -> None:
-    """Draw all pages of the Welch fits, which are the same at any time of the session.
+    """Send the charts and tables of the Welch fits to Rerun, independent of the session's time.
 
     Parameters
     ----------
@@ -211,7 +211,7 @@ def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
 
 
 def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
-    """Draw the charts of a page with their curves, reduced to the pixels of a view."""
+    """Draw the three charts of a tab with their curves, which are decimated for the screen."""
     decimation = CurveDecimation.logarithmic(
         fit_page.frequency_hz, *fit_page.band_hz, _FREQUENCY_GROUPS
     )

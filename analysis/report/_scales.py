@@ -67,8 +67,7 @@ def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     )
     yield (
         f"Mass per length from the record, ρ/EI times EI: {found_value.text} ± {found_std.text} "
-        "g/m (std); "
-        f"stated: {stated_value.text} ± {stated_std.text} g/m. "
+        f"g/m (std); stated: {stated_value.text} ± {stated_std.text} g/m. "
         + (
             "They agree."
             if density_result.agree
@@ -78,7 +77,7 @@ def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
 
 
 def _scale_dependence(whole_record: WholeRecord) -> str:
-    """Return how each parameter depends on the scales, as a list of powers."""
+    """Return as text how each parameter depends on the scales, as products of their powers."""
     return ", ".join(
         f"{QUANTITIES[parameter_name][0]} ∝ {_product_text(SCALE_EXPONENTS[parameter_name])}"
         for parameter_name in whole_record.headline.parameters

@@ -105,7 +105,7 @@ def _main_results(whole_record: WholeRecord) -> RenderableType:
 
 
 def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
-    """Return a table without notes, except those that explain marked numbers."""
+    """Return a table with only those notes that explain numbers marked as not reported."""
     mark_notes = tuple(
         table_note for table_note in table.notes if table_note.startswith(NOT_REPORTED_MARK)
     )
@@ -297,12 +297,15 @@ def _size_text(loss_factor: ReportedLossFactor) -> str:
 
 
 def _coefficient_is_flagged(headline: Headline, loss_factor: ReportedLossFactor) -> bool:
-    """Return whether the coefficient of a damping carries a flag."""
+    """Return whether the coefficient of a damping is flagged as not a property of the antenna."""
     return headline.parameters[_DAMPING_SYMBOLS[loss_factor.damping][2]].flag is not None
 
 
 def _order_text(headline: Headline, loss_factor: ReportedLossFactor) -> str:
-    """Return the order of a damping as the end of a sentence."""
+    """Return the fractional order of a damping as the end of a sentence.
+
+    It is empty for parameters with a tolerance of the geometry.
+    """
     *_others, order_name, order_symbol = _DAMPING_SYMBOLS[loss_factor.damping]
     order_value = headline.parameters[order_name]
     if headline.tolerant is None and order_name not in headline.fit.structure.free:

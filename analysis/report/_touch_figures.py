@@ -118,7 +118,7 @@ def _draw_force(axes: Axes, estimate: TouchEstimate, touch_time_s: float) -> Non
 def _draw_innovations(
     axes: Axes, estimate: TouchEstimate, channel_row: int, channel_name: str, touch_time_s: float
 ) -> None:
-    """Draw the innovations of one channel over time, in standard deviations."""
+    """Draw one channel's deviations from the prediction (innovations), in standard deviations."""
     times_ms = 1e3 * (estimate.innovation_times_s - touch_time_s)
     axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0)
     axes.axvline(0.0, color=style.GREY, linewidth=0.8)

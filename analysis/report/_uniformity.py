@@ -132,8 +132,7 @@ def uniformity_description(uniformity_test: UniformBeamTest) -> str:
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
         "uniform beam are), below in per cent with the 95 % interval (phase: per cent of 1 rad). "
         f"Chi-square {uniformity_test.chi_square:.4g} for {uniformity_test.degrees_of_freedom} "
-        "degrees of freedom. "
-        f"{uniformity_test.summary.sentence}"
+        f"degrees of freedom. {uniformity_test.summary.sentence}"
     )
 
 

@@ -461,7 +461,10 @@ def _loss_with_slopes(
 
 
 def _rows_by_parameter(fit: Estimate, slopes_by_name: dict[str, Real], point_count: int) -> Real:
-    """Return slopes by parameter name as rows in the order of the fit's covariance, (k, n)."""
+    """Return slopes as rows (k, n) in the order of the parameters in the fit's covariance.
+
+    A parameter without slopes has a row of zeros.
+    """
     return np.array(
         [
             slopes_by_name.get(parameter_name, np.zeros(point_count))
@@ -477,7 +480,7 @@ def _standard_deviations(gradient: Real, covariance: Real) -> Real:
 
 
 def _logarithmic_limits(central_value: Real, log_std: Real) -> tuple[Real, Real]:
-    """Return the limits of a value's 95 % interval, which is symmetric in the logarithm."""
+    """Return the lower and upper limit of a 95 % interval that is symmetric in the logarithm."""
     # An undetermined value may overflow. Its band then includes everything.
     limit_factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
     return central_value / limit_factor, central_value * limit_factor

@@ -74,8 +74,7 @@ def report_folders(
     else:
         raise OutputExistsError(
             f"--report {report_path} exists and is not an empty folder; choose another name, or "
-            "replace "
-            "an earlier report with --overwrite. Nothing is overwritten without it."
+            "replace an earlier report with --overwrite. Nothing is overwritten without it."
         )
     reserved_folders: set[Path] = set()
     if not overwrite:
@@ -123,7 +122,7 @@ def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False)
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a path does not exist, or is an empty folder."""
+    """Return True if a path does not exist or is an empty folder, so that a report fits there."""
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
 
@@ -270,8 +269,8 @@ def _replace_report(
         ):
             raise OutputExistsError(
                 f"The report {folder} is unchanged: {file_name} in it was modified, or not "
-                "written by "
-                "an analysis, and --overwrite does not replace such files; move it away, or choose "
+                "written by an analysis, and --overwrite does not replace such files; move it "
+                "away, or choose "
                 "another folder with --report."
             )
     try:
@@ -310,7 +309,7 @@ def _is_unchanged_report_file(
 
 
 def _read_list(folder: Path) -> dict[str, set[str]]:
-    """Return the listed SHA-256 checksums of a report's files, by name.
+    """Return the SHA-256 checksums that the list in a report's folder states, by file name.
 
     A file that was being replaced at an interruption has two checksums.
     """

@@ -35,7 +35,7 @@ Value = str | float | bool | None
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Cell of a table whose displayed text differs from the standard format of its value.
+    """Cell of a table with a displayed text of its own, instead of the column's number format.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Column:
         return self.number_format != TEXT_FORMAT
 
     def shown(self, entry: Entry) -> Cell:
-        """Return the cell that people see for an entry of this column."""
+        """Return the cell with the text that is displayed for an entry of this column."""
         if isinstance(entry, Cell):
             return entry
         if isinstance(entry, bool):
@@ -459,19 +459,19 @@ def unreported_parameters(
 
 
 def mark_cell(cell: Cell) -> Cell:
-    """Return a cell in grey with the mark of numbers that are not reported; dashes get no mark."""
+    """Return a cell in grey with the symbol † for "not reported"; a dash gets no symbol."""
     return grey_cell(
         cell if cell.value is None else replace(cell, text=cell.text + NOT_REPORTED_MARK)
     )
 
 
 def grey_cell(cell: Cell) -> Cell:
-    """Return a cell in grey, such as a number that belongs to a marked number."""
+    """Return a cell in grey, such as the standard deviation of a number that is not reported."""
     return replace(cell, doubtful=cell.value is not None)
 
 
 def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
-    """Return the note that explains the mark, if an order is not reported; else nothing."""
+    """Return the note on the symbol † if fractional orders are not reported, else nothing."""
     if not unsupported_orders:
         return ()
     order_symbols = " or ".join(
@@ -479,6 +479,5 @@ def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
     )
     return (
         f"{NOT_REPORTED_MARK} not reported: the data support no order {order_symbols}. The number "
-        "belongs "
-        "to its curve, not to the antenna.",
+        "belongs to its curve, not to the antenna.",
     )

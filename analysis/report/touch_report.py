@@ -141,7 +141,7 @@ def session_lines(session: TouchedSession) -> list[str]:
 
 
 def model_words(session: TouchedSession) -> str:
-    """Return the source of the beam model as text."""
+    """Return as text from where the parameters of a session's beam model are."""
     model_source = session.model.source
     return "the nominal beam of the attached profile" if model_source == "profile" else model_source
 
@@ -290,6 +290,5 @@ def _beam_text(session: TouchedSession) -> str:
     model_beam = session.model.beam
     return (
         f"length {model_beam.length_m:g} m, density {model_beam.density_kg_per_m:.5g} kg/m, "
-        "bending stiffness "
-        f"{model_beam.bending_stiffness_n_m2:.5g} N·m²"
+        f"bending stiffness {model_beam.bending_stiffness_n_m2:.5g} N·m²"
     )

@@ -75,7 +75,7 @@ StampedRow = tuple[str, SessionRow]
 
 
 class Index:
-    """Index of the sessions in one folder.
+    """Index file with the data of the sessions in one folder (SQLite).
 
     Parameters
     ----------
@@ -88,7 +88,10 @@ class Index:
         self._path = folder / INDEX_NAME
 
     def read(self) -> dict[str, StampedRow]:
-        """Return the index's rows with their stamps, by file name; empty without a valid index."""
+        """Return the index's rows by file name, each with the size and time (stamp) of its files.
+
+        The dictionary is empty without a valid index.
+        """
         if not self._is_own_index():
             return {}
         indexed_rows: dict[str, StampedRow] = {}
@@ -180,7 +183,7 @@ class Index:
             database.close()
 
     def _is_own_index(self) -> bool:
-        """Return whether the file is an index of this program, or empty."""
+        """Return True if the index file was written by this program or is empty."""
         try:
             with self._path.open("rb") as index_file:
                 first_bytes = index_file.read(_APPLICATION_ID_POSITION.stop)

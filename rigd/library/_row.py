@@ -41,7 +41,7 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """Session of a folder with the data from its files.
+    """Data of one session in a folder, from the session file and the files of its results.
 
     Unknown values are empty texts or None. Texts are printable and cut to 1000 characters.
     """
@@ -107,7 +107,9 @@ class SessionRow:
 def read_row(
     path: Path, quick_look: Path | None, report_folder: Path | None
 ) -> tuple[SessionRow, bool]:
-    """Return the row of a session. Files that cannot be read are reported in the row.
+    """Return the data of a session, and whether they can be stored in the index.
+
+    A file that cannot be read is reported in the row.
 
     Parameters
     ----------
@@ -182,10 +184,10 @@ def read_row(
         late=_count_of_key(outcome_document, "late"),
         lost=_count_of_key(outcome_document, "lost"),
         meta={
-            _cut_text(session_id): _cut_text(entry_value)
+            _cut_text(entry_name): _cut_text(entry_value)
             if isinstance(entry_value, str)
             else entry_value
-            for session_id, entry_value in user_metadata
+            for entry_name, entry_value in user_metadata
         },
         problem=file_summary.problem,
         **results_of_analysis,
@@ -226,7 +228,10 @@ def _number_of_key(key_texts: Mapping[str, str], key: str) -> float | None:
 
 
 def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Document:
-    """Return modes and validity from the report, else from the quick look, else nothing."""
+    """Return the modes and the validity of the linear model from a session's results.
+
+    The report has priority over the quick look. Without results the dictionary is empty.
+    """
     if report_folder is not None:
         for headline_document in _list_in_document(
             _read_json(report_folder / RESULTS_FILE), "headlines"

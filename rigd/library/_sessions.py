@@ -159,7 +159,10 @@ class _SessionFiles:
         self.report: Path | None = None
 
     def add_results(self, quick_look: Path | None, report_folder: Path | None) -> None:
-        """Add quick look and report, and append their stamps to the stamp of the session file."""
+        """Add the paths of quick look and report.
+
+        Their sizes and times are appended to those of the session file.
+        """
         self.quick_look, self.report = quick_look, report_folder
         if quick_look is not None:
             self.stamp += f" look {_stamp_of(quick_look)}"

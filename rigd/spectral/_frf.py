@@ -114,7 +114,7 @@ class FrequencyResponse:
 def checked_records(
     input_: ArrayLike, output: ArrayLike, rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return input and output as float arrays after a check; raise if they are not valid.
+    """Return the records of input and output as arrays of floats; raise SpectralError if invalid.
 
     They must have one dimension, equal length and finite values, and the input must not be zero.
 
@@ -137,8 +137,7 @@ def checked_records(
             invalid_count = int(np.count_nonzero(~np.isfinite(record)))
             raise SpectralError(
                 f"{invalid_count} of {record.size} samples of the {record_name} are NaN or "
-                "infinite; "
-                "fill or cut them before estimating a frequency response."
+                "infinite; fill or cut them before estimating a frequency response."
             )
     if not x.any():
         raise SpectralError(
@@ -339,7 +338,7 @@ class CrossSpectra:
 
     @classmethod
     def of_zero_segments(cls, bin_count: int) -> "CrossSpectra":
-        """Return spectra that are zero in each bin, to which segments can be added."""
+        """Return spectra without segments, which are zero in each bin."""
         return cls(
             np.zeros(bin_count), np.zeros(bin_count), np.zeros(bin_count, dtype=np.complex128)
         )

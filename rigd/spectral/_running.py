@@ -354,7 +354,9 @@ paper's segments join (−15 dB)."""
 
 
 def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
-    """Return in which bins the reference has power that has not leaked from other bins.
+    """Return True for bins in which the reference angle has power of its own.
+
+    Power that leaks from other bins does not count.
 
     Parameters
     ----------
@@ -379,9 +381,9 @@ def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> 
 
 
 def _is_near_marked(is_marked: NDArray[np.bool_], distance_bins: int) -> NDArray[np.bool_]:
-    """Return whether each bin is within `distance_bins` bins of a marked one.
+    """Return True for each bin within `distance_bins` bins of a bin where `is_marked` is True.
 
-    Beyond the ends, the marks of the end bins continue.
+    Bins beyond either end count like the end bin.
     """
     marked_counts = np.cumsum(np.pad(is_marked, (distance_bins + 1, distance_bins), mode="edge"))
     is_near: NDArray[np.bool_] = (

@@ -17,7 +17,7 @@ With this ratio the level of a sine between two bins is low by at most 0.1 dB.""
 
 
 class RunningSpectrogram:
-    """Spectrogram of a signal that arrives in blocks, with a column of levels in every step.
+    """Spectrogram of a signal that arrives in blocks, with one column of levels per time step.
 
     The window is Hann's. A sine of amplitude A has the level 20 log10 A at its frequency, in dB re
     1 of the signal's unit. A constant A has this level at frequency 0.
@@ -63,7 +63,7 @@ class RunningSpectrogram:
     def feed(
         self, ticks: ArrayLike, signal_values: ArrayLike
     ) -> list[tuple[float, NDArray[np.float64]]]:
-        """Add samples and return the columns that they complete.
+        """Add samples and return the columns (time in s, levels in dB) that they complete.
 
         Parameters
         ----------

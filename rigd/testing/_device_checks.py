@@ -23,7 +23,7 @@ def _require(is_satisfied: bool, message: str) -> None:
 def _run_ticks(
     devices: Devices, first_tick: int, tick_count: int, torque_nm: float | None = None
 ) -> tuple[list[float], list[Wrench]]:
-    """Run some ticks of the loop and return the motor angles and wrenches that were read."""
+    """Run ticks of the control loop and return the motor angles (rad) and wrenches read."""
     angles_rad, wrenches = [], []
     for tick in range(first_tick, first_tick + tick_count):
         devices.drive.latch(tick * _PERIOD_NS)

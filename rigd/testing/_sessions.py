@@ -64,7 +64,7 @@ def beam_torque(
     tool_inertia_kg_m2: float = 0.0,
     delay_s: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the coupling torque that the exact model gives for a motion of the motor.
+    """Return the coupling torque in N·m that the exact beam model gives for a motor motion.
 
     Parameters
     ----------

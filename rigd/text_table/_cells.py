@@ -70,7 +70,10 @@ def number_of(cell: str, decimal_sign: str) -> float:
 
 
 def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
-    """Return a fast function from a cell to its number; it raises ValueError if in doubt."""
+    """Return a fast function that converts a cell to its number.
+
+    The function raises ValueError for a cell that may not be a number.
+    """
     return float if decimal_sign == POINT else _number_with_comma
 
 
@@ -99,7 +102,7 @@ class ThousandsCheck:
         self.plain = False
 
     def proves_decimal_sign(self, cell: str, line_number: int) -> bool:
-        """Add a cell and return whether it proves that the sign is a decimal sign."""
+        """Check a cell; return True if it proves that the sign is not a thousands separator."""
         cell_text = cell.strip()
         if self._decimal_sign not in cell_text:
             self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(cell_text) is not None

@@ -25,7 +25,10 @@ _PERIOD_PATTERN: Final = re.compile(
 
 
 def stated_rate_hz(head_lines: Iterable[str]) -> float | None:
-    """Return the sampling rate that a line states; None if none does. The default unit is Hz."""
+    """Return the sampling rate in Hz that a line above the table states; None without one.
+
+    A rate without a unit is in Hz.
+    """
     for head_line in head_lines:
         rate_match = _RATE_PATTERN.search(head_line)
         if rate_match:

@@ -163,8 +163,7 @@ def wrong_width_message(
         remedy_text = "repair or remove the line; an unknown value is an empty cell"
     return (
         f"line {line_number} has {_count_with_noun(cell_count, 'cell')} between {separator_name}, "
-        "and "
-        f"{expected_width}: {cause_text}; {remedy_text}."
+        f"and {expected_width}: {cause_text}; {remedy_text}."
     )
 
 
@@ -358,7 +357,7 @@ def _layout_below_titles(
     requested_names: Sequence[str],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
-    """Return the layout of the table below a row of titles."""
+    """Return the layout of the table below a row of titles, or raise an error for the user."""
     titles_row = rows[titles_index]
     raw_titles, plain_titles = (
         without_trailing_empty_cells(titles_row.cells, 0),
@@ -389,8 +388,8 @@ def _layout_below_titles(
                 _RANK_ALL_TITLES,
                 TableError(
                     f"{titles.count(column_name)} columns are named '{column_name}' (line "
-                    f"{titles_row.line}); "
-                    f"give the number, such as #{titles.index(column_name) + 1} for the first of "
+                    f"{titles_row.line}); give the number, such as "
+                    f"#{titles.index(column_name) + 1} for the first of "
                     "them."
                 ),
             )
@@ -458,8 +457,7 @@ def comma_in_single_message(line_number: int) -> str:
     """Return the error message for a table of one column with decimal commas."""
     return (
         f"line {line_number} has a comma, which separates two cells, and the table has one "
-        "column; save "
-        "the file with decimal points."
+        "column; save the file with decimal points."
     )
 
 
@@ -471,7 +469,7 @@ def _next_row(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
 def _is_data(
     row_cells: Sequence[str], column_indices: Sequence[int], next_row: TextRow | None
 ) -> bool:
-    """Return whether a row is one of numbers.
+    """Return True if a row belongs to the numbers of the table.
 
     It must have numbers in the requested columns, and no text where the next row has a number.
     """
@@ -522,15 +520,14 @@ def not_a_number_error(line_number: int, column_name: str, cell_text: str) -> Ta
     if is_date(cell_text):
         return TableError(
             f"line {line_number}: '{column_name}' is a date or a time of day{{cell}} that is not "
-            "understood; "
-            "write times as 2026-11-25 12:00:00.001 or in seconds, or leave them out and state the "
+            "understood; write times as 2026-11-25 12:00:00.001 or in seconds, or leave them out "
+            "and state the "
             "rate (--rate-hz).",
             cell_text,
         )
     return TableError(
         f"line {line_number}: '{column_name}' is not a number{{cell}}; below the titles and one "
-        "line of units "
-        "only numbers are allowed.",
+        "line of units only numbers are allowed.",
         cell_text,
     )
 
@@ -542,7 +539,7 @@ def _layout_from_numbers(
     column_numbers: Sequence[int],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout | None:
-    """Return the layout if a row is the first one with numbers; None if it is not.
+    """Return the layout if the row at `row_index` is the first one with numbers; else None.
 
     The requested columns are given by their numbers.
     """

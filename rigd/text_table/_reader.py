@@ -223,8 +223,8 @@ def _lines_of_bounded_length(text_stream: TextIOWrapper) -> Iterator[str]:
         if len(text_line) > MOST_LINE_CHARACTERS:
             raise TableError(
                 f"line {line_number}: a line of more than {MOST_LINE_CHARACTERS} characters; a "
-                "table "
-                "has one line per sample and few channels. Export the session's channels alone."
+                "table has one line per sample and few channels. Export the session's channels "
+                "alone."
             )
         yield text_line
 
@@ -270,7 +270,7 @@ class _NumberRows:
         return f"#{column_index + 1}"
 
     def fit(self, row: Sequence[str], line_number: int) -> list[str]:
-        """Return a row with the table's number of cells, or raise TableError."""
+        """Return a row with as many cells as the table has columns, or raise TableError."""
         column_count = self.layout.width
         fitted_cells = without_trailing_empty_cells(row, column_count)
         if column_count - self.layout.optional_columns <= len(fitted_cells) < column_count:
@@ -296,8 +296,7 @@ class _NumberRows:
                 if cell and not is_any_number(cell):
                     raise TableError(
                         f"line {line_number}: column {column_index + 1} is not a number{{cell}}, "
-                        "unlike in the "
-                        "lines above; remove the line if it is not a sample.",
+                        "unlike in the lines above; remove the line if it is not a sample.",
                         cell,
                     )
                 cell_numbers.append(float("nan"))
@@ -317,8 +316,7 @@ class _NumberRows:
         if is_stamp(cell):
             raise TableError(
                 f"line {line_number}: '{self.title(column_index)}' is of another day{{cell}}, and "
-                "the order of "
-                "day and month is not clear; write the date as 2026-11-25.",
+                "the order of day and month is not clear; write the date as 2026-11-25.",
                 cell,
             )
         raise not_a_number_error(line_number, self.title(column_index), cell)
@@ -332,8 +330,8 @@ class _NumberRows:
         if is_number(cell, POINT):
             return TableError(
                 f"line {line_number}: '{self.title(column_index)}' has a decimal point{{cell}}, "
-                "and other "
-                "numbers have decimal commas; save the file with one of them, and without "
+                "and other numbers have decimal commas; save the file with one of them, and "
+                "without "
                 "separators between thousands.",
                 cell,
             )
@@ -359,8 +357,8 @@ class _NumberRows:
                 raise TableError(
                     f"line {thousands_check.grouped_line}: the {sign_noun} in "
                     f"'{self.title(column_index)}' may be decimal signs or separators between "
-                    "thousands, "
-                    "as each has three digits behind it; save the file with decimal points and "
+                    "thousands, as each has three digits behind it; save the file with decimal "
+                    "points and "
                     "without separators between thousands."
                 )
 
@@ -522,8 +520,7 @@ def _text_table(
             if x_dimension.lower() not in _TIME_DIMENSIONS:
                 raise TableError(
                     f"'{requested_name}' is not a function of time by the X_Dimension of the "
-                    f"head{{cell}}; "
-                    "give measured samples.",
+                    f"head{{cell}}; give measured samples.",
                     x_dimension,
                 )
             period_s = layout.labview.number("Delta_X", column_index)

@@ -91,7 +91,7 @@ _TRAIL_COLOR: Color = (70, 115, 145)
 
 
 class Antenna:
-    """Drawing of the motor and the bending beam during one session.
+    """Drawing of the motor and of the antenna, which is a flexible beam, during one session.
 
     Parameters
     ----------
@@ -124,10 +124,10 @@ class Antenna:
         return static_drawings()
 
     def samples(self, samples: Records) -> list["Drawing"]:
-        """Return functions that draw the beam for new samples (n,) of ``SAMPLE_DTYPE``, in order.
+        """Return functions that draw the bent beam for new samples (n,) of ``SAMPLE_DTYPE``.
 
-        The beam is drawn 20 times per second. Across gaps between samples the angle is
-        interpolated.
+        The samples are in order of time. The beam is drawn 20 times per second. Across gaps
+        between samples the motor angle is interpolated.
         """
         if len(samples) == 0:
             return []
@@ -220,7 +220,7 @@ class Antenna:
         ]
 
     def _interpolate_to_ticks(self, samples: Records) -> Real:
-        """Return (time in ns, angle in rad) of every tick up to the last sample, shape (n, 2).
+        """Return time (ns) and motor angle (rad) of every tick to the last sample, shape (n, 2).
 
         The first row is the tick after the previous sample. Ticks without a sample have
         interpolated values.

@@ -167,7 +167,10 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
 
 
 def _targets(fit: Fit) -> list[Mapping[str, Any]]:
-    """Return the target precisions of a fit's search; an empty list without a search."""
+    """Return the standard deviations that a session is to reach, each with its estimate.
+
+    The list is empty if the session does not stop at a precision.
+    """
     return list((fit.get("search") or {}).get("targets") or ())
 
 
@@ -175,7 +178,9 @@ def _targets(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return a Markdown table of a fit: target and reached precisions, modes and parameters.
+    """Return Markdown tables of a fit: requested and reached standard deviations, and values.
+
+    The values are those of the modes and of the parameters.
 
     Parameters
     ----------
@@ -235,7 +240,7 @@ def _markdown_table(*column_headings: str, table_rows: list[tuple[str, ...]]) ->
 
 
 def _target_row(target_precision: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the table row of a target precision: name, value, reached and target deviation."""
+    """Return a table row: name, value, reached and requested standard deviation of a quantity."""
     estimated_value, reached_std, target_std = (
         target_precision["value"],
         target_precision["std"],

@@ -53,7 +53,7 @@ class Gauge:
 
 
 class Gauges:
-    """Calculator of the largest magnitudes of each signal, for successive blocks of samples.
+    """Calculator of the largest magnitude of each signal in successive blocks of samples.
 
     The rms torque (i²t) is computed as if the motor were cold at the first sample.
 
@@ -124,7 +124,7 @@ class Gauges:
         return sqrt(self._heat_nm2)
 
     def forget_angle(self) -> None:
-        """Forget the last angle, so that no speed is computed across two records."""
+        """Forget the last motor angle, so that no speed is computed from angles of two records."""
         self._last = None
 
     def _speeds_from_fresh_angles(self, samples: Records) -> npt.NDArray[np.float64]:

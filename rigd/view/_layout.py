@@ -61,7 +61,7 @@ Their values arrive at most once per second."""
 
 @dataclass(frozen=True, slots=True)
 class TimeView:
-    """Position and size of a plot over time in a tab of the window.
+    """View of a plot over time in a tab of the window: its time range and height.
 
     Attributes
     ----------
@@ -361,7 +361,7 @@ def chart_view(
 def chart_page(
     wide_view: "rrb.Spatial2DView", *narrow_views: "rrb.Spatial2DView", tab_title: str | None = None
 ) -> "rrb.Vertical":
-    """Return a tab with a wide chart above a row of narrow charts.
+    """Return the contents of a tab: a wide chart above a row of narrow charts.
 
     Parameters
     ----------
@@ -447,7 +447,10 @@ class Scale:
         ]
 
     def frame(self) -> list["Drawing"]:
-        """Return functions that send an empty first point, without which Rerun reports an error."""
+        """Return the function that sends an empty first point of each axis to Rerun.
+
+        Without a point Rerun reports an error.
+        """
         empty_values = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
@@ -514,7 +517,10 @@ class _AxisExtremes:
         self._above: _CurvePoint | None = None
 
     def take(self, t_ns: int, least_value: float, greatest_value: float) -> list[_CurvePoint]:
-        """Add the least and greatest value of an interval; return the invisible points to send."""
+        """Add the least and greatest value of a time interval.
+
+        Returns the invisible points (time, value) that the axis needs for its labels.
+        """
         if not (math.isfinite(least_value) and math.isfinite(greatest_value)):
             return []
         high_ns, greatest_value = self._greatest.take(t_ns, greatest_value)
@@ -534,7 +540,7 @@ class _AxisExtremes:
         return new_points
 
     def _must_send(self, last_point: _CurvePoint | None, tick_value: float, t_ns: int) -> bool:
-        """Return whether to send an invisible point: its value changes, or it leaves the window."""
+        """Return True if an invisible point is new, has changed or leaves the time window."""
         return (
             last_point is None
             or last_point[1] != tick_value

@@ -143,7 +143,7 @@ def _stated_limits(profile_bytes: bytes) -> dict[str, float]:
 
 
 def _components_without_values(session: Session, tick_timings: Records | None) -> frozenset[str]:
-    """Return the component names of plots for which a recorded session has no values."""
+    """Return Rerun's names (components) of the plots for which a session has no values."""
     absent_components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
     if tick_timings is None or len(tick_timings) == 0:
         absent_components.add(AGES.component)

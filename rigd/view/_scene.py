@@ -147,14 +147,14 @@ class Scene:
         ]
 
     def samples(self, samples: Records) -> list[Drawing]:
-        """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE``.
+        """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE`` in all views.
 
         The samples are in order. Gaps are allowed.
         """
         return self._draw_samples(self._samples.add(samples))
 
     def timings(self, tick_timings: Records) -> list[Drawing]:
-        """Return functions that draw the ages (n,) of readings, of ``TIMING_DTYPE``."""
+        """Return functions that plot the ages of the devices' readings, (n,) of ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(tick_timings))
 
     def events(self, session_notes: Sequence[Note]) -> list[Drawing]:
@@ -200,7 +200,7 @@ class Scene:
         return self._draw_banner()
 
     def health(self, t_ns: int, health_reading: Health) -> list[Drawing]:
-        """Return functions that draw a health reading.
+        """Return functions that draw the condition of loop, recorder, disk and bus at one time.
 
         Parameters
         ----------
@@ -319,7 +319,7 @@ def _gauge_with_larger_value(gauge: Gauge, earlier_gauge: Gauge | None) -> Gauge
 
 
 class _PeriodicTimer:
-    """Timer in session time: a call returns True once per period."""
+    """Timer in session time: a call with the time in ns returns True once per period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_ns = round(1e9 * period_s)

@@ -263,7 +263,10 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
 
 
 def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
-    """Send the newest of `notes`, which are in order of time, as a document with wrapped lines."""
+    """Send the newest lines of the session's log to Rerun as a document with wrapped lines.
+
+    `notes` are in order of time.
+    """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

@@ -540,7 +540,9 @@ class CurveDecimation:
     def logarithmic(
         cls, grid: Real, first_hz: float, last_hz: float, most_groups: int
     ) -> "CurveDecimation":
-        """Return the decimation with groups of equal frequency ratio; empty groups are omitted.
+        """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
+
+        Groups without points are omitted.
 
         Parameters
         ----------
@@ -608,7 +610,10 @@ class CurveDecimation:
         return np.unique(np.concatenate([first_indices, last_indices]))
 
     def _extremes(self, curve_values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Return the indices of groups with known values, and of both extremes of each group."""
+        """Return the indices of groups with known values, and the grid indices of their extremes.
+
+        The extremes are the least and the greatest value, shape (groups, 2).
+        """
         grouped_values = curve_values[self.groups]
         is_unknown = np.isnan(grouped_values)
         group_indices = np.flatnonzero(~is_unknown.all(axis=1))

@@ -33,7 +33,9 @@ _STALE_STATUS: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
 
 class SweepResponse:
-    """Running estimate of the frequency response torque over angle in a sweep (Welch's method).
+    """Running estimate of the frequency response torque over motor angle in a sweep.
+
+    It is computed by Welch's method.
 
     The segments are the default ones of `analyze`.
 
@@ -372,7 +374,9 @@ class ResponseCharts:
         self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
     def as_last_response(self, subject: "Subject") -> LastResponse | None:
-        """Return the last update for comparison with a later session; None without an update.
+        """Return the newest frequency response for comparison with a later session.
+
+        It is None before the first estimate.
 
         Parameters
         ----------
@@ -603,7 +607,10 @@ class SpectrogramChart:
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
-        """Levels so far as bytes (0–255), shape (frequencies, times), highest frequency first."""
+        """Levels of the spectrogram so far as bytes (0–255), shape (frequencies, times).
+
+        The first row is that of the highest frequency.
+        """
         return self._image[:, : self._filled]
 
     def draw_frame(self, stream: "RecordingStream") -> None:

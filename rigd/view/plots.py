@@ -160,7 +160,7 @@ def send_columns(
 
 
 def _column(component_name: str, component_values: Values) -> "ComponentColumn":
-    """Return values (n, k) in the form that Rerun stores, with k scalars in each row."""
+    """Return values (n, k) as a column of Rerun's data, with k scalars in each of n rows."""
     import rerun as rr
 
     row_count, values_per_row = component_values.shape
