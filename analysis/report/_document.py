@@ -73,8 +73,10 @@ def indices_of_record_fit(
     delayed_plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
 
     def indices_against(measured_frf: FrequencyResponse) -> IndexValues:
-        (model,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(delayed_plant, ())
-        return _fit_indices(measured_frf, model)
+        (model_response,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(
+            delayed_plant, ()
+        )
+        return _fit_indices(measured_frf, model_response)
 
     return indices_against(welch_analysis.response), indices_against(welch_analysis.whole_record)
 
@@ -89,17 +91,21 @@ def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
     ]
 
 
-def _fit_indices(measured_frf: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
+def _fit_indices(
+    measured_frf: FrequencyResponse, model_response: NDArray[np.complex128]
+) -> IndexValues:
     """Return the errors MSE, WMSE and MD of a model's response against a measured response."""
     is_finite = np.isfinite(measured_frf.response)
     if not is_finite.any():
         return NOT_COMPARED
     omega_rad_s = 2 * np.pi * measured_frf.frequency_hz[is_finite]
-    return asdict(fit_indices(omega_rad_s, measured_frf.response[is_finite], model[is_finite]))
+    return asdict(
+        fit_indices(omega_rad_s, measured_frf.response[is_finite], model_response[is_finite])
+    )
 
 
 def response_fit_percent(welch_analysis: WelchAnalysis, model: FittedModel) -> float:
-    """Return how well a Welch fit reproduces its response, in percent (`nrmse_percent`).
+    """Return how well a Welch fit reproduces the measured response, in percent (100 % = exact).
 
     Parameters
     ----------
@@ -421,7 +427,7 @@ def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
 def _welch_fits_json(
     analysis: WelchAnalysis, unsupported_orders: Collection[str]
 ) -> list[dict[str, Any]]:
-    """Return the JSON objects of a record's Welch fits."""
+    """Return the JSON objects of the models that are fitted to a record's Welch response."""
     record_indices = whole_record_indices(analysis)
     return [
         {
@@ -435,7 +441,7 @@ def _welch_fits_json(
 def _welch_fit_json(
     analysis: WelchAnalysis, model: FittedModel, unsupported_orders: Collection[str]
 ) -> dict[str, Any]:
-    """Return the JSON object of one Welch fit."""
+    """Return the JSON object of one model that is fitted to a record's Welch response."""
     fit = model.fit
     return {
         **_fit_identity(analysis, model),

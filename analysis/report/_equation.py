@@ -208,11 +208,11 @@ def _modal_equation() -> Formula:
     """Return the equation of the modal model: poles and residues, and background terms."""
     k, n, highest_exponent = _variable("k"), _variable("n"), BACKGROUND_COEFFICIENTS - 1
     sum_over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
-    highest_power = _number_formula(str(highest_exponent))
-    lower_power = _join(n, _EQUALS_SIGN, _number_formula("0"))
+    upper_sum_limit = _number_formula(str(highest_exponent))
+    lower_sum_limit = _join(n, _EQUALS_SIGN, _number_formula("0"))
     sum_over_powers = Formula(
-        f"<munderover><mo>∑</mo>{lower_power.row.mathml}{highest_power.row.mathml}</munderover>",
-        rf"\sum_{lower_power.row.tex}^{highest_power.row.tex}",
+        f"<munderover><mo>∑</mo>{lower_sum_limit.row.mathml}{upper_sum_limit.row.mathml}</munderover>",
+        rf"\sum_{lower_sum_limit.row.tex}^{upper_sum_limit.row.tex}",
     )
     modal_terms = []
     for residue_symbol, pole_symbol in (

@@ -337,15 +337,15 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
     """
     fitted_models = analysis.models
-    most_modes = max((len(model.modes) for model in fitted_models), default=0)
+    most_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
     if not most_modes:
         return None
 
     def cells(
-        model: FittedModel, value_name: str, number_format: str, display_factor: float = 1.0
+        fitted_model: FittedModel, value_name: str, number_format: str, display_factor: float = 1.0
     ) -> list[Cell]:
         mode_cells = []
-        for mode, is_followed in zip(model.modes, model.followed, strict=True):
+        for mode, is_followed in zip(fitted_model.modes, fitted_model.followed, strict=True):
             cell = number_cell(
                 getattr(mode, value_name) if mode.damping_ratio < 1 else None,
                 number_format,
@@ -358,8 +358,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
 
     mode_pairs = [
         mode_pair
-        for model in fitted_models
-        for mode_pair in zip(model.modes, model.followed, strict=True)
+        for fitted_model in fitted_models
+        for mode_pair in zip(fitted_model.modes, fitted_model.followed, strict=True)
     ]
     is_underdamped = [mode.damping_ratio < 1 for mode, _ in mode_pairs]
     table_notes = ["From the poles of the fitted model; ξ is the damping ratio."]
@@ -369,7 +369,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             "beam's: the fit does not follow this resonance. The number only describes the fitted "
             "curve."
         )
-    if not all(is_underdamped) or not all(model.modes for model in fitted_models):
+    if not all(is_underdamped) or not all(fitted_model.modes for fitted_model in fitted_models):
         table_notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
     return Table.of(
         "welch_modes",
@@ -381,11 +381,11 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         ),
         (
             (
-                *_type_and_weighting(model),
-                *cells(model, "frequency_hz", ".4f"),
-                *cells(model, "damping_ratio", ".4g", 100.0),
+                *_type_and_weighting(fitted_model),
+                *cells(fitted_model, "frequency_hz", ".4f"),
+                *cells(fitted_model, "damping_ratio", ".4g", 100.0),
             )
-            for model in fitted_models
+            for fitted_model in fitted_models
         ),
         table_notes,
         grouped=True,

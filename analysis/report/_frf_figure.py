@@ -37,7 +37,7 @@ _FURTHER_LINES: Final[tuple[dict[str, Any], ...]] = (
 
 
 def frf_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw the measured response, every fitted model's response, and the coherence."""
+    """Draw the measured frequency response, those of all fitted models, and the coherence."""
     settings = analysis.settings
     type_names = settings.types
     panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
@@ -171,7 +171,7 @@ def _draw_type_panel(
 def _write_scores(
     panel_axes: Axes, models: list[FittedModel], style_by_weighting: dict[str, dict[str, Any]]
 ) -> None:
-    """Write MSE and WMSE of each model into the panel, in the colour of its line."""
+    """Write each model's mean square errors (MSE, WMSE) into the panel, in its line's colour."""
     for line_number, model in enumerate(models):
         panel_axes.annotate(
             f"MSE {model.indices.mse:.3g}  WMSE {model.indices.wmse:.3g}",

@@ -39,7 +39,7 @@ def _environment() -> jinja2.Environment:
 
 
 def versions(made_at: datetime) -> Facts:
-    """Return the date of the report and the versions of the programs, as facts."""
+    """Return a table of (name, text): date of the report and versions of the programs."""
     return (
         "Versions",
         [

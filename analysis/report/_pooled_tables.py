@@ -497,7 +497,7 @@ def _decimals_of_scatter(scatter: Heterogeneity) -> int:
 
 
 def chance_cell(p_value: float) -> Cell:
-    """Return a cell with a p-value, which may be too small to write as a number."""
+    """Return a cell with a p-value; a very small one is displayed as a bound, such as "< 1e-99"."""
     return replace(number_cell(p_value), text=probability(p_value))
 
 

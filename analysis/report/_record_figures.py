@@ -233,7 +233,7 @@ Smaller loss factors do not matter for the total."""
 
 
 def loss_figure(
-    modes: Sequence[ModeEstimate],
+    mode_estimates: Sequence[ModeEstimate],
     loss_model: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
@@ -245,7 +245,7 @@ def loss_figure(
 
     Parameters
     ----------
-    modes : sequence of ModeEstimate
+    mode_estimates : sequence of ModeEstimate
         Modes to draw as points.
     loss_model : Estimate or None
         Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
@@ -265,7 +265,7 @@ def loss_figure(
     for legend_label, is_filled in (("modes", True), ("modes, doubtful", False)):
         drawn_modes = [
             mode_estimate
-            for mode_estimate in modes
+            for mode_estimate in mode_estimates
             if (mode_estimate.number not in flagged_modes) is is_filled
         ]
         if drawn_modes:
@@ -276,14 +276,14 @@ def loss_figure(
                 fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
                 markerfacecolor=style.INK if is_filled else "white", label=legend_label, zorder=5,
             )  # fmt: skip
-    modes_hz = [mode_estimate.frequency_hz for mode_estimate in modes]
+    modes_hz = [mode_estimate.frequency_hz for mode_estimate in mode_estimates]
     grey_bands_hz = (
         [] if loss_model is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
     )
     for band_edge_hz, band_end_hz in grey_bands_hz:
         axes.axvspan(band_edge_hz, band_end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
-    mode_loss_factors = [2 * mode_estimate.damping_ratio for mode_estimate in modes]
+    mode_loss_factors = [2 * mode_estimate.damping_ratio for mode_estimate in mode_estimates]
     # A quantile of each curve, because a total may rise without bound towards an end.
     highest_loss = max(
         [

@@ -312,7 +312,7 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
 
 
 def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
-    """Return the table of the parameters of a simpler damping structure beside the reported ones.
+    """Return the table of the parameters of a simpler damping structure next to the reported ones.
 
     It is None if no structure with fewer free parameters is sufficient for the record.
     """

@@ -315,9 +315,9 @@ def _type_page(
     measured_frf, band_hz = analysis.response.response, analysis.settings.band_hz
     page_entity = f"{FITS_ENTITY}/type_{type_name}"
 
-    def model_curves(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
+    def model_curves(values_of_model: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
-            ChartCurve(_entity_name(model.fit.weighting), key, values(model))
+            ChartCurve(_entity_name(model.fit.weighting), key, values_of_model(model))
             for key, model in zip(legend_entries, models, strict=True)
         ]
 

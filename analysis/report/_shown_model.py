@@ -109,7 +109,7 @@ class ShownModel:
         return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
 
     def fit_percent(self, analysis: RecordAnalysis) -> float:
-        """Return the fit to the measured torque in the band, in percent (NRMSE).
+        """Return how well the model reproduces the measured torque in the band, in percent.
 
         Parameters
         ----------

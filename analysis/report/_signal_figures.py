@@ -339,7 +339,7 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
 
 
 def best_model(analysis: WelchAnalysis) -> FittedModel:
-    """Return the fitted model with the lowest WMSE, by which the paper selects a model."""
+    """Return the fitted model with the lowest weighted mean square error (WMSE)."""
     return min(analysis.models, key=lambda model: model.indices.wmse)
 
 
@@ -401,5 +401,5 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
 
 
 def _rms(signal_values: np.ndarray) -> float:
-    """Return the root mean square of values."""
+    """Return the root mean square of a signal, in the unit of the signal."""
     return float(np.sqrt(np.mean(signal_values**2)))

@@ -39,7 +39,7 @@ def as_text(renderable: RenderableType) -> str:
 
 
 def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
-    """Return the terminal's text on one record: verdict, tables and warnings.
+    """Return the results of one record for the terminal: verdict, tables and warnings.
 
     Parameters
     ----------
@@ -75,7 +75,7 @@ _RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
 
 
 def _main_results(whole_record: WholeRecord) -> RenderableType:
-    """Return the verdict, the modes and the parameters of damping and beam."""
+    """Return the main results of a record for the terminal: verdict, modes and parameters."""
     parameter_table = tables.parameters_table(whole_record)
     parameter_names = tables.parameter_names(whole_record.headline)
     shown_rows = [
@@ -277,7 +277,7 @@ def _percent_text(damping_ratio: ReportedValue) -> str:
 
 
 def _size_text(loss_factor: ReportedLossFactor) -> str:
-    """Return the loss factor or the coefficient of a damping as part of a sentence."""
+    """Return the loss factor, or else the coefficient, of a damping as part of a sentence."""
     coefficient_symbol, unit_text, *_names = _DAMPING_SYMBOLS[loss_factor.damping]
     damping_size = loss_factor.size
     display_factor, power_of_ten = (

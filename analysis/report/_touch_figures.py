@@ -144,18 +144,23 @@ def _draw_innovations(
 # Map
 
 
-def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
+def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with at least one contact point.
     """
     contact_points_m = np.array(
-        [t.point_m for session in sessions for t in session.touches if t.point_m is not None]
+        [
+            t.point_m
+            for session in touched_sessions
+            for t in session.touches
+            if t.point_m is not None
+        ]
     )
-    length_m = max(session.model.beam.length_m for session in sessions)
+    length_m = max(session.model.beam.length_m for session in touched_sessions)
     spread_m = float(np.ptp(contact_points_m, axis=0).max())
     has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
@@ -163,15 +168,20 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
     overview_axes = figure.add_subplot(grid[0])
-    _draw_map(overview_axes, sessions, with_numbers=not has_detail)
+    _draw_map(overview_axes, touched_sessions, with_numbers=not has_detail)
     overview_axes.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
     overview_axes.set_aspect("equal", adjustable="datalim")
     overview_axes.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, sessions, with_numbers=True)
+        _draw_map(detail_axes, touched_sessions, with_numbers=True)
         interval_ends_m = np.concatenate(
-            [t.ends_m for session in sessions for t in session.touches if t.ends_m is not None]
+            [
+                t.ends_m
+                for session in touched_sessions
+                for t in session.touches
+                if t.ends_m is not None
+            ]
         )
         map_centre_m = (interval_ends_m.min(axis=0) + interval_ends_m.max(axis=0)) / 2
         half_width_m = 0.75 * max(float(np.ptp(interval_ends_m, axis=0).max()), 0.005 * length_m)
@@ -183,7 +193,7 @@ def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
     for axes in figure.axes:
         axes.set_xlabel("x (m)", labelpad=1)
     overview_axes.set_ylabel("y (m)")
-    if len(sessions) > 1:
+    if len(touched_sessions) > 1:
         overview_axes.legend(loc="upper left", fontsize=7.5)
     return figure
 

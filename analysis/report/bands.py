@@ -474,7 +474,10 @@ def _rows_by_parameter(fit: Estimate, slopes_by_name: dict[str, Real], point_cou
 
 
 def _standard_deviations(gradient: Real, covariance: Real) -> Real:
-    """Return standard deviations (n,) from slopes (k, n) and the parameters' covariance."""
+    """Return the standard deviations (n,) of a function of the parameters.
+
+    `gradient` contains its slopes (k, n), and `covariance` is that of the parameters, (k, k).
+    """
     log_variance = np.einsum("in,ij,jn->n", gradient, covariance, gradient, optimize=True)
     return np.asarray(np.sqrt(np.maximum(log_variance, 0.0)))
 

@@ -180,7 +180,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
 
 
 def _collect_facts(campaign: CampaignResult) -> list[Facts]:
-    """Return the facts on specimen and estimators."""
+    """Return tables of (name, text) on specimen and estimators, for the HTML page."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
     stated_beam = campaign.sessions[0].beam
     fact_groups = [
@@ -232,7 +232,7 @@ def _collect_facts(campaign: CampaignResult) -> list[Facts]:
 
 
 def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
-    """Return the fact on the model of modes and parameters, if a geometry tolerance is stated."""
+    """Return (name, text) on the tolerance of the beam's geometry; nothing if none is stated."""
     if campaign.modal is None or not campaign.modal.leads:
         return []
     return [

@@ -128,7 +128,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 
 
 def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
-    """Return the facts on file, record, session and settings."""
+    """Return tables of (name, text) on file, record, session and settings, for the HTML page."""
     record, welch_analysis = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
@@ -160,7 +160,7 @@ def sha256(path: Path) -> str | None:
 
 
 def _file_facts(path: Path) -> list[tuple[str, str]]:
-    """Return path, size and checksum of a file, as facts."""
+    """Return (name, text) of a file's path, size and checksum."""
     checksum = sha256(path)
     file_facts = [("path", str(path))]
     if checksum is not None:
@@ -169,7 +169,7 @@ def _file_facts(path: Path) -> list[tuple[str, str]]:
 
 
 def _record_facts(record: Record) -> list[tuple[str, str]]:
-    """Return outcome, samples, beam, latencies and gaps of a record, as facts."""
+    """Return (name, text) of a record's outcome, samples, beam, latencies and gaps."""
     stated_beam, sample_gaps = record.beam, record.gaps
     sample_count = len(record.time_s)
     flag_counts_text = ", ".join(
@@ -202,7 +202,7 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
 
 
 def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
-    """Return estimator, band, types and fixed parameters of the whole-record fits, as facts."""
+    """Return (name, text) of the whole-record fits' estimator, band, types and fixed values."""
     first_hz, last_hz = whole_record.band_hz
     hum_texts = [
         f"{hum_line.frequency_hz:.5g} Hz, {1e3 * hum_line.amplitude_nm:.3g} mN·m"
@@ -227,7 +227,7 @@ def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
 
 
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
-    """Return estimator, band, types and segments of the Welch fits, as facts."""
+    """Return (name, text) of the Welch fits' estimator, band, types and segments."""
     settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
     welch_facts = [

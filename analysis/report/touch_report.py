@@ -33,15 +33,15 @@ _KIND_DESCRIPTIONS = {
 """Descriptions of the kinds of contact, by key."""
 
 
-def touches_table(sessions: Sequence[TouchedSession]) -> Table:
+def touches_table(touched_sessions: Sequence[TouchedSession]) -> Table:
     """Return the table of the touches of all sessions.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with their touches.
     """
-    has_several_sessions = len(sessions) > 1
+    has_several_sessions = len(touched_sessions) > 1
     table_columns = (
         Column("Session" if has_several_sessions else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
@@ -52,7 +52,9 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
         Column("Stiffness (N/m)", "stiffness_n_per_m"),
         Column("Kind", "kind", TEXT_FORMAT),
     )
-    table_rows = [_touch_row(session, touch) for session in sessions for touch in session.touches]
+    table_rows = [
+        _touch_row(session, touch) for session in touched_sessions for touch in session.touches
+    ]
     return Table(
         "touches",
         "Touches",
@@ -147,13 +149,13 @@ def model_words(session: TouchedSession) -> str:
 
 
 def touches_document(
-    sessions: Sequence[TouchedSession], error_messages: Mapping[str, str]
+    touched_sessions: Sequence[TouchedSession], error_messages: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the touches of all sessions as one JSON document.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with their touches.
     error_messages : mapping of str to str
         Message for each file that could not be analysed.
@@ -173,7 +175,7 @@ def touches_document(
                     "validity": session.validity.as_json(),
                     **touch.as_dict(),
                 }
-                for session in sessions
+                for session in touched_sessions
                 for touch in session.touches
             ],
             "errors": [
@@ -189,7 +191,7 @@ def touches_document(
 
 
 def write_touch_report(
-    sessions: Sequence[TouchedSession],
+    touched_sessions: Sequence[TouchedSession],
     error_messages: Mapping[str, str],
     folder: Path,
 ) -> None:
@@ -199,7 +201,7 @@ def write_touch_report(
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         At least one session.
     error_messages : mapping of str to str
         Message for each file that could not be analysed.
@@ -217,26 +219,30 @@ def write_touch_report(
 
     pictures = []
     with style.figure_style():
-        for illustration in touch_illustrations(sessions):
+        for illustration in touch_illustrations(touched_sessions):
             figure_stem = folder / "figures" / illustration.name
             picture = style.save_picture(
                 illustration.figure, figure_stem, illustration.description, DEFAULT_FORMATS
             )
             pictures.append(picture)
-    touch_table = touches_table(sessions)
+    touch_table = touches_table(touched_sessions)
     write_new(folder / "tables" / "touches.csv", csv_text(touch_table))
-    write_new(folder / "touches.json", document_text(touches_document(sessions, error_messages)))
+    write_new(
+        folder / "touches.json", document_text(touches_document(touched_sessions, error_messages))
+    )
     page_html = pages.page(
         "touch.html",
-        title=sessions[0].path.stem if len(sessions) == 1 else f"{len(sessions)} sessions",
-        files=", ".join(session.path.name for session in sessions),
+        title=touched_sessions[0].path.stem
+        if len(touched_sessions) == 1
+        else f"{len(touched_sessions)} sessions",
+        files=", ".join(session.path.name for session in touched_sessions),
         first=(),
-        sentences=[line for session in sessions for line in session_lines(session)[:1]],
+        sentences=[line for session in touched_sessions for line in session_lines(session)[:1]],
         experiments=(),
         warnings=[
             *(
                 f"{session.path.name}: {sentence}"
-                for session in sessions
+                for session in touched_sessions
                 for sentence in session.warnings
             ),
             *(f"Left out: {message}" for message in error_messages.values()),
@@ -245,13 +251,13 @@ def write_touch_report(
         tables=(touch_table,) if touch_table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_collect_facts(sessions), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(touched_sessions), pages.versions(datetime.now().astimezone())],
     )
     write_new(folder / "report.html", page_html)
 
 
-def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Return the facts on sessions, model and estimator."""
+def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
+    """Return tables of (name, text) on sessions, model and estimator, for the HTML page."""
     return [
         (
             "Sessions",
@@ -261,10 +267,13 @@ def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
                     f"{session.rate_hz:g} Hz, "
                     + ("torque and base shear" if session.has_shear else "torque alone"),
                 )
-                for session in sessions
+                for session in touched_sessions
             ],
         ),
-        ("Model", sorted({(model_words(session), _beam_text(session)) for session in sessions})),
+        (
+            "Model",
+            sorted({(model_words(session), _beam_text(session)) for session in touched_sessions}),
+        ),
         (
             "Estimate",
             [

@@ -174,7 +174,10 @@ class _SessionFiles:
 
 
 def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
-    """Return the rows of a folder's sessions from the index or from the files; update the index."""
+    """Return the data of a folder's sessions, from its index or from new or changed files.
+
+    The index is updated.
+    """
     session_files = _find_session_files(folder)
     folder_index = Index(folder)
     indexed_rows = folder_index.read()

@@ -21,7 +21,7 @@ Quantity = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ModeChange:
-    """Change of a mode's frequency or damping ratio between two sessions."""
+    """Change of a mode's frequency or damping ratio between two sessions, and if significant."""
 
     difference: float
     """Value in the later session minus value in the earlier one, in the unit of the quantity."""

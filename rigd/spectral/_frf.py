@@ -338,7 +338,7 @@ class CrossSpectra:
 
     @classmethod
     def of_zero_segments(cls, bin_count: int) -> "CrossSpectra":
-        """Return spectra without segments, which are zero in each bin."""
+        """Return sums of spectra without any segment: zero in each frequency bin."""
         return cls(
             np.zeros(bin_count), np.zeros(bin_count), np.zeros(bin_count, dtype=np.complex128)
         )
@@ -370,7 +370,7 @@ class CrossSpectra:
         )
 
     def _ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
-        """Return the estimated ratio of output to input in each bin."""
+        """Return the estimated ratio of output to input in each frequency bin."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if estimator == "h1":
                 return self.sxy / self.sxx
@@ -555,7 +555,8 @@ def instrumental_response(
 ) -> FrequencyResponse:
     """Return the response ``Hiv = Sry / Srx`` from input to output of a control loop.
 
-    The loop's reference is the instrument, with which noise in the input is averaged out.
+    S are cross-spectra of reference r, input x and output y. With the reference as the instrument,
+    noise in the input is averaged out.
 
     Parameters
     ----------

@@ -275,7 +275,7 @@ def static_drawings() -> list["Drawing"]:
 
 
 def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
-    """Return the straight line and the bent beam in beam lengths, with their motion enlarged.
+    """Return the coordinates of the undeformed line and of the bent beam, drawn enlarged.
 
     Parameters
     ----------
@@ -299,7 +299,7 @@ def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray
 
 
 def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
-    """Return the straight line and the bent beam in beam lengths, true to scale.
+    """Return the coordinates of the undeformed line and of the bent beam, true to scale.
 
     Parameters
     ----------
@@ -443,7 +443,7 @@ def _draw_lines(stream: "RecordingStream", entity: str, timed_lines: Sequence[_T
 
 
 def _draw_label(stream: "RecordingStream", t_ns: int, label_text: str) -> None:
-    """Send the label with the true deflection of the tip, at its time."""
+    """Send the label with the deflection of the beam's tip to Rerun, at the time `t_ns`."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)

@@ -34,7 +34,7 @@ _MOST_FINDINGS: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """Quantity of a mode that is plotted over time: its names, unit and scale."""
+    """Frequency or damping ratio of a mode, as plotted over time: names, unit and factor."""
 
     name: str
     """Name of the quantity in the target precisions of a search."""
@@ -64,7 +64,7 @@ _TARGET_LOW_INDEX, _TARGET_HIGH_INDEX, _LOW_INDEX, _HIGH_INDEX, _VALUE_INDEX = r
 
 
 def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
-    """Return the plots of damping ratio and frequency over time, for each of the first modes.
+    """Return the plots over time of the fitted damping ratio and frequency of each mode.
 
     Parameters
     ----------

@@ -29,7 +29,7 @@ UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Largest magnitude of a signal, with the limit of the signal.
+    """Gauge of a signal: its largest magnitude, and the limit of this magnitude.
 
     Attributes
     ----------
@@ -113,7 +113,7 @@ class Gauges:
         }
 
     def cool(self, duration_s: float) -> float:
-        """Return the rms torque (i²t) in N·m after the motor was without torque for some time.
+        """Return the rms torque (i²t) in N·m after `duration_s` without torque.
 
         Parameters
         ----------

@@ -128,7 +128,7 @@ class Scene:
         return self.response_charts.as_last_response(self._subject)
 
     def frame(self) -> list[Drawing]:
-        """Return functions that draw the window of a new connection with all contents so far."""
+        """Return functions that draw the whole window for a newly connected viewer."""
         session_name = self._subject.name
         return [
             lambda stream: stream.send_recording_name(session_name),
@@ -154,7 +154,7 @@ class Scene:
         return self._draw_samples(self._samples.add(samples))
 
     def timings(self, tick_timings: Records) -> list[Drawing]:
-        """Return functions that plot the ages of the devices' readings, (n,) of ``TIMING_DTYPE``."""
+        """Return functions that plot the ages of the devices' readings (n,), ``TIMING_DTYPE``."""
         return self._draw_timings(self._timings.add(tick_timings))
 
     def events(self, session_notes: Sequence[Note]) -> list[Drawing]:

@@ -131,19 +131,19 @@ def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
 
 
 def linear_sweep_band_hz(
-    excitation_kind: str, parameters: Mapping[str, float | int | str]
+    excitation_kind: str, excitation_parameters: Mapping[str, float | int | str]
 ) -> tuple[float, float] | None:
     """Return the frequencies at the start and end of a linear sweep; None for other excitations.
 
     Parameters
     ----------
-    excitation_kind, parameters
+    excitation_kind, excitation_parameters
         Name of the excitation and its parameters, as numbers or as texts of a session file.
     """
     if excitation_kind != "chirp":
         return None
     try:
-        return float(parameters["start_hz"]), float(parameters["stop_hz"])
+        return float(excitation_parameters["start_hz"]), float(excitation_parameters["stop_hz"])
     except (KeyError, ValueError):
         return None
 
@@ -167,18 +167,20 @@ class Note:
     message: str
 
 
-def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
+def outcome_note(t_ns: int, outcome_name: str, outcome_reason: str) -> Note:
     """Return the last log line of a session, which states its outcome.
 
     Parameters
     ----------
     t_ns
         Time of the last sample since the start of the session.
-    outcome, reason
+    outcome_name, outcome_reason
         Outcome of the session ("complete", "stopped", "fault") and the reason for it.
     """
     return Note(
-        t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
+        t_ns,
+        _LEVEL_OF_OUTCOME.get(outcome_name, "warning"),
+        f"Outcome: {outcome_name}. {outcome_reason}".rstrip(),
     )
 
 

@@ -93,16 +93,18 @@ def preparing(activity: str = "") -> BannerState:
     return BannerState("PREPARING", ORANGE, activity)
 
 
-def ended(outcome_name: str, reason: str) -> BannerState:
+def ended(outcome_name: str, end_reason: str) -> BannerState:
     """Return the banner's state for a session that is over.
 
     Parameters
     ----------
-    outcome_name, reason
+    outcome_name, end_reason
         Outcome of the session and the reason for it. An empty outcome means unknown.
     """
     state_name = outcome_name.upper() or "ENDED"
-    return BannerState(state_name, _COLOR_OF_OUTCOME.get(outcome_name, ORANGE), reason, over=True)
+    return BannerState(
+        state_name, _COLOR_OF_OUTCOME.get(outcome_name, ORANGE), end_reason, over=True
+    )
 
 
 # State in words
