@@ -382,7 +382,7 @@ def draw_session(
 def _decimated_line(
     frequency_hz: NDArray[np.float64], curve_values: NDArray[np.float64], decimation_columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies and values decimated to a number of columns of a logarithmic axis."""
+    """Return the points of a curve, decimated for a number of columns of a logarithmic axis."""
     return style.envelope(frequency_hz, curve_values, decimation_columns, logarithmic=True)
 
 

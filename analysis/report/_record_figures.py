@@ -394,7 +394,7 @@ A short record has fewer independent values."""
 
 
 def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
-    """Draw the residual's spectrum, its cumulative periodogram, and its power over time.
+    """Draw the spectrum, cumulative periodogram and power over time of a model's residual.
 
     Parameters
     ----------

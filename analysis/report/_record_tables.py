@@ -140,7 +140,7 @@ def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
 
 
 def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
-    """Yield notes on the fit of the modal model and on its resonances that are not the beam's."""
+    """Yield notes on how well the modal model fits, and on resonances that are not the beam's."""
     modal_fit = whole_record.headline.modal
     if modal_fit is None:
         return

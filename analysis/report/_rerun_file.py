@@ -160,7 +160,7 @@ class ChartPage:
 
 
 def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
-    """Return the pages of the Welch fits: the measured response, then one for each model type."""
+    """Return the charts of the Welch fits, with one tab for the measured response and each type."""
     level_axis = _magnitude_axis(analysis)
     keys_by_weighting = line_keys(analysis.settings.weightings)
     return (
@@ -239,7 +239,7 @@ def _draw_text(entity_path: str, markdown_text: str, stream: RecordingStream) ->
 
 
 def _page_view(fit_page: ChartPage) -> rrb.Container:
-    """Return the tab of a page: a wide chart above two narrow ones."""
+    """Return the tab with the three charts of `fit_page`: a wide one above two narrow ones."""
 
     def view(graph: Graph) -> rrb.Spatial2DView:
         graph_chart = graph.chart
@@ -249,7 +249,7 @@ def _page_view(fit_page: ChartPage) -> rrb.Container:
 
 
 def _measured_page(analysis: WelchAnalysis, level_axis: Axis) -> ChartPage:
-    """Return the page of the measured response: magnitude, phase and coherence."""
+    """Return the charts of the measured response for one tab: magnitude, phase and coherence."""
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
@@ -303,7 +303,7 @@ def _type_page(
     level_axis: Axis,
     entry_by_weighting: dict[str, LegendEntry],
 ) -> ChartPage:
-    """Return the page of a model type: magnitude, phase and residuals of its models."""
+    """Return the charts of one damping type for one tab: magnitude, phase and residuals."""
     models = [model for model in analysis.models if model.fit.structure.name == type_name]
     legend_entries = [entry_by_weighting[model.fit.weighting] for model in models]
     # Short labels on the narrow charts, because long ones would overlap the axis title.
@@ -404,7 +404,7 @@ def _axis_of_responses(measured_frf: Complex, modelled_frf: Sequence[Complex]) -
 
 
 def _entity_name(weighting: str) -> str:
-    """Return the name of a weighting in a form that an entity path can contain."""
+    """Return the name of a fit's weighting in a form that an entity path of Rerun can contain."""
     return "model_" + "".join(c if c.isalnum() else "_" for c in weighting)
 
 
@@ -460,7 +460,7 @@ _PLOTS_OVER_TIME: Final = (
 
 
 def record_page(whole_record: WholeRecord) -> ChartPage:
-    """Return the page with the response and residual of the whole record's displayed model.
+    """Return the charts of response and residual of the whole record's displayed model.
 
     The measured response is the ratio of the whole record's transforms, without the model's delay.
     """

@@ -270,7 +270,7 @@ def _write_page(
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     paper_pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write ``report.html`` and the files in ``figures/`` and ``tables/``."""
+    """Write a record's report: ``report.html``, and the files in ``figures/`` and ``tables/``."""
     from analysis.report import _style as style
     from analysis.report._record_figures import illustrations
 

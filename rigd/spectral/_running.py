@@ -266,7 +266,7 @@ class Segments:
         return self._buffer[:, self._used - min(most_samples, self._available) : self._used]
 
     def _add_block(self, first_tick: int, sample_block: Real) -> Iterator[tuple[int, Real]]:
-        """Add samples without gaps and yield each segment that they complete, with its first tick."""
+        """Add samples without gaps; yield the first tick and the data of each complete segment."""
         if first_tick != self.end:
             self.end = first_tick
             self._available = 0

@@ -87,7 +87,7 @@ class RunningSpectrogram:
         ]
 
     def _levels_db(self, segment: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the levels (m,) of a segment in dB."""
+        """Return a segment's levels in the frequency bins (m,), in dB re 1 of the signal's unit."""
         bin_amplitudes = np.abs(
             np.fft.rfft(segment * self._window, self._nfft)[: self.frequency_hz.size]
         )

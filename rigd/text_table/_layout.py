@@ -644,7 +644,10 @@ def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> b
 def _missing_title_error(
     rows: Sequence[TextRow], requested_names: Sequence[str]
 ) -> _NotThisTableError:
-    """Return the error for a missing title, with the titles of the most probable row."""
+    """Return the error for a requested title that no row has.
+
+    Its message contains the titles of the row that is most probably the one with titles.
+    """
 
     def count_found_names(row: TextRow) -> int:
         return sum(

@@ -212,7 +212,7 @@ def _overview() -> "rrb.Container":
 
 
 def _signals() -> "rrb.Container":
-    """Return the contents of the tab Signals: plots of the samples over a short time."""
+    """Return the contents of the tab Signals: plots of the samples of the last 2 s."""
     import rerun.blueprint as rrb
 
     return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
@@ -557,7 +557,7 @@ class _RunningMaximum:
         self._marks: collections.deque[_CurvePoint] = collections.deque()
 
     def take(self, t_ns: int, newest_value: float) -> _CurvePoint:
-        """Add the newest value and return the largest value in the window, with its time."""
+        """Add the newest value; return time (ns) and value of the largest one in the window."""
         while self._marks and self._marks[-1][1] <= newest_value:
             self._marks.pop()
         self._marks.append((t_ns, newest_value))

@@ -281,7 +281,7 @@ def recorded_blueprint(
 def _number_in_range(
     session: Session, metadata_key: str, least_value: float, greatest_value: float
 ) -> float:
-    """Return a number that the session file states, or raise if it is not in a plausible range."""
+    """Return a number that the session file states; raise SessionError outside a given range."""
     stated_number = session.number(metadata_key)
     if not least_value <= stated_number <= greatest_value:
         raise SessionError(

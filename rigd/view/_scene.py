@@ -168,7 +168,10 @@ class Scene:
         ]
 
     def touches(self, touch_documents: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Return functions that draw touches (JSON documents), which replace earlier estimates."""
+        """Return functions that draw touches of the beam (JSON documents).
+
+        A touch replaces an earlier estimate with the same number.
+        """
         drawings_of_touches = {
             touch_document["number"]: self._antenna.touch(touch_document)
             for touch_document in touch_documents
@@ -348,6 +351,6 @@ class _BlockBuffer:
         return self.take_remaining() if span_ticks >= self._ticks else None
 
     def take_remaining(self) -> Records | None:
-        """Return and remove the records that are still stored; None if there are none."""
+        """Return and remove the records that are still in the buffer; None if there are none."""
         stored_blocks, self._parts = self._parts, []
         return np.concatenate(stored_blocks) if stored_blocks else None
