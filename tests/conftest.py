@@ -108,7 +108,7 @@ def write_profile_in():
         borne = {key: PATIENT[key] for key in PATIENT if key.split(".")[0] in sections}
         texts = BRIEF | SEEDED | (borne if patient else {}) | (values or {})
         other = {key: tomllib.loads(f"value = {text}")["value"] for key, text in texts.items()}
-        return testing.write_profile(folder, other, base=str(base))
+        return testing.write_profile(folder, other, base_profile=str(base))
 
     return write
 

@@ -241,7 +241,9 @@ def _count_steps(routes: Routes, rerun: Path | None) -> int:
     from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import welch_figure_names
 
-    figures = welch_figure_names(paper=routes.paper, whole_record=routes.whole_record)
+    figures = welch_figure_names(
+        with_paper_figures=routes.paper, has_whole_record=routes.whole_record
+    )
     figure_count = len(figures) + routes.whole_record * len(RECORD_FIGURES) + (rerun is not None)
     steps = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
     return steps + _STEPS_PER_FIGURE * figure_count

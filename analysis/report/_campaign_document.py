@@ -41,7 +41,7 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
         files. All numbers are finite.
     """
     leading_quantity = campaign.homogeneity.leading
-    content: dict[str, Any] = finite(
+    document_content: dict[str, Any] = finite(
         {
             "versions": versions(),
             "headlines": headlines(campaign),
@@ -50,13 +50,15 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
             "settings": asdict(campaign.settings) | {"record_band_hz": campaign.record_band_hz},
             "files": [
                 {
-                    "file": str(session.path),
-                    "validity": session.validity.as_json(),
-                    "warnings": session.warnings,
-                    "welch_segments": session.segments or None,
-                    "verdict": None if session.verdict is None else session.verdict.as_json(),
+                    "file": str(session_analysis.path),
+                    "validity": session_analysis.validity.as_json(),
+                    "warnings": session_analysis.warnings,
+                    "welch_segments": session_analysis.segments or None,
+                    "verdict": None
+                    if session_analysis.verdict is None
+                    else session_analysis.verdict.as_json(),
                 }
-                for session in campaign.sessions
+                for session_analysis in campaign.sessions
             ],
             "one_specimen": campaign.homogeneity.one_specimen,
             "groups": leading_quantity
@@ -75,37 +77,44 @@ def campaign_document(campaign: CampaignResult, *, with_paper: bool = False) -> 
             ],
             "fits": [
                 fit
-                for session in campaign.sessions
+                for session_analysis in campaign.sessions
                 for fit in (
-                    *(_welch_fit_json(session, welch) for welch in session.welch_fits),
-                    *(_record_fit_json(session, estimate) for estimate in session.record_estimates),
+                    *(
+                        _welch_fit_json(session_analysis, welch)
+                        for welch in session_analysis.welch_fits
+                    ),
+                    *(
+                        _record_fit_json(session_analysis, estimate)
+                        for estimate in session_analysis.record_estimates
+                    ),
                 )
             ],
             "modes": [
-                _mode_json(session, estimate, mode)
-                for session in campaign.sessions
-                for estimate in session.record_estimates
-                if estimate.name == session.selected
+                _mode_json(session_analysis, estimate, mode)
+                for session_analysis in campaign.sessions
+                for estimate in session_analysis.record_estimates
+                if estimate.name == session_analysis.selected
                 for mode in estimate.modes
             ],
             **{
-                name: json_rows(table)
-                for name, table in all_tables(campaign, with_paper=with_paper).items()
+                table_name: json_rows(report_table)
+                for table_name, report_table in all_tables(campaign, with_paper=with_paper).items()
             },
         }
     )
-    return content
+    return document_content
 
 
-def _fit_identity(session: SessionAnalysis, estimator: str, structure: str) -> dict[str, Any]:
+def _fit_identity(session: SessionAnalysis, estimator: str, structure_name: str) -> dict[str, Any]:
     """Return the keys that identify a session's fit: file, estimator, type and weighting."""
     return {
-        "file": str(session.path), "estimator": estimator, "type": structure, "weighting": None,
+        "file": str(session.path), "estimator": estimator, "type": structure_name,
+        "weighting": None,
     }  # fmt: skip
 
 
 def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
-    """Return the JSON object of a session's Welch fit."""
+    """Return the JSON object of the model that is fitted to a session's Welch response."""
     return {
         **_fit_identity(session, "welch", fit.structure),
         "weighting": fit.weighting,
@@ -118,7 +127,7 @@ def _welch_fit_json(session: SessionAnalysis, fit: WelchFit) -> dict[str, Any]:
 
 
 def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str, Any]:
-    """Return the JSON object of a session's whole-record fit."""
+    """Return the JSON object of the model that is fitted to a session's whole record."""
     return {
         **_fit_identity(session, "record", fit.structure),
         "candidate": fit.name,
@@ -133,14 +142,17 @@ def _record_fit_json(session: SessionAnalysis, fit: RecordEstimate) -> dict[str,
 def _std_of_free_parameters(
     std: Mapping[str, float | None], free_parameters: Collection[str]
 ) -> dict[str, float | None]:
-    """Return standard deviations with None for fixed parameters, which were not estimated."""
-    return {name: value if name in free_parameters else None for name, value in std.items()}
+    """Return the parameters' standard deviations by name, with None for fixed parameters."""
+    return {
+        parameter_name: parameter_std if parameter_name in free_parameters else None
+        for parameter_name, parameter_std in std.items()
+    }
 
 
 def _mode_json(session: SessionAnalysis, fit: RecordEstimate, mode: ModeEstimate) -> dict[str, Any]:
     """Return the JSON object of a mode of a session's whole-record fit."""
-    values = asdict(mode)
+    mode_values = asdict(mode)
     return _fit_identity(session, "record", fit.structure) | {
-        "mode": values.pop("number"),
-        **values,
+        "mode": mode_values.pop("number"),
+        **mode_values,
     }

@@ -38,15 +38,16 @@ _MARK_SIZE_PT: Final = 3.0
 
 
 def index_figure(campaign: CampaignResult) -> Figure:
-    """Draw MSE, WMSE and MD of every nominal model over the sessions (Eqs. 28-30)."""
+    """Draw how far each session is from each nominal model: MSE, WMSE and MD (Eqs. 28-30)."""
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
     from matplotlib.ticker import LogLocator, NullFormatter, StrMethodFormatter
 
-    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
+    type_names = list(dict.fromkeys(model.structure for model in campaign.nominal))
     weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
-    colors = {
-        name: line_style["color"] for name, line_style in line_styles(tuple(weightings)).items()
+    color_by_weighting = {
+        weighting_name: line_style["color"]
+        for weighting_name, line_style in line_styles(tuple(weightings)).items()
     }
     width_in, height_in = 13.0, 4.9
     figure = style.new_figure(
@@ -58,45 +59,48 @@ def index_figure(campaign: CampaignResult) -> Figure:
         1, 3, left=0.055, right=0.99, top=1 - 1.2 / height_in, bottom=0.45 / height_in, wspace=0.2
     )
     box_width = 0.72 / len(weightings)
-    for column, (index, heading, axis_label) in enumerate(_INDEX_PANELS):
-        axes = figure.add_subplot(grid[column])
+    for panel_number, (index_name, panel_title, axis_label) in enumerate(_INDEX_PANELS):
+        axes = figure.add_subplot(grid[panel_number])
         for model in campaign.nominal:
-            offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
-            position = types.index(model.structure) + offset * box_width
-            values = np.array(
-                [getattr(session_indices, index) for session_indices in model.indices]
+            box_offset = weightings.index(model.weighting) - (len(weightings) - 1) / 2
+            box_position = type_names.index(model.structure) + box_offset * box_width
+            index_values = np.array(
+                [getattr(session_indices, index_name) for session_indices in model.indices]
             )
-            color = colors[model.weighting]
+            box_color = color_by_weighting[model.weighting]
             axes.boxplot(
-                [values], positions=[position], widths=0.8 * box_width, patch_artist=True,
+                [index_values], positions=[box_position], widths=0.8 * box_width, patch_artist=True,
                 showmeans=True, manage_ticks=False,
-                boxprops={"facecolor": "white", "edgecolor": color},
-                whiskerprops={"color": color}, capprops={"color": color},
+                boxprops={"facecolor": "white", "edgecolor": box_color},
+                whiskerprops={"color": box_color}, capprops={"color": box_color},
                 medianprops={"color": "#C00000", "linewidth": 1.2},
                 meanprops={
                     "marker": "o", "markerfacecolor": style.GREEN, "markeredgecolor": style.GREEN,
                     "markersize": _MARK_SIZE_PT,
                 },
                 flierprops={
-                    "marker": "x", "markeredgecolor": color, "markersize": _MARK_SIZE_PT,
+                    "marker": "x", "markeredgecolor": box_color, "markersize": _MARK_SIZE_PT,
                 },
             )  # fmt: skip
         axes.set_yscale("log")
         axes.yaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0), numticks=20))
         axes.yaxis.set_major_formatter(StrMethodFormatter("{x:g}"))
         axes.yaxis.set_minor_formatter(NullFormatter())
-        axes.set_xticks(range(len(types)), [f"Type {name}" for name in types])
+        axes.set_xticks(range(len(type_names)), [f"Type {type_name}" for type_name in type_names])
         axes.grid(visible=False, axis="x")
-        axes.set_title(heading)
+        axes.set_title(panel_title)
         axes.set_ylabel(axis_label)
     weighting_entries = [
-        Patch(facecolor="white", edgecolor=colors[w], label=f"weights {w}") for w in weightings
+        Patch(facecolor="white", edgecolor=color_by_weighting[w], label=f"weights {w}")
+        for w in weightings
     ]
     mark_entries = [
         Line2D([], [], color="#C00000", label="median"),
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=4, label="mean"),
     ]
-    style.legend(figure, [*weighting_entries, *mark_entries], columns=len(weighting_entries) + 2)
+    style.legend(
+        figure, [*weighting_entries, *mark_entries], column_count=len(weighting_entries) + 2
+    )
     return figure
 
 
@@ -107,9 +111,9 @@ INTERVAL_COLOR: Final = "#C3DCED"
 
 
 def pooled_figure(campaign: CampaignResult) -> Figure:
-    """Draw each session's estimate of every parameter with its interval, over the pooled one.
+    """Draw each session's estimate of every parameter over the pooled estimate, with intervals.
 
-    The figure shows the freest structure that the sessions support.
+    The parameters are those of the reported pooled estimate.
     """
     from matplotlib.lines import Line2D
     from matplotlib.patches import Patch
@@ -123,8 +127,8 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
     )
     if any(campaign.homogeneity.is_mixed(parameter.name) for parameter in estimate.parameters):
         subtitle_note += f"  ·  {MIXTURE_MARK} mean of a mixture"
-    rows = -(-len(estimate.parameters) // _PANELS_PER_ROW)
-    width_in, height_in = 13.0, 2.6 * rows + 1.35
+    row_count = -(-len(estimate.parameters) // _PANELS_PER_ROW)
+    width_in, height_in = 13.0, 2.6 * row_count + 1.35
     figure = style.new_figure(
         width_in, height_in,
         title(
@@ -137,16 +141,22 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
         f"{subtitle_note}",
     )  # fmt: skip
     grid = figure.add_gridspec(
-        rows, _PANELS_PER_ROW, left=0.06, right=0.99, top=1 - 1.2 / height_in,
+        row_count, _PANELS_PER_ROW, left=0.06, right=0.99, top=1 - 1.2 / height_in,
         bottom=0.5 / height_in, wspace=0.42, hspace=0.4,
     )  # fmt: skip
-    for number, parameter in enumerate(estimate.parameters):
-        axes = figure.add_subplot(grid[number // _PANELS_PER_ROW, number % _PANELS_PER_ROW])
-        _draw_parameter_panel(
-            campaign, estimate.name, parameter, axes, reported=parameter.name not in not_reported
+    for panel_number, parameter in enumerate(estimate.parameters):
+        panel_axes = figure.add_subplot(
+            grid[panel_number // _PANELS_PER_ROW, panel_number % _PANELS_PER_ROW]
         )
-        if number + _PANELS_PER_ROW >= len(estimate.parameters):
-            axes.set_xlabel("Session", labelpad=1)
+        _draw_parameter_panel(
+            campaign,
+            estimate.name,
+            parameter,
+            panel_axes,
+            reported=parameter.name not in not_reported,
+        )
+        if panel_number + _PANELS_PER_ROW >= len(estimate.parameters):
+            panel_axes.set_xlabel("Session", labelpad=1)
     legend_entries = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
@@ -154,50 +164,61 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
         Patch(facecolor=style.SHADE_COLOR, label="95 % prediction interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=4)
+    style.legend(figure, legend_entries, column_count=4)
     return figure
 
 
 def _draw_parameter_panel(
-    campaign: CampaignResult, name: str, parameter: PooledParameter, axes: Axes, *, reported: bool
+    campaign: CampaignResult,
+    structure_name: str,
+    parameter: PooledParameter,
+    panel_axes: Axes,
+    *,
+    reported: bool,
 ) -> None:
-    """Draw the sessions' estimates of a parameter over its pooled and prediction interval."""
-    symbol, factor, _ = label(parameter.name)
-    positions, values, half_widths = [], [], []
-    for number, session in enumerate(campaign.sessions, start=1):
+    """Draw the sessions' estimates of one parameter.
+
+    Behind them are the interval of the pooled value and the interval in which the next session's
+    estimate is expected.
+    """
+    parameter_symbol, display_factor, _ = label(parameter.name)
+    session_positions, session_values, half_widths = [], [], []
+    for session_number, session in enumerate(campaign.sessions, start=1):
         for estimate in session.record_estimates:
             std = estimate.std.get(parameter.name)
-            if estimate.name == name and std is not None:
-                positions.append(number)
-                values.append(factor * estimate.parameters[parameter.name])
-                half_widths.append(1.96 * factor * std)
-    axes.axhspan(
-        *(factor * end for end in parameter.next_interval), color=style.SHADE_COLOR, zorder=0.5
+            if estimate.name == structure_name and std is not None:
+                session_positions.append(session_number)
+                session_values.append(display_factor * estimate.parameters[parameter.name])
+                half_widths.append(1.96 * display_factor * std)
+    panel_axes.axhspan(
+        *(display_factor * end for end in parameter.next_interval),
+        color=style.SHADE_COLOR,
+        zorder=0.5,
     )
-    axes.axhspan(
-        *(factor * end for end in parameter.interval),
+    panel_axes.axhspan(
+        *(display_factor * end for end in parameter.interval),
         color=INTERVAL_COLOR if reported else style.FAINT,
         zorder=0.6,
     )
     session_color, pooled_color = (style.INK, style.BLUE) if reported else (style.GREY, style.GREY)
-    axes.axhline(factor * parameter.value, color=pooled_color)
-    axes.errorbar(
-        positions,
-        values,
+    panel_axes.axhline(display_factor * parameter.value, color=pooled_color)
+    panel_axes.errorbar(
+        session_positions,
+        session_values,
         yerr=half_widths,
         fmt="o",
         markersize=2.6,
         color=session_color,
         linewidth=0.8,
     )
-    marks = "" if reported else NOT_REPORTED_MARK
-    marks += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
+    mark_text = "" if reported else NOT_REPORTED_MARK
+    mark_text += MIXTURE_MARK if campaign.homogeneity.is_mixed(parameter.name) else ""
     p_value_text = f"p = {probability(parameter.chance)}".replace("= <", "<")
-    axes.set_title(f"{symbol}{marks}   {p_value_text}")
-    axes.set_ylabel(symbol_with_unit(parameter.name))
-    axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
-    axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
-    axes.ticklabel_format(axis="y", useOffset=False)
+    panel_axes.set_title(f"{parameter_symbol}{mark_text}   {p_value_text}")
+    panel_axes.set_ylabel(symbol_with_unit(parameter.name))
+    panel_axes.set_xlim(0.3, len(campaign.sessions) + 0.7)
+    panel_axes.set_xticks(np.unique(np.linspace(1, len(campaign.sessions), 6).round().astype(int)))
+    panel_axes.ticklabel_format(axis="y", useOffset=False)
 
 
 _PANEL_COLUMNS: Final = 500
@@ -217,67 +238,74 @@ _BEST_MODEL_STYLES: Final[tuple[dict[str, Any], ...]] = (
 
 def nominal_figure(campaign: CampaignResult) -> Figure:
     """Draw the nominal models of every type over all measured responses (Figure 6)."""
-    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
-    columns = min(len(types), 4 if len(types) > 6 else 3)
-    rows = -(-len(types) // columns)
-    width_in, height_in = max(4.4 * columns, 9.0), 3.75 * rows + 1.35
+    type_names = list(dict.fromkeys(model.structure for model in campaign.nominal))
+    panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
+    panel_rows = -(-len(type_names) // panel_columns)
+    width_in, height_in = max(4.4 * panel_columns, 9.0), 3.75 * panel_rows + 1.35
     figure = _new_response_figure(
         campaign, width_in, height_in, "frequency responses and nominal models"
     )
     grid = figure.add_gridspec(
-        rows, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
+        panel_rows, panel_columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
         top=1 - 1.15 / height_in, bottom=0.55 / height_in, wspace=0.12, hspace=0.24,
     )  # fmt: skip
-    lines = line_styles(campaign.settings.weightings)
-    handles: dict[str, Line2D] = {}
-    panels = style.type_panels(
-        figure, grid, types, campaign.settings.band_hz, _db_limits(campaign, campaign.nominal)
+    style_by_weighting = line_styles(campaign.settings.weightings)
+    line_by_label: dict[str, Line2D] = {}
+    panel_axes = style.type_panels(
+        figure, grid, type_names, campaign.settings.band_hz, _db_limits(campaign, campaign.nominal)
     )
-    for name, magnitude, phase in panels:
-        models = [model for model in campaign.nominal if model.structure == name]
-        styles = [(f"nominal, weights {m.weighting}", lines[m.weighting]) for m in models]
-        handles |= _draw_responses(campaign, magnitude, phase, models, styles, _PANEL_COLUMNS)
-    for phase in figure.axes[1::2][-columns:]:
-        phase.set_xlabel("Frequency (Hz)", labelpad=1)
-    _add_legend(figure, handles)
+    for type_name, magnitude_axes, phase_axes in panel_axes:
+        type_models = [model for model in campaign.nominal if model.structure == type_name]
+        model_styles = [
+            (f"nominal, weights {m.weighting}", style_by_weighting[m.weighting])
+            for m in type_models
+        ]
+        line_by_label |= _draw_responses(
+            campaign, magnitude_axes, phase_axes, type_models, model_styles, _PANEL_COLUMNS
+        )
+    for phase_axes in figure.axes[1::2][-panel_columns:]:
+        phase_axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    _add_legend(figure, line_by_label)
     return figure
 
 
 def best_figure(campaign: CampaignResult) -> Figure:
     """Draw the two best nominal models over all measured responses (Figure 8)."""
-    models = best_models(campaign.nominal)
+    drawn_models = best_models(campaign.nominal)
     width_in, height_in = 10.0, 6.6
-    names = " and ".join(f"type {m.structure} ({m.weighting})" for m in models)
-    figure = _new_response_figure(campaign, width_in, height_in, f"nominal models of {names}")
+    model_names = " and ".join(f"type {m.structure} ({m.weighting})" for m in drawn_models)
+    figure = _new_response_figure(campaign, width_in, height_in, f"nominal models of {model_names}")
     grid = figure.add_gridspec(
         2, 1, left=0.62 / width_in, right=1 - 0.2 / width_in, top=1 - 0.95 / height_in,
         bottom=0.55 / height_in, height_ratios=(2.2, 1.0), hspace=0.07,
     )  # fmt: skip
-    magnitude, phase = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
-    styles = [
+    magnitude_axes, phase_axes = figure.add_subplot(grid[0]), figure.add_subplot(grid[1])
+    model_styles = [
         (f"nominal type {m.structure}, weights {m.weighting}", line_style)
-        for m, line_style in zip(models, _BEST_MODEL_STYLES, strict=False)
+        for m, line_style in zip(drawn_models, _BEST_MODEL_STYLES, strict=False)
     ]
-    handles = _draw_responses(campaign, magnitude, phase, models, styles, _WIDE_COLUMNS)
-    magnitude.set_ylim(_db_limits(campaign, models))
-    style.response_axes(magnitude, phase)
-    style.frequency_axis(magnitude, campaign.settings.band_hz, labels=False)
-    style.frequency_axis(phase, campaign.settings.band_hz)
-    phase.set_xlabel("Frequency (Hz)", labelpad=1)
-    _add_legend(figure, handles)
+    line_by_label = _draw_responses(
+        campaign, magnitude_axes, phase_axes, drawn_models, model_styles, _WIDE_COLUMNS
+    )
+    magnitude_axes.set_ylim(_db_limits(campaign, drawn_models))
+    style.response_axes(magnitude_axes, phase_axes)
+    style.frequency_axis(magnitude_axes, campaign.settings.band_hz, with_labels=False)
+    style.frequency_axis(phase_axes, campaign.settings.band_hz)
+    phase_axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    _add_legend(figure, line_by_label)
     return figure
 
 
 def _new_response_figure(
-    campaign: CampaignResult, width_in: float, height_in: float, heading: str
+    campaign: CampaignResult, width_in: float, height_in: float, figure_heading: str
 ) -> Figure:
     """Return an empty figure whose title states the sessions and the response estimator."""
-    count = len(campaign.sessions)
+    session_count = len(campaign.sessions)
     drawn_sessions_text = (
-        "" if count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"
+        "" if session_count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"
     )
     return style.new_figure(
-        width_in, height_in, f"{count} sessions — {heading}",
+        width_in, height_in, f"{session_count} sessions — {figure_heading}",
         f"coupling torque over motor angle, {welch_method_text(campaign)}{drawn_sessions_text}  ·  "
         "a nominal model has the mean of the sessions' parameters",
     )  # fmt: skip
@@ -285,74 +313,83 @@ def _new_response_figure(
 
 def _draw_responses(
     campaign: CampaignResult,
-    magnitude: Axes,
-    phase: Axes,
+    magnitude_axes: Axes,
+    phase_axes: Axes,
     models: Sequence[NominalModel],
-    styles: Sequence[tuple[str, dict[str, Any]]],
-    columns: int,
+    model_styles: Sequence[tuple[str, dict[str, Any]]],
+    decimation_columns: int,
 ) -> dict[str, Line2D]:
     """Draw all sessions' responses and the models over them; return the lines by label."""
-    handles: dict[str, Line2D] = {}
+    line_by_label: dict[str, Line2D] = {}
     frequency_hz = campaign.sessions[0].frequency_hz
     for session in shown_sessions(campaign):
-        handles["measured, every session"] = draw_session(
-            magnitude, phase, frequency_hz, session.response, columns, 2 * columns, alpha=0.7
+        line_by_label["measured, every session"] = draw_session(
+            magnitude_axes,
+            phase_axes,
+            frequency_hz,
+            session.response,
+            decimation_columns,
+            2 * decimation_columns,
+            opacity=0.7,
         )
-    for model, (name, line_style) in zip(models, styles, strict=True):
-        (handles[name],) = magnitude.plot(
-            *_decimated_line(frequency_hz, magnitude_db(model.response), columns),
+    for model, (line_label, line_style) in zip(models, model_styles, strict=True):
+        (line_by_label[line_label],) = magnitude_axes.plot(
+            *_decimated_line(frequency_hz, magnitude_db(model.response), decimation_columns),
             **line_style,
             linewidth=1.3,
         )
-        phase.plot(
-            *_decimated_line(frequency_hz, phase_deg(model.response), columns),
+        phase_axes.plot(
+            *_decimated_line(frequency_hz, phase_deg(model.response), decimation_columns),
             **line_style,
             linewidth=1.3,
         )
-    return handles
+    return line_by_label
 
 
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
     """Return the sessions to draw together, evenly spread over the campaign."""
-    last = len(campaign.sessions) - 1
-    session_indices = np.unique(np.linspace(0, last, _MOST_DRAWN_SESSIONS).round().astype(int))
-    return [campaign.sessions[number] for number in session_indices]
+    last_index = len(campaign.sessions) - 1
+    session_indices = np.unique(
+        np.linspace(0, last_index, _MOST_DRAWN_SESSIONS).round().astype(int)
+    )
+    return [campaign.sessions[session_index] for session_index in session_indices]
 
 
 def draw_session(
-    magnitude: Axes,
-    phase: Axes,
+    magnitude_axes: Axes,
+    phase_axes: Axes,
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
-    columns: int,
+    decimation_columns: int,
     most_dots: int,
-    alpha: float = 1.0,
+    opacity: float = 1.0,
 ) -> Line2D:
     """Draw one session's response in the background and return the line of its magnitude."""
-    (line,) = magnitude.plot(
-        *_decimated_line(frequency_hz, magnitude_db(response), columns), color=SESSION_COLOR,
-        linewidth=0.5, alpha=alpha, rasterized=True,
+    (magnitude_line,) = magnitude_axes.plot(
+        *_decimated_line(frequency_hz, magnitude_db(response), decimation_columns),
+        color=SESSION_COLOR,
+        linewidth=0.5, alpha=opacity, rasterized=True,
     )  # fmt: skip
     point_indices = style.log_spaced_indices(frequency_hz, most_dots)
     # Dots, because a line would jump wherever noise wraps the phase.
-    phase.plot(
+    phase_axes.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,
         color=SESSION_COLOR, rasterized=True,
     )  # fmt: skip
-    return line
+    return magnitude_line
 
 
 def _decimated_line(
-    frequency_hz: NDArray[np.float64], values: NDArray[np.float64], columns: int
+    frequency_hz: NDArray[np.float64], curve_values: NDArray[np.float64], decimation_columns: int
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return frequencies and values decimated to a number of columns of a logarithmic axis."""
-    return style.envelope(frequency_hz, values, columns, logarithmic=True)
+    """Return the points of a curve, decimated for a number of columns of a logarithmic axis."""
+    return style.envelope(frequency_hz, curve_values, decimation_columns, logarithmic=True)
 
 
-def _add_legend(figure: Figure, handles: dict[str, Line2D]) -> None:
+def _add_legend(figure: Figure, line_by_label: dict[str, Line2D]) -> None:
     """Add a legend to a figure and thicken the line of the measured responses in it."""
     figure_legend = style.legend(
-        figure, list(handles.values()), list(handles), columns=len(handles)
+        figure, list(line_by_label.values()), list(line_by_label), column_count=len(line_by_label)
     )
     figure_legend.get_lines()[0].set_linewidth(1.5)
 
@@ -371,10 +408,12 @@ def validation_figure(campaign: CampaignResult) -> Figure:
     """Draw the prediction error of every left-out session by model, the best model at the top."""
     from matplotlib.lines import Line2D
 
-    models = group_errors_by_model(campaign.validation)
+    ranked_models = group_errors_by_model(campaign.validation)
     weightings = campaign.settings.weightings
-    colors = {w: line_style["color"] for w, line_style in line_styles(weightings).items()}
-    width_in, height_in = 9.0, _ROW_HEIGHT_IN * len(models) + 1.75
+    color_by_weighting = {
+        w: line_style["color"] for w, line_style in line_styles(weightings).items()
+    }
+    width_in, height_in = 9.0, _ROW_HEIGHT_IN * len(ranked_models) + 1.75
     figure = style.new_figure(
         width_in, height_in,
         f"{_predicted_sessions_text(campaign)} sessions — leave-one-out validation",
@@ -386,43 +425,50 @@ def validation_figure(campaign: CampaignResult) -> Figure:
             2.0 / width_in,
             0.5 / height_in,
             1 - 2.2 / width_in,
-            _ROW_HEIGHT_IN * len(models) / height_in,
+            _ROW_HEIGHT_IN * len(ranked_models) / height_in,
         )
     )
     rng = np.random.default_rng(0)  # random offsets put equal errors side by side
-    for row, (_, _, weighting, errors) in enumerate(models):
-        color = style.GREEN if weighting is None else colors[weighting]
-        values = 100 * np.array([session_error.error for session_error in errors])
+    for row, (_, _, weighting, model_errors) in enumerate(ranked_models):
+        color = style.GREEN if weighting is None else color_by_weighting[weighting]
+        session_errors = 100 * np.array([session_error.error for session_error in model_errors])
         axes.plot(
-            values, row + rng.uniform(-0.18, 0.18, values.size), "o", color=color, markersize=2.6,
+            session_errors, row + rng.uniform(-0.18, 0.18, session_errors.size), "o", color=color,
+            markersize=2.6,
             alpha=0.6,
         )  # fmt: skip
-        own_errors = [
+        expected_errors = [
             session_error.own_error
-            for session_error in errors
+            for session_error in model_errors
             if session_error.own_error is not None
         ]
-        if own_errors:
+        if expected_errors:
             axes.plot(
-                [100 * float(np.mean(own_errors))], [row], "|", color=style.INK, markersize=11
+                [100 * float(np.mean(expected_errors))], [row], "|", color=style.INK, markersize=11
             )
-    axes.set_yticks(range(len(models)), [_model_label(*model[:3]) for model in models])
-    axes.set_ylim(len(models) - 0.4, -0.6)
+    axes.set_yticks(
+        range(len(ranked_models)), [_model_label(*model[:3]) for model in ranked_models]
+    )
+    axes.set_ylim(len(ranked_models) - 0.4, -0.6)
     axes.set_xscale("log")
-    low, high = axes.get_xlim()
-    ticks = [t for t in (d * 10.0**e for e in range(-3, 4) for d in (1, 2, 5)) if low <= t <= high]
-    axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
+    lower_limit, upper_limit = axes.get_xlim()
+    error_ticks = [
+        t
+        for t in (d * 10.0**e for e in range(-3, 4) for d in (1, 2, 5))
+        if lower_limit <= t <= upper_limit
+    ]
+    axes.set_xticks(error_ticks, [f"{tick_value:g}" for tick_value in error_ticks])
     axes.set_xticks([], minor=True)
     axes.set_xlabel("Error (%)", labelpad=1)
-    handles = [
+    legend_handles = [
         Line2D([], [], color=style.GREEN, marker="o", linestyle="", markersize=3.5,
                label="pooled whole-record estimate"),
         Line2D([], [], color=style.INK, marker="|", linestyle="", markersize=9,
                label="mean of the sessions' own fits"),
-        *(Line2D([], [], color=colors[w], marker="o", linestyle="", markersize=3.5,
+        *(Line2D([], [], color=color_by_weighting[w], marker="o", linestyle="", markersize=3.5,
                  label=f"nominal model, weights {w}") for w in weightings),
     ]  # fmt: skip
-    style.legend(figure, handles, columns=2)
+    style.legend(figure, legend_handles, column_count=2)
     return figure
 
 
@@ -437,5 +483,5 @@ def _predicted_sessions_text(campaign: CampaignResult) -> str:
 
 
 def _model_label(_method: str, structure: str, weighting: str | None) -> str:
-    """Return the label of a model in the validation figure."""
+    """Return the label of a fitted model in the validation figure: its type and weighting."""
     return f"{structure}: {'whole record' if weighting is None else f'Welch, {weighting}'}"

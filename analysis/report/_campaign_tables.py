@@ -53,17 +53,17 @@ def main_tables(campaign: CampaignResult) -> tuple[Table, ...]:
 
 def headline_tables(campaign: CampaignResult) -> tuple[Table, ...]:
     """Return the main tables: pooled modes, parameters with a tolerance, and the pooled fit."""
-    candidates = (
+    candidate_tables = (
         modes_table(campaign),
         tolerance_table(campaign),
         *(pooled_table(campaign, estimate) for estimate in likely_estimates(campaign)[:1]),
     )
-    return tuple(table for table in candidates if table.rows)
+    return tuple(report_table for report_table in candidate_tables if report_table.rows)
 
 
 def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[str, Table]:
     """Return the tables that are written to files, by name, except empty ones."""
-    candidates = (
+    candidate_tables = (
         *paper_tables(campaign, with_paper=with_paper),
         session_list_table(campaign),
         sessions_welch_table(campaign),
@@ -77,7 +77,9 @@ def all_tables(campaign: CampaignResult, *, with_paper: bool = False) -> dict[st
         modes_table(campaign),
         validation_table(campaign),
     )
-    return {table.name: table for table in candidates if table.rows}
+    return {
+        report_table.name: report_table for report_table in candidate_tables if report_table.rows
+    }
 
 
 def session_list_table(campaign: CampaignResult) -> Table:
@@ -86,22 +88,25 @@ def session_list_table(campaign: CampaignResult) -> Table:
     def text_cell(text: str) -> Cell:
         return Cell(text, text or ABSENT_TEXT)
 
-    headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
-    keys = ("file", "start_utc", "specimen", "operator", "note")
+    column_headings = ("file", "recorded (UTC)", "specimen", "operator", "note")
+    column_keys = ("file", "start_utc", "specimen", "operator", "note")
     experiments = (
         *(session.experiment for session in campaign.sessions),
         *(session.experiment for session in campaign.failures),
     )
     metadata_names = dict.fromkeys(
-        name for experiment in experiments if experiment for name in experiment.added
+        metadata_name
+        for experiment in experiments
+        if experiment
+        for metadata_name in experiment.added
     )
     return Table.of(
         "session_list",
         "Sessions, as their files state them",
         (
             *(
-                Column(heading, key, TEXT_FORMAT)
-                for heading, key in zip(headings, keys, strict=True)
+                Column(column_heading, key, TEXT_FORMAT)
+                for column_heading, key in zip(column_headings, column_keys, strict=True)
             ),
             *map(_added_column, metadata_names),
             Column("used", "used", TEXT_FORMAT),
@@ -114,35 +119,41 @@ def session_list_table(campaign: CampaignResult) -> Table:
                 text_cell(experiment.operator if experiment else ""),
                 text_cell(experiment.note if experiment else ""),
                 *(
-                    _added_cell(experiment.added.get(name) if experiment else None)
-                    for name in metadata_names
+                    _added_cell(experiment.added.get(metadata_name) if experiment else None)
+                    for metadata_name in metadata_names
                 ),
                 is_used,
             )
-            for is_used, group in ((True, campaign.sessions), (False, campaign.failures))
-            for session in group
+            for is_used, column_group in ((True, campaign.sessions), (False, campaign.failures))
+            for session in column_group
             for experiment in (session.experiment,)
         ),
     )
 
 
-def _added_column(name: str) -> Column:
+def _added_column(metadata_name: str) -> Column:
     """Return the column of metadata that users added, with the unit from its name."""
-    unit = unit_of(name)
-    heading = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return Column(f"{heading} ({unit})" if unit else heading, f"{META_PREFIX}{name}", TEXT_FORMAT)
+    unit_symbol = unit_of(metadata_name)
+    column_heading = metadata_name.removesuffix(suffix_of(metadata_name)).replace("_", " ")
+    return Column(
+        f"{column_heading} ({unit_symbol})" if unit_symbol else column_heading,
+        f"{META_PREFIX}{metadata_name}",
+        TEXT_FORMAT,
+    )
 
 
-def _added_cell(value: float | str | None) -> Cell:
+def _added_cell(metadata_value: float | str | None) -> Cell:
     """Return the cell of a metadata value that users added; a dash if there is none."""
-    if value is None:
+    if metadata_value is None:
         return Cell(None, ABSENT_TEXT)
-    return Cell(value, value if isinstance(value, str) else f"{value:g}")
+    return Cell(
+        metadata_value, metadata_value if isinstance(metadata_value, str) else f"{metadata_value:g}"
+    )
 
 
 def sessions_welch_table(campaign: CampaignResult) -> Table:
     """Return the table of every session's Welch fits, with the distance from the nominal models."""
-    rows = [
+    table_rows = [
         {
             "file": str(session.path),
             "type": fit.structure,
@@ -150,24 +161,27 @@ def sessions_welch_table(campaign: CampaignResult) -> Table:
             **fit.parameters,
             "cost": fit.cost,
             "at_bounds": " ".join(fit.at_bounds),
-            **{f"nominal_{name}": value for name, value in asdict(model.indices[index]).items()},
+            **{
+                f"nominal_{parameter_name}": parameter_value
+                for parameter_name, parameter_value in asdict(model.indices[session_index]).items()
+            },
         }
-        for index, session in enumerate(campaign.sessions)
+        for session_index, session in enumerate(campaign.sessions)
         for fit, model in zip(session.welch_fits, campaign.nominal, strict=True)
     ]
-    return _file_only_table("sessions_welch", rows)
+    return _file_only_table("sessions_welch", table_rows)
 
 
 def sessions_record_table(campaign: CampaignResult) -> Table:
     """Return the table of every session's whole-record fits."""
-    rows = [
+    table_rows = [
         {
             "file": str(session.path),
             "type": estimate.structure,
             **estimate.parameters,
             **{
-                _std_key(name): value if name in estimate.free else None
-                for name, value in estimate.std.items()
+                _std_key(parameter_name): parameter_std if parameter_name in estimate.free else None
+                for parameter_name, parameter_std in estimate.std.items()
             },
             "cost": estimate.cost,
             "degrees_of_freedom": estimate.degrees_of_freedom,
@@ -177,18 +191,18 @@ def sessions_record_table(campaign: CampaignResult) -> Table:
         for session in campaign.sessions
         for estimate in session.record_estimates
     ]
-    return _file_only_table("sessions_record", rows)
+    return _file_only_table("sessions_record", table_rows)
 
 
-def _std_key(parameter: str) -> str:
+def _std_key(parameter_key: str) -> str:
     """Return the key of a parameter's standard deviation, with the unit last: ``delay_std_s``."""
-    unit = suffix_of(parameter)
-    return f"{parameter.removesuffix(unit)}_std{unit}"
+    unit_suffix = suffix_of(parameter_key)
+    return f"{parameter_key.removesuffix(unit_suffix)}_std{unit_suffix}"
 
 
-def _file_only_table(name: str, rows: list[dict[str, Any]]) -> Table:
+def _file_only_table(table_name: str, table_rows: list[dict[str, Any]]) -> Table:
     """Return a table that is written to files only."""
-    return Table(name, "", (), tuple(rows))
+    return Table(table_name, "", (), tuple(table_rows))
 
 
 def validation_table(campaign: CampaignResult) -> Table:
@@ -196,7 +210,7 @@ def validation_table(campaign: CampaignResult) -> Table:
 
     The trials that failed follow.
     """
-    rows: list[dict[str, Any]] = [
+    table_rows: list[dict[str, Any]] = [
         {
             "file": str(prediction.path),
             "method": prediction.method,
@@ -211,30 +225,37 @@ def validation_table(campaign: CampaignResult) -> Table:
         }
         for prediction in campaign.validation
     ]
-    rows += [{"file": str(trial.path), "lost": trial.reason} for trial in campaign.lost_trials]
-    return _file_only_table("validation", rows)
+    table_rows += [
+        {"file": str(failed_trial.path), "lost": failed_trial.reason}
+        for failed_trial in campaign.lost_trials
+    ]
+    return _file_only_table("validation", table_rows)
 
 
 def validation_summary(campaign: CampaignResult) -> Table:
     """Return the table of each model's fit and leave-one-out error, the best model first."""
-    rows: list[Row] = []
-    for method, name, weighting, errors in group_errors_by_model(campaign.validation):
-        values = [session_error.error for session_error in errors]
-        own_errors = [
+    table_rows: list[Row] = []
+    for fit_method, type_name, weighting, model_errors in group_errors_by_model(
+        campaign.validation
+    ):
+        session_errors = [session_error.error for session_error in model_errors]
+        expected_errors = [
             session_error.own_error
-            for session_error in errors
+            for session_error in model_errors
             if session_error.own_error is not None
         ]
-        rows.append(
+        table_rows.append(
             {
-                "method": method,
-                "type": name,
+                "method": fit_method,
+                "type": type_name,
                 "weighting": weighting or "",
-                "sessions": f"{len(values)} of {campaign.trials}",
-                "nrmse_percent": 100 * (1 - float(np.mean(own_errors))) if own_errors else None,
-                "own_error": float(np.mean(own_errors)) if own_errors else None,
-                "error": float(np.mean(values)),
-                "worst": max(values),
+                "sessions": f"{len(session_errors)} of {campaign.trials}",
+                "nrmse_percent": 100 * (1 - float(np.mean(expected_errors)))
+                if expected_errors
+                else None,
+                "own_error": float(np.mean(expected_errors)) if expected_errors else None,
+                "error": float(np.mean(session_errors)),
+                "worst": max(session_errors),
             }
         )
     return Table(
@@ -248,7 +269,7 @@ def validation_summary(campaign: CampaignResult) -> Table:
             Column("leave-one-out error (%)", "error", ".2f", 100.0),
             Column("worst (%)", "worst", ".2f", 100.0),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (
             "Fit: 100 (1 − ‖y − ŷ‖ / ‖y − mean of y‖), each session by its own whole-record fit: "
             "100 % less the in-sample error. Both errors include the noise of the torque.",
@@ -258,15 +279,19 @@ def validation_summary(campaign: CampaignResult) -> Table:
 
 
 def sessions_table(campaign: CampaignResult) -> Table:
-    """Return the table of verdicts on single sessions, then the files that were left out."""
+    """Return the table with one row for each session's verdict and for each excluded file."""
     leading_quantity = campaign.homogeneity.leading
-    groups = leading_quantity.groups if leading_quantity else ()
-    group_by_file = {name: f"{index}" for index, names in enumerate(groups, 1) for name in names}
-    name = campaign.headline.name if campaign.headline else None
+    session_groups = leading_quantity.groups if leading_quantity else ()
+    group_by_file = {
+        file_name: f"{group_number}"
+        for group_number, group_files in enumerate(session_groups, 1)
+        for file_name in group_files
+    }
+    structure_name = campaign.headline.name if campaign.headline else None
     trials_by_path = {
         prediction.path: prediction
         for prediction in campaign.validation
-        if (prediction.method, prediction.name) == ("record", name)
+        if (prediction.method, prediction.name) == ("record", structure_name)
     }
 
     def row(session: SessionAnalysis) -> tuple[Entry, ...]:
@@ -282,7 +307,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
             ", ".join(dict.fromkeys(finding_kinds)) or ABSENT_TEXT,
         )
 
-    left_out: list[tuple[Entry, ...]] = [
+    excluded_rows: list[tuple[Entry, ...]] = [
         (failure.name, "left out", None, None, ABSENT_TEXT, failure.message)
         for failure in campaign.failures
     ]
@@ -295,17 +320,17 @@ def sessions_table(campaign: CampaignResult) -> Table:
             Column("leave-one-out error (%)" if trials_by_path else "", "error", ".2f", 100.0),
             Column("residual", "left", TEXT_FORMAT),
             Column("other effects", "findings", TEXT_FORMAT),
-            Column("group" if groups else "", "group", TEXT_FORMAT),
+            Column("group" if session_groups else "", "group", TEXT_FORMAT),
         ),
         (
             (*row_cells, group_by_file.get(str(row_cells[0]), ABSENT_TEXT))
-            for row_cells in (*map(row, campaign.sessions), *left_out)
+            for row_cells in (*map(row, campaign.sessions), *excluded_rows)
         ),
         (
-            *((f"Fit and error: of type {name}.",) if trials_by_path else ()),
+            *((f"Fit and error: of type {structure_name}.",) if trials_by_path else ()),
             *(
                 (f"Group: by the {label(leading_quantity.quantity)[0]}.",)
-                if leading_quantity and groups
+                if leading_quantity and session_groups
                 else ()
             ),
         ),

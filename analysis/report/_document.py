@@ -48,7 +48,10 @@ NOT_COMPARED: dict[str, float | None] = {"mse": None, "wmse": None, "md": None}
 def indices_of_record_fit(
     fit: RecordFit, welch_analysis: WelchAnalysis
 ) -> tuple[IndexValues, IndexValues]:
-    """Return the paper's indices of a whole-record fit, in the band of the Welch fits.
+    """Return the errors MSE, WMSE and MD of a whole-record fit in the band of the Welch fits.
+
+    The first errors are against Welch's response, the second against the ratio of the whole
+    record's transforms.
 
     Parameters
     ----------
@@ -67,17 +70,19 @@ def indices_of_record_fit(
     record = welch_analysis.record
     # The delay stated in the file has been removed from the responses.
     stated_delay_s = record.torque_delay_s - record.angle_delay_s
-    plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
+    delayed_plant = replace(fit.plant, delay_s=fit.plant.delay_s - stated_delay_s)
 
     def indices_against(measured_frf: FrequencyResponse) -> IndexValues:
-        (model,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(plant, ())
-        return _fit_indices(measured_frf, model)
+        (model_response,) = ResponseGrid(2j * np.pi * measured_frf.frequency_hz).evaluate(
+            delayed_plant, ()
+        )
+        return _fit_indices(measured_frf, model_response)
 
     return indices_against(welch_analysis.response), indices_against(welch_analysis.whole_record)
 
 
 def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
-    """Return the indices of each Welch fit against the ratio of the whole record's transforms."""
+    """Return MSE, WMSE and MD of each Welch fit against the ratio of the record's transforms."""
     measured_frf, record = welch_analysis.whole_record, welch_analysis.record
     grid = FrequencyResponseModel(measured_frf.frequency_hz, record.beam, record.tool_inertia_kg_m2)
     return [
@@ -86,26 +91,30 @@ def whole_record_indices(welch_analysis: WelchAnalysis) -> list[IndexValues]:
     ]
 
 
-def _fit_indices(measured_frf: FrequencyResponse, model: NDArray[np.complex128]) -> IndexValues:
-    """Return the paper's indices MSE, WMSE and MD of a model, against a measured response."""
+def _fit_indices(
+    measured_frf: FrequencyResponse, model_response: NDArray[np.complex128]
+) -> IndexValues:
+    """Return the errors MSE, WMSE and MD of a model's response against a measured response."""
     is_finite = np.isfinite(measured_frf.response)
     if not is_finite.any():
         return NOT_COMPARED
-    omega = 2 * np.pi * measured_frf.frequency_hz[is_finite]
-    return asdict(fit_indices(omega, measured_frf.response[is_finite], model[is_finite]))
+    omega_rad_s = 2 * np.pi * measured_frf.frequency_hz[is_finite]
+    return asdict(
+        fit_indices(omega_rad_s, measured_frf.response[is_finite], model_response[is_finite])
+    )
 
 
-def response_fit_percent(analysis: WelchAnalysis, model: FittedModel) -> float:
-    """Return how well a Welch fit reproduces its response, in percent (`nrmse_percent`).
+def response_fit_percent(welch_analysis: WelchAnalysis, model: FittedModel) -> float:
+    """Return how well a Welch fit reproduces the measured response, in percent (100 % = exact).
 
     Parameters
     ----------
-    analysis : WelchAnalysis
+    welch_analysis : WelchAnalysis
         Welch fits of a record.
     model : FittedModel
         One of the analysis's fitted models.
     """
-    measured_frf = analysis.response.response
+    measured_frf = welch_analysis.response.response
     is_finite = np.isfinite(measured_frf)
     measured_frf, modelled_frf = measured_frf[is_finite], model.response[is_finite]
     return nrmse_percent(measured_frf - modelled_frf, measured_frf - measured_frf.mean())
@@ -133,38 +142,38 @@ def record_entries(
         response, as those of the paper's fits, ``indices_whole_record`` against the ratio of the
         whole record's transforms.
     """
-    names = [
+    fit_keys = [
         (
             {
                 "file": str(whole_record.record.path),
                 "estimator": "record",
                 "type": fit.structure.name,
                 "weighting": None,
-                "candidate": name,
-                "selected": name == whole_record.headline.name,
+                "candidate": fit_name,
+                "selected": fit_name == whole_record.headline.name,
             },
             fit,
         )
-        for name, fit in whole_record.fits.items()
+        for fit_name, fit in whole_record.fits.items()
     ]
     indices = [
         (NOT_COMPARED, NOT_COMPARED)
         if welch_analysis is None
         else indices_of_record_fit(fit, welch_analysis)
-        for _, fit in names
+        for _, fit in fit_keys
     ]
     return {
         "headline": whole_record.headline_json(),
         "fits": [
             {
-                **name,
+                **fit_key,
                 "free": [*fit.interval],
                 "parameters": dict(fit.parameters),
                 "withheld": sorted(unreported_parameters(fit.structure, whole_record.unsupported)),
                 "std": {key: std if key in fit.interval else None for key, std in fit.std.items()},
                 "interval_95": {
-                    key: None if interval is None else list(interval)
-                    for key, interval in fit.interval.items()
+                    key: None if order_interval is None else list(order_interval)
+                    for key, order_interval in fit.interval.items()
                 },
                 "cost": fit.cost,
                 "degrees_of_freedom": fit.degrees_of_freedom,
@@ -178,11 +187,13 @@ def record_entries(
                 "indices": welch_indices,
                 "indices_whole_record": record_indices,
             }
-            for (name, fit), (welch_indices, record_indices) in zip(names, indices, strict=True)
+            for (fit_key, fit), (welch_indices, record_indices) in zip(
+                fit_keys, indices, strict=True
+            )
         ],
         "modes": [
             {
-                **name,
+                **fit_key,
                 "mode": mode.number,
                 "visible": mode.shown,
                 "source": mode.source,
@@ -192,8 +203,8 @@ def record_entries(
                 "damping_ratio_std": mode.damping_ratio.std,
             }
             # The reported modes come first, because narrow sweeps are planned from them.
-            for name, _ in names
-            if name["selected"]
+            for fit_key, _ in fit_keys
+            if fit_key["selected"]
             for mode in whole_record.headline.modes
         ],
         "records": [
@@ -204,47 +215,49 @@ def record_entries(
                 "experiments": list(whole_record.verdict.experiments),
                 "withheld": sorted(whole_record.withheld),
                 "orders": {
-                    order.order: {
-                        "status": order.status,
-                        "value": order.value,
-                        "interval_95": None if order.interval is None else list(order.interval),
+                    order_estimate.order: {
+                        "status": order_estimate.status,
+                        "value": order_estimate.value,
+                        "interval_95": None
+                        if order_estimate.interval is None
+                        else list(order_estimate.interval),
                     }
-                    for order in whole_record.orders
+                    for order_estimate in whole_record.orders
                 },
                 "band_hz": list(whole_record.band_hz),
                 "fixed": list(whole_record.fixed),
-                "hum": [asdict(line) for line in whole_record.analysis.lines],
+                "hum": [asdict(spectral_line) for spectral_line in whole_record.analysis.lines],
                 "curves": _curves_json(whole_record),
             }
         ],
     }
 
 
-def _damping_size_json(size: DampingSize | None) -> dict[str, Any] | None:
-    """Return a damping size as a JSON object; null if there is none."""
-    return None if size is None else asdict(size)
+def _damping_size_json(damping_size: DampingSize | None) -> dict[str, Any] | None:
+    """Return the size of a damping (loss factor or coefficient) for JSON; None if unknown."""
+    return None if damping_size is None else asdict(damping_size)
 
 
 def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     """Return the displayed model's response and the loss factors over the band, as JSON lists."""
     first_hz, last_hz = whole_record.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
-    model, beam = (
+    model, loss_model = (
         ShownModel.of(whole_record.headline, whole_record.record),
         loss_estimate(whole_record),
     )
-    band = model.band(frequency_hz)
-    low, high = band.magnitude_limits()
-    factors_over_frequency = None if beam is None else loss_factors(beam, frequency_hz)
+    model_band = model.band(frequency_hz)
+    lower_magnitude, upper_magnitude = model_band.magnitude_limits()
+    factors_over_frequency = None if loss_model is None else loss_factors(loss_model, frequency_hz)
     supported_hz = supported_band_hz(whole_record)
     return {
         "model": "beam" if model.modal is None else "modal",
         "frequency_hz": frequency_hz.tolist(),
-        "magnitude_nm_per_rad": np.abs(band.response).tolist(),
-        "magnitude_low_nm_per_rad": low.tolist(),
-        "magnitude_high_nm_per_rad": high.tolist(),
-        "phase_rad": np.angle(band.response).tolist(),
-        "phase_std_rad": band.phase_std_rad.tolist(),
+        "magnitude_nm_per_rad": np.abs(model_band.response).tolist(),
+        "magnitude_low_nm_per_rad": lower_magnitude.tolist(),
+        "magnitude_high_nm_per_rad": upper_magnitude.tolist(),
+        "phase_rad": np.angle(model_band.response).tolist(),
+        "phase_std_rad": model_band.phase_std_rad.tolist(),
         "loss_factor_supported_hz": None if supported_hz is None else list(supported_hz),
         "loss_factor": None
         if factors_over_frequency is None
@@ -258,24 +271,28 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     }
 
 
-def _loss_factor_json(factor: LossFactor | None) -> dict[str, list[float]] | None:
-    """Return a loss factor with its 95 % band as JSON lists; null if there is none."""
-    if factor is None:
+def _loss_factor_json(loss_factor: LossFactor | None) -> dict[str, list[float]] | None:
+    """Return a loss factor over frequency and its 95 % band as lists; None without one."""
+    if loss_factor is None:
         return None
-    low, high = factor.limits()
-    return {"value": factor.value.tolist(), "low": low.tolist(), "high": high.tolist()}
+    lower_limit, upper_limit = loss_factor.limits()
+    return {
+        "value": loss_factor.value.tolist(),
+        "low": lower_limit.tolist(),
+        "high": upper_limit.tolist(),
+    }
 
 
 def document(
-    results: Sequence[RecordResult], errors: Mapping[str, str] | None = None
+    record_results: Sequence[RecordResult], error_messages: Mapping[str, str] | None = None
 ) -> dict[str, Any]:
     """Return the results of all files as one JSON document.
 
     Parameters
     ----------
-    results : sequence of RecordResult
+    record_results : sequence of RecordResult
         Results of each file. The entries of whole-record fits follow those of the Welch fits.
-    errors : mapping of str to str, optional
+    error_messages : mapping of str to str, optional
         Message for each file that could not be analysed.
 
     Returns
@@ -287,10 +304,12 @@ def document(
         ``versions``. All numbers are finite.
     """
     record_entries_by_file = [
-        record_entries(result.whole, result.welch) for result in results if result.whole
+        record_entries(result.whole, result.welch) for result in record_results if result.whole
     ]
-    welch_analyses = [(result.welch, result.unsupported) for result in results if result.welch]
-    content: dict[str, Any] = finite(
+    welch_analyses = [
+        (result.welch, result.unsupported) for result in record_results if result.welch
+    ]
+    document_content: dict[str, Any] = finite(
         {
             "versions": versions(),
             "files": [
@@ -298,12 +317,12 @@ def document(
                 for result, file_facts in (
                     *(
                         (result, _welch_file_json(result.welch))
-                        for result in results
+                        for result in record_results
                         if result.welch
                     ),
                     *(
                         (result, _record_facts(result.record, result.warnings))
-                        for result in results
+                        for result in record_results
                         if result.welch is None
                     ),
                 )
@@ -314,7 +333,7 @@ def document(
                     for analysis, unsupported_orders in welch_analyses
                     for fit in _welch_fits_json(analysis, unsupported_orders)
                 ),
-                *(fit for entries in record_entries_by_file for fit in entries["fits"]),
+                *(fit for file_entries in record_entries_by_file for fit in file_entries["fits"]),
             ],
             "modes": [
                 *(
@@ -323,41 +342,48 @@ def document(
                     for model in analysis.models
                     for mode in _welch_modes_json(analysis, model)
                 ),
-                *(mode for entries in record_entries_by_file for mode in entries["modes"]),
+                *(
+                    mode
+                    for file_entries in record_entries_by_file
+                    for mode in file_entries["modes"]
+                ),
             ],
-            "headlines": [entries["headline"] for entries in record_entries_by_file],
+            "headlines": [file_entries["headline"] for file_entries in record_entries_by_file],
             "records": [
-                record for entries in record_entries_by_file for record in entries["records"]
+                record_entry
+                for file_entries in record_entries_by_file
+                for record_entry in file_entries["records"]
             ],
             "peaks": [
                 {
                     "file": str(analysis.record.path),
-                    "mode": number,
-                    "frequency_hz": None if peak is None else peak.frequency_hz,
-                    "magnitude_db": None if peak is None else peak.magnitude_db,
+                    "mode": mode_number,
+                    "frequency_hz": None if resonance_peak is None else resonance_peak.frequency_hz,
+                    "magnitude_db": None if resonance_peak is None else resonance_peak.magnitude_db,
                 }
                 for analysis, _ in welch_analyses
-                for number, peak in enumerate(analysis.peaks, start=1)
+                for mode_number, resonance_peak in enumerate(analysis.peaks, start=1)
             ],
             "errors": [
-                {"file": file, "message": message} for file, message in (errors or {}).items()
+                {"file": file, "message": message}
+                for file, message in (error_messages or {}).items()
             ],
         }
     )
-    return content
+    return document_content
 
 
-def document_text(content: Mapping[str, Any], *, ascii_only: bool = False) -> str:
+def document_text(document_content: Mapping[str, Any], *, ascii_only: bool = False) -> str:
     """Return a document as JSON text with a newline at its end.
 
     Parameters
     ----------
-    content : mapping
+    document_content : mapping
         Document, without NaN and infinite numbers.
     ascii_only : bool
         Whether other characters are escaped, for a stream of unknown encoding.
     """
-    return json.dumps(content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
+    return json.dumps(document_content, indent=2, ensure_ascii=ascii_only, allow_nan=False) + "\n"
 
 
 def _welch_file_json(analysis: WelchAnalysis) -> dict[str, Any]:
@@ -401,21 +427,21 @@ def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
 def _welch_fits_json(
     analysis: WelchAnalysis, unsupported_orders: Collection[str]
 ) -> list[dict[str, Any]]:
-    """Return the JSON objects of a record's Welch fits."""
-    indices = whole_record_indices(analysis)
+    """Return the JSON objects of the models that are fitted to a record's Welch response."""
+    record_indices = whole_record_indices(analysis)
     return [
         {
             **_welch_fit_json(analysis, model, unsupported_orders),
             "indices_whole_record": indices_of_record,
         }
-        for model, indices_of_record in zip(analysis.models, indices, strict=True)
+        for model, indices_of_record in zip(analysis.models, record_indices, strict=True)
     ]
 
 
 def _welch_fit_json(
     analysis: WelchAnalysis, model: FittedModel, unsupported_orders: Collection[str]
 ) -> dict[str, Any]:
-    """Return the JSON object of one Welch fit."""
+    """Return the JSON object of one model that is fitted to a record's Welch response."""
     fit = model.fit
     return {
         **_fit_identity(analysis, model),
@@ -440,29 +466,29 @@ def _welch_modes_json(analysis: WelchAnalysis, model: FittedModel) -> list[dict[
     A mode is computed from the poles of the fitted model. Each object also states the deviation of
     the model's peak from the measured one.
     """
-    modes = []
-    for number, (peak, deviation) in enumerate(
+    mode_objects = []
+    for mode_number, (measured_peak, peak_deviation) in enumerate(
         zip(model.peaks, model.deviations, strict=True), start=1
     ):
-        mode = model.modes[number - 1] if model.modes else None
-        modes.append(
+        mode = model.modes[mode_number - 1] if model.modes else None
+        mode_objects.append(
             {
                 **_fit_identity(analysis, model),
-                "mode": number,
+                "mode": mode_number,
                 "frequency_hz": None if mode is None else mode.frequency_hz,
                 "natural_frequency_rad_s": None if mode is None else mode.natural_frequency_rad_s,
                 "damping_ratio": None if mode is None else mode.damping_ratio,
-                "peak_frequency_hz": None if peak is None else peak.frequency_hz,
-                "peak_magnitude_db": None if peak is None else peak.magnitude_db,
+                "peak_frequency_hz": None if measured_peak is None else measured_peak.frequency_hz,
+                "peak_magnitude_db": None if measured_peak is None else measured_peak.magnitude_db,
                 "peak_frequency_deviation_rad_s": (
-                    None if deviation is None else deviation.frequency_rad_s
+                    None if peak_deviation is None else peak_deviation.frequency_rad_s
                 ),
                 "peak_magnitude_deviation_db": (
-                    None if deviation is None else deviation.magnitude_db
+                    None if peak_deviation is None else peak_deviation.magnitude_db
                 ),
             }
         )
-    return modes
+    return mode_objects
 
 
 def _fit_identity(analysis: WelchAnalysis, model: FittedModel) -> dict[str, Any]:

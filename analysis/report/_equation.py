@@ -23,11 +23,11 @@ class Formula(NamedTuple):
     mathml: str
     tex: str
 
-    def __add__(self, other: object) -> Formula:
+    def __add__(self, next_formula: object) -> Formula:
         """Return this formula followed by another one."""
-        if not isinstance(other, Formula):
+        if not isinstance(next_formula, Formula):
             return NotImplemented
-        return Formula(self.mathml + other.mathml, f"{self.tex} {other.tex}")
+        return Formula(self.mathml + next_formula.mathml, f"{self.tex} {next_formula.tex}")
 
     @property
     def row(self) -> Formula:
@@ -35,34 +35,36 @@ class Formula(NamedTuple):
         return Formula(f"<mrow>{self.mathml}</mrow>", f"{{{self.tex}}}")
 
 
-def _variable(letter: str, tex: str = "") -> Formula:
+def _variable(letter: str, tex_command: str = "") -> Formula:
     """Return a variable, from its letter and its LaTeX command."""
-    return Formula(f"<mi>{letter}</mi>", tex or letter)
+    return Formula(f"<mi>{letter}</mi>", tex_command or letter)
 
 
-def _operator(text: str, tex: str = "") -> Formula:
+def _operator(operator_text: str, tex_command: str = "") -> Formula:
     """Return an operator or bracket, from its character and its LaTeX command."""
-    return Formula(f"<mo>{text}</mo>", tex or text)
+    return Formula(f"<mo>{operator_text}</mo>", tex_command or operator_text)
 
 
-def _number_formula(text: str) -> Formula:
+def _number_formula(number_text: str) -> Formula:
     """Return a number as a formula."""
-    return Formula(f"<mn>{text}</mn>", text)
+    return Formula(f"<mn>{number_text}</mn>", number_text)
 
 
-def _power(base: Formula, exponent: Formula) -> Formula:
+def _power(base_formula: Formula, exponent_formula: Formula) -> Formula:
     """Return a formula raised to the power of another formula."""
-    exponent_group = exponent.row
+    exponent_group = exponent_formula.row
     return Formula(
-        f"<msup>{base.row.mathml}{exponent_group.mathml}</msup>", f"{base.tex}^{exponent_group.tex}"
+        f"<msup>{base_formula.row.mathml}{exponent_group.mathml}</msup>",
+        f"{base_formula.tex}^{exponent_group.tex}",
     )
 
 
-def _subscript(base: Formula, index: Formula) -> Formula:
+def _subscript(base_formula: Formula, subscript_formula: Formula) -> Formula:
     """Return a formula with another formula as its subscript."""
-    index_group = index.row
+    index_group = subscript_formula.row
     return Formula(
-        f"<msub>{base.row.mathml}{index_group.mathml}</msub>", f"{base.tex}_{index_group.tex}"
+        f"<msub>{base_formula.row.mathml}{index_group.mathml}</msub>",
+        f"{base_formula.tex}_{index_group.tex}",
     )
 
 
@@ -72,15 +74,15 @@ def _fraction(numerator: Formula, denominator: Formula) -> Formula:
     return Formula(f"<mfrac>{a.mathml}{b.mathml}</mfrac>", rf"\frac{a.tex}{b.tex}")
 
 
-def _function_of(function: str, argument: Formula) -> Formula:
+def _function_of(function_word: str, argument_formula: Formula) -> Formula:
     """Return a function with several letters, such as sin, of an argument in brackets."""
-    function_name = Formula(f"<mi>{function}</mi><mo>&#x2061;</mo>", rf"\{function}")
-    return _join(function_name, _OPENING_BRACKET, argument, _CLOSING_BRACKET)
+    function_name = Formula(f"<mi>{function_word}</mi><mo>&#x2061;</mo>", rf"\{function_word}")
+    return _join(function_name, _OPENING_BRACKET, argument_formula, _CLOSING_BRACKET)
 
 
-def _join(*parts: Formula) -> Formula:
+def _join(*joined_formulas: Formula) -> Formula:
     """Return a formula that consists of several formulas, one after the other."""
-    return reduce(Formula.__add__, parts)
+    return reduce(Formula.__add__, joined_formulas)
 
 
 _S_SYMBOL: Final = _variable("s")
@@ -106,13 +108,18 @@ _TORQUE_OVER_ANGLE: Final = _fraction(
 """Formula of the coupling torque over the motor angle, both as Laplace transforms."""
 
 
-def _damping_term(coefficient: Formula, order: Formula, *, is_first_order: bool) -> Formula:
+def _damping_term(
+    coefficient_symbol: Formula, order_symbol: Formula, *, is_first_order: bool
+) -> Formula:
     """Return a damping term: coefficient times s, or times s to a fractional power."""
-    return coefficient + (_S_SYMBOL if is_first_order else _power(_S_SYMBOL, order))
+    return coefficient_symbol + (_S_SYMBOL if is_first_order else _power(_S_SYMBOL, order_symbol))
 
 
 def _elastic_factor(structure: Structure) -> Formula | None:
-    """Return the factor ``1 + zeta s^alpha`` of a structure; None without internal damping."""
+    """Return ``1 + zeta s^alpha`` of a damping structure as a formula.
+
+    It is None without internal damping.
+    """
     if not structure.internal:
         return None
     return _join(
@@ -124,10 +131,10 @@ def _elastic_factor(structure: Structure) -> Formula | None:
 
 def _inertial_terms(structure: Structure) -> Formula:
     """Return ``rho/EI s^2 + gamma s^lambda`` with the terms of the structure."""
-    ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
+    density_ratio = _fraction(_variable("ρ", r"\rho"), _EI_SYMBOLS)
     # In display style, although the ratio is inside a fraction.
-    displayed_ratio = f'<mstyle displaystyle="true">{ratio.mathml}</mstyle>'
-    inertia = Formula(displayed_ratio, ratio.tex.replace("frac", "dfrac")) + _power(
+    ratio_mathml = f'<mstyle displaystyle="true">{density_ratio.mathml}</mstyle>'
+    inertia = Formula(ratio_mathml, density_ratio.tex.replace("frac", "dfrac")) + _power(
         _S_SYMBOL, _NUMBER_TWO
     )
     if not structure.external:
@@ -140,22 +147,27 @@ def _inertial_terms(structure: Structure) -> Formula:
 
 
 def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
-    """Return Eq. 25 of the reference paper, and the equation of its beta."""
+    """Return the equation of the beam's response and that of the wave number beta in it.
+
+    The first is Eq. 25 of the reference paper.
+    """
     elastic_factor, z = _elastic_factor(structure), _BETA_SYMBOL + _L_SYMBOL
-    sin, cos, sinh, cosh = (_function_of(name, z) for name in ("sin", "cos", "sinh", "cosh"))
-    stiffness = (
+    sin, cos, sinh, cosh = (
+        _function_of(function_word, z) for function_word in ("sin", "cos", "sinh", "cosh")
+    )
+    stiffness_factor = (
         _EI_SYMBOLS
         if elastic_factor is None
         else _join(_EI_SYMBOLS, _OPENING_BRACKET, elastic_factor, _CLOSING_BRACKET)
     )
     numerator = _join(sin, cosh, _MINUS_SIGN, cos, sinh)
     denominator = _join(_NUMBER_ONE, _PLUS_SIGN, cos, cosh)
-    response = _join(
+    response_equation = _join(
         _G_SYMBOL,
         _ARGUMENT_S,
         _EQUALS_SIGN,
         _MINUS_SIGN,
-        stiffness,
+        stiffness_factor,
         _BETA_SYMBOL,
         _fraction(numerator, denominator),
     )
@@ -165,61 +177,68 @@ def _beam_equations(structure: Structure) -> tuple[Formula, Formula]:
         if elastic_factor is None
         else _fraction(inertial_terms, elastic_factor)
     )
-    return response, _join(
+    return response_equation, _join(
         _power(_BETA_SYMBOL, _number_formula("4")), _EQUALS_SIGN, _MINUS_SIGN, minus_beta_to_4
     )
 
 
 def _measured_equation(fit: RecordFit) -> Formula:
     """Return the equation of the measured torque over angle: beam, tool inertia and channels."""
-    beam = _G_SYMBOL + _ARGUMENT_S
-    names = fit.parameters
-    beam_and_tool = _join(beam, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
+    beam_response = _G_SYMBOL + _ARGUMENT_S
+    parameter_names = fit.parameters
+    beam_and_tool = _join(beam_response, _PLUS_SIGN, _variable("J"), _power(_S_SYMBOL, _NUMBER_TWO))
     delay_factor = _power(_variable("e"), _join(_MINUS_SIGN, _variable("τ", r"\tau"), _S_SYMBOL))
-    formula = _join(
+    measured_formula = _join(
         _operator("[", r"\left["), beam_and_tool, _operator("]", r"\right]"), delay_factor
     )
-    time = _variable("T") + _S_SYMBOL
-    if "filter_time_constant_s" in names:
-        formula += _fraction(_NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, time))
-    if "second_order_filter_time_constant_s" in names:
-        root = Formula(f"<msqrt>{_NUMBER_TWO.mathml}</msqrt>", r"\sqrt{2}")
-        square = _power(_variable("T"), _NUMBER_TWO) + _power(_S_SYMBOL, _NUMBER_TWO)
-        formula += _fraction(
-            _NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, root, time, _PLUS_SIGN, square)
+    filter_time = _variable("T") + _S_SYMBOL
+    if "filter_time_constant_s" in parameter_names:
+        measured_formula += _fraction(_NUMBER_ONE, _join(_NUMBER_ONE, _PLUS_SIGN, filter_time))
+    if "second_order_filter_time_constant_s" in parameter_names:
+        root_two = Formula(f"<msqrt>{_NUMBER_TWO.mathml}</msqrt>", r"\sqrt{2}")
+        square_sum = _power(_variable("T"), _NUMBER_TWO) + _power(_S_SYMBOL, _NUMBER_TWO)
+        measured_formula += _fraction(
+            _NUMBER_ONE,
+            _join(_NUMBER_ONE, _PLUS_SIGN, root_two, filter_time, _PLUS_SIGN, square_sum),
         )
-    return _join(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, formula)
+    return _join(_TORQUE_OVER_ANGLE, _EQUALS_SIGN, measured_formula)
 
 
 def _modal_equation() -> Formula:
     """Return the equation of the modal model: poles and residues, and background terms."""
-    k, n, background = _variable("k"), _variable("n"), BACKGROUND_COEFFICIENTS - 1
-    over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
-    highest_power = _number_formula(str(background))
-    from_zero = _join(n, _EQUALS_SIGN, _number_formula("0"))
-    over_powers = Formula(
-        f"<munderover><mo>∑</mo>{from_zero.row.mathml}{highest_power.row.mathml}</munderover>",
-        rf"\sum_{from_zero.row.tex}^{highest_power.row.tex}",
+    k, n, highest_exponent = _variable("k"), _variable("n"), BACKGROUND_COEFFICIENTS - 1
+    sum_over_modes = Formula(f"<munder><mo>∑</mo>{k.row.mathml}</munder>", rf"\sum_{k.row.tex}")
+    upper_sum_limit = _number_formula(str(highest_exponent))
+    lower_sum_limit = _join(n, _EQUALS_SIGN, _number_formula("0"))
+    sum_over_powers = Formula(
+        f"<munderover><mo>∑</mo>{lower_sum_limit.row.mathml}{upper_sum_limit.row.mathml}</munderover>",
+        rf"\sum_{lower_sum_limit.row.tex}^{upper_sum_limit.row.tex}",
     )
-    terms = []
-    for residue, pole in (
+    modal_terms = []
+    for residue_symbol, pole_symbol in (
         (_variable("R"), _variable("p")),
         (_conjugate_variable("R"), _conjugate_variable("p")),
     ):
-        terms.append(
-            _fraction(_subscript(residue, k), _join(_S_SYMBOL, _MINUS_SIGN, _subscript(pole, k)))
+        modal_terms.append(
+            _fraction(
+                _subscript(residue_symbol, k),
+                _join(_S_SYMBOL, _MINUS_SIGN, _subscript(pole_symbol, k)),
+            )
         )
-    first, second = terms
+    first_term, second_term = modal_terms
     return _join(
-        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, over_modes, _OPENING_BRACKET, first, _PLUS_SIGN, second,
+        _TORQUE_OVER_ANGLE, _EQUALS_SIGN, sum_over_modes, _OPENING_BRACKET, first_term, _PLUS_SIGN,
+        second_term,
         _CLOSING_BRACKET, _PLUS_SIGN,
-        over_powers, _subscript(_variable("b"), n), _power(_S_SYMBOL, n),
+        sum_over_powers, _subscript(_variable("b"), n), _power(_S_SYMBOL, n),
     )  # fmt: skip
 
 
-def _conjugate_variable(letter: str) -> Formula:
+def _conjugate_variable(variable_letter: str) -> Formula:
     """Return a letter with an overline, for the complex conjugate."""
-    return Formula(f"<mover><mi>{letter}</mi><mo>¯</mo></mover>", rf"\bar{{{letter}}}")
+    return Formula(
+        f"<mover><mi>{variable_letter}</mi><mo>¯</mo></mover>", rf"\bar{{{variable_letter}}}"
+    )
 
 
 def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
@@ -240,9 +259,10 @@ def equations(whole_record: WholeRecord) -> tuple[Formula, ...]:
 
 
 def _reported_structure(whole_record: WholeRecord) -> Structure:
-    """Return the structure of the reported parameters.
+    """Return the damping structure to which the reported parameters belong.
 
-    With a tolerance of the geometry it is the structure with both orders free.
+    If the parameters are estimated with a tolerance of the beam's geometry, the orders of internal
+    and external damping are both free.
     """
     return (
         whole_record.fit.structure if whole_record.headline.tolerant is None else STRUCTURES["VI"]
@@ -261,41 +281,47 @@ _EFFECT_DEFINITIONS: Final = {
 
 def definitions(whole_record: WholeRecord) -> str:
     """Return a text that defines the symbols of the equations that no table explains."""
-    statements = [
+    definition_sentences = [
         "On the left coupling torque over motor angle, as Laplace transforms",
         f"L = {whole_record.record.beam.length_m:g} m is the length from the axis to the tip",
         "powers of s are principal values",
     ]
     if whole_record.headline.modal is not None:
-        statements[1:1] = [
+        definition_sentences[1:1] = [
             "first the modal model with a pole p and a residue R of each mode, which the modes are "
             "of, below it the beam's, which the parameters are of",
         ]
-    names = whole_record.headline.parameters
-    statements += [definition for name, definition in _EFFECT_DEFINITIONS.items() if name in names]
-    return f"{'; '.join(statements)}. The numbers are in the table of the parameters."
+    parameter_names = whole_record.headline.parameters
+    definition_sentences += [
+        effect_definition
+        for parameter_name, effect_definition in _EFFECT_DEFINITIONS.items()
+        if parameter_name in parameter_names
+    ]
+    return f"{'; '.join(definition_sentences)}. The numbers are in the table of the parameters."
 
 
 def types_table(whole_record: WholeRecord) -> Table:
     """Return the table of the damping types with their internal and external terms."""
-    order_words = {False: "fractional", True: "integer"}
+    order_adjectives = {False: "fractional", True: "integer"}
 
     def rows() -> Iterator[tuple[str, str, str, str]]:
         for structure in STRUCTURES.values():
-            descriptions, terms = [], []
-            for is_present, damping_name, coefficient, order, symbol in (
+            term_descriptions, damping_terms = [], []
+            for is_present, damping_name, coefficient_name, order_name, order_symbol in (
                 (structure.internal, "internal", "ζ", "alpha", "α"),
                 (structure.external, "external", "γ", "lambda", "λ"),
             ):
-                is_first_order = order not in structure.free
-                terms.append(
-                    f"{coefficient} s{'' if is_first_order else '^' + symbol}"
+                is_first_order = order_name not in structure.free
+                damping_terms.append(
+                    f"{coefficient_name} s{'' if is_first_order else '^' + order_symbol}"
                     if is_present
                     else ABSENT_TEXT
                 )
                 if is_present:
-                    descriptions.append(f"{damping_name} of {order_words[is_first_order]} order")
-            yield structure.name, terms[0], terms[1], ", ".join(descriptions)
+                    term_descriptions.append(
+                        f"{damping_name} of {order_adjectives[is_first_order]} order"
+                    )
+            yield structure.name, damping_terms[0], damping_terms[1], ", ".join(term_descriptions)
 
     return Table.of(
         "types",
@@ -326,6 +352,6 @@ def mathml(formula: Formula) -> str:
 
 def latex(formulas: tuple[Formula, ...]) -> str:
     r"""Return formulas as an ``align`` environment of LaTeX's amsmath."""
-    lines = (formula.tex.replace(" = ", " &= ", 1) for formula in formulas)
-    body = " \\\\\n  ".join(lines)
-    return f"\\begin{{align}}\n  {body}\n\\end{{align}}\n"
+    formula_lines = (formula.tex.replace(" = ", " &= ", 1) for formula in formulas)
+    align_body = " \\\\\n  ".join(formula_lines)
+    return f"\\begin{{align}}\n  {align_body}\n\\end{{align}}\n"

@@ -40,14 +40,17 @@ _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by t
 
 
 def structures_table(whole_record: WholeRecord) -> Table:
-    """Return the table of all whole-record fits; orders without support are marked."""
+    """Return the table of all whole-record fits, with one row for each damping structure.
+
+    Fractional orders that the data do not determine are marked.
+    """
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
     unsupported_orders = whole_record.unsupported
     delta_bic = whole_record.delta_bic
     status_by_name = dict(whole_record.headline.structures)
-    rows: list[tuple[Entry, ...]] = []
-    for name, fit in whole_record.fits.items():
-        fit_status = status_by_name.get(name, "")
+    table_rows: list[tuple[Entry, ...]] = []
+    for structure_name, fit in whole_record.fits.items():
+        fit_status = status_by_name.get(structure_name, "")
         damping_cells = _damping_cells(
             fit.structure,
             fit.parameters,
@@ -55,12 +58,12 @@ def structures_table(whole_record: WholeRecord) -> Table:
             unsupported_orders=unsupported_orders,
             at_bounds=fit.at_bounds,
         )
-        rows.append(
+        table_rows.append(
             (
-                name,
+                structure_name,
                 fit_status,
                 *(map(_hidden_cell, damping_cells) if fit_status == "excluded" else damping_cells),
-                *([delta_bic[name]] if delta_bic else []),
+                *([delta_bic[structure_name]] if delta_bic else []),
                 whole_record.analysis.fit_percent(fit),
                 fit.cost / fit.degrees_of_freedom,
                 fit.free_parameters,
@@ -86,7 +89,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
             Column("", "degrees_of_freedom"),
             Column("", "not_reported", TEXT_FORMAT),
         ),
-        rows,
+        table_rows,
         (
             *footnotes(unsupported_orders),
             "ΔBIC: Bayesian information criterion above the lowest; 10 = decisive. Fit: NRMSE "
@@ -101,7 +104,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
 
 
 def _marked_row(whole_record: WholeRecord) -> str:
-    """Return to which values the marked row belongs, for the note of the table."""
+    """Return what the highlighted row of the table of fits contains, as part of a note."""
     return (
         "the one reported"
         if whole_record.headline.exact is None
@@ -110,18 +113,18 @@ def _marked_row(whole_record: WholeRecord) -> str:
 
 
 def _hidden_cell(cell: Cell) -> Cell:
-    """Return a cell that shows a dash to people but contains its number for programs."""
+    """Return a cell that is displayed as a dash, and has its number in the CSV file."""
     return cell if cell.value is None else replace(cell, text=ABSENT_TEXT, doubtful=True)
 
 
 def _damping_columns() -> list[Column]:
     """Return the columns of value and standard deviation of each damping parameter."""
     return [
-        column
-        for name in _DAMPING_PARAMETERS
-        for column in (
-            Column(_parameter_heading(name), name),
-            Column("std", f"{name}_std", std_of_previous=True),
+        value_column
+        for parameter_name in _DAMPING_PARAMETERS
+        for value_column in (
+            Column(_parameter_heading(parameter_name), parameter_name),
+            Column("std", f"{parameter_name}_std", std_of_previous=True),
         )
     ]  # fmt: skip
 
@@ -139,30 +142,36 @@ def _damping_cells(
     Fixed values have no standard deviation. Parameters that the structure does not have are dashes.
     """
     not_reported = unreported_parameters(structure, unsupported_orders)
-    cells: list[Cell] = []
-    for name in _DAMPING_PARAMETERS:
-        if not structure.has(name):
-            cells += [number_cell(None), number_cell(None)]
+    parameter_cells: list[Cell] = []
+    for parameter_name in _DAMPING_PARAMETERS:
+        if not structure.has(parameter_name):
+            parameter_cells += [number_cell(None), number_cell(None)]
             continue
-        parameter_std = std[name] if std is not None and name in structure.free else None
-        value, std_cell = estimate_cells(
-            (parameters[name], parameter_std), parameter_std, QUANTITIES[name][3]
+        parameter_std = (
+            std[parameter_name] if std is not None and parameter_name in structure.free else None
         )
-        if name in at_bounds:
-            value = replace(value, text=f"{value.text}*")
-        cells += (
-            [mark_cell(value), grey_cell(std_cell)] if name in not_reported else [value, std_cell]
+        value_cell, std_cell = estimate_cells(
+            (parameters[parameter_name], parameter_std),
+            parameter_std,
+            QUANTITIES[parameter_name][3],
         )
-    return cells
+        if parameter_name in at_bounds:
+            value_cell = replace(value_cell, text=f"{value_cell.text}*")
+        parameter_cells += (
+            [mark_cell(value_cell), grey_cell(std_cell)]
+            if parameter_name in not_reported
+            else [value_cell, std_cell]
+        )
+    return parameter_cells
 
 
-def _parameter_heading(name: str) -> str:
+def _parameter_heading(parameter_name: str) -> str:
     """Return the heading of a damping parameter: symbol and power of ten.
 
     The units are omitted, because they depend on the orders and would be too long.
     """
-    symbol, _meaning, unit, factor = QUANTITIES[name]
-    return symbol if factor == 1.0 else f"{symbol} ({unit.split()[0]})"
+    parameter_symbol, _meaning, unit, display_factor = QUANTITIES[parameter_name]
+    return parameter_symbol if display_factor == 1.0 else f"{parameter_symbol} ({unit.split()[0]})"
 
 
 _NAME_COLUMNS: Final = (
@@ -194,7 +203,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
             *_NAME_COLUMNS,
             *_damping_columns(),
             Column("Fit (%)", "nrmse_percent", ".2f"),
-            *(Column(name.upper(), name) for name in _INDEX_NAMES),
+            *(Column(index_name.upper(), index_name) for index_name in _INDEX_NAMES),
         ),
         (
             (
@@ -204,7 +213,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
                     at_bounds=fit.at_bounds,
                 ),
                 response_fit_percent(analysis, model),
-                *(getattr(model.indices, name) for name in _INDEX_NAMES),
+                *(getattr(model.indices, index_name) for index_name in _INDEX_NAMES),
             )
             for fit, model in zip(fits, analysis.models, strict=True)
         ),
@@ -222,29 +231,35 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
 
 def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
     """Return the table of each Welch fit's mean and standard deviation over several files."""
-    rows: list[tuple[Entry, ...]] = []
-    for models in zip(*(analysis.models for analysis in analyses), strict=True):
-        fits = [model.fit for model in models]
-        parameters, indices = (
-            {key: [values[key] for values in results_of_files] for key in keys}
-            for keys, results_of_files in (
-                (_DAMPING_PARAMETERS, [fit.parameters for fit in fits]),
-                (_INDEX_NAMES, [asdict(model.indices) for model in models]),
+    table_rows: list[tuple[Entry, ...]] = []
+    for same_models in zip(*(welch_analysis.models for welch_analysis in analyses), strict=True):
+        model_fits = [model.fit for model in same_models]
+        parameter_values, index_values = (
+            {key: [file_values[key] for file_values in results_of_files] for key in fit_keys}
+            for fit_keys, results_of_files in (
+                (_DAMPING_PARAMETERS, [fit.parameters for fit in model_fits]),
+                (_INDEX_NAMES, [asdict(model.indices) for model in same_models]),
             )
         )
-        rows.append(
+        table_rows.append(
             (
-                *_type_and_weighting(models[0]),
+                *_type_and_weighting(same_models[0]),
                 *_damping_cells(
-                    fits[0].structure,
-                    {name: fmean(values) for name, values in parameters.items()},
-                    {name: _stdev_or_nan(values) for name, values in parameters.items()},
+                    model_fits[0].structure,
+                    {
+                        value_name: fmean(file_values)
+                        for value_name, file_values in parameter_values.items()
+                    },
+                    {
+                        value_name: _stdev_or_nan(file_values)
+                        for value_name, file_values in parameter_values.items()
+                    },
                 ),
                 *(
-                    cell
-                    for values in indices.values()
-                    for cell in estimate_cells(
-                        (fmean(values), _stdev_or_nan(values)), _stdev_or_nan(values)
+                    mean_cell
+                    for file_values in index_values.values()
+                    for mean_cell in estimate_cells(
+                        (fmean(file_values), _stdev_or_nan(file_values)), _stdev_or_nan(file_values)
                     )
                 ),
             )
@@ -256,22 +271,23 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
             *_NAME_COLUMNS,
             *_damping_columns(),
             *(
-                column
-                for name in _INDEX_NAMES
-                for column in (
-                    Column(name.upper(), name), Column("std", f"{name}_std", std_of_previous=True),
+                table_column
+                for value_name in _INDEX_NAMES
+                for table_column in (
+                    Column(value_name.upper(), value_name),
+                    Column("std", f"{value_name}_std", std_of_previous=True),
                 )
             ),
         ),
-        rows,
+        table_rows,
         (_INDEX_UNITS,),
         grouped=True,
     )  # fmt: skip
 
 
-def _stdev_or_nan(values: list[float]) -> float:
+def _stdev_or_nan(sample_values: list[float]) -> float:
     """Return the standard deviation of several values; NaN for a single one."""
-    return stdev(values) if len(values) > 1 else math.nan
+    return stdev(sample_values) if len(sample_values) > 1 else math.nan
 
 
 def _type_and_weighting(model: FittedModel) -> tuple[str, str]:
@@ -281,7 +297,7 @@ def _type_and_weighting(model: FittedModel) -> tuple[str, str]:
 
 def peaks_table(analysis: WelchAnalysis) -> Table:
     """Return the table of measured resonance peaks and each model's deviations from them."""
-    modes = range(1, len(analysis.peaks) + 1)
+    mode_numbers = range(1, len(analysis.peaks) + 1)
     measured_values = (
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
         *(p.magnitude_db if p else None for p in analysis.peaks),
@@ -291,8 +307,8 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
         "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
         (
             *_NAME_COLUMNS,
-            *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s", ".3f") for n in modes),
-            *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in modes),
+            *(Column(f"ω{n} (rad/s)", f"omega_{n}_rad_s", ".3f") for n in mode_numbers),
+            *(Column(f"M{n} (dB)", f"magnitude_{n}_db", ".3f") for n in mode_numbers),
         ),
         (
             ("measured", "", *measured_values),
@@ -318,53 +334,59 @@ _FAR_MODE_MARK: Final = "‡"
 def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     """Return the table of modes from each Welch fit's poles; None if no fit has modes.
 
-    Modes that are not the antenna's are marked or omitted.
+    A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
     """
-    models = analysis.models
-    modes = max((len(model.modes) for model in models), default=0)
-    if not modes:
+    fitted_models = analysis.models
+    most_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
+    if not most_modes:
         return None
 
-    def cells(model: FittedModel, name: str, number_format: str, factor: float = 1.0) -> list[Cell]:
+    def cells(
+        fitted_model: FittedModel, value_name: str, number_format: str, display_factor: float = 1.0
+    ) -> list[Cell]:
         mode_cells = []
-        for mode, is_followed in zip(model.modes, model.followed, strict=True):
+        for mode, is_followed in zip(fitted_model.modes, fitted_model.followed, strict=True):
             cell = number_cell(
-                getattr(mode, name) if mode.damping_ratio < 1 else None, number_format, factor
+                getattr(mode, value_name) if mode.damping_ratio < 1 else None,
+                number_format,
+                display_factor,
             )
             if cell.value is not None and not is_followed:
                 cell = grey_cell(replace(cell, text=cell.text + _FAR_MODE_MARK))
             mode_cells.append(cell)
-        return mode_cells or [number_cell(None)] * modes
+        return mode_cells or [number_cell(None)] * most_modes
 
     mode_pairs = [
-        pair for model in models for pair in zip(model.modes, model.followed, strict=True)
+        mode_pair
+        for fitted_model in fitted_models
+        for mode_pair in zip(fitted_model.modes, fitted_model.followed, strict=True)
     ]
     is_underdamped = [mode.damping_ratio < 1 for mode, _ in mode_pairs]
-    notes = ["From the poles of the fitted model; ξ is the damping ratio."]
+    table_notes = ["From the poles of the fitted model; ξ is the damping ratio."]
     if any(not is_followed and mode.damping_ratio < 1 for mode, is_followed in mode_pairs):
-        notes.append(
+        table_notes.append(
             f"{_FAR_MODE_MARK} more than {100 * LARGEST_FREQUENCY_SHIFT:g} % off the undamped "
             "beam's: the fit does not follow this resonance. The number only describes the fitted "
             "curve."
         )
-    if not all(is_underdamped) or not all(model.modes for model in models):
-        notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
+    if not all(is_underdamped) or not all(fitted_model.modes for fitted_model in fitted_models):
+        table_notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
     return Table.of(
         "welch_modes",
         "Modes of the fits to Welch's estimate",
         (
             *_NAME_COLUMNS,
-            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, modes + 1)),
-            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, modes + 1)),
+            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, most_modes + 1)),
+            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, most_modes + 1)),
         ),
         (
             (
-                *_type_and_weighting(model),
-                *cells(model, "frequency_hz", ".4f"),
-                *cells(model, "damping_ratio", ".4g", 100.0),
+                *_type_and_weighting(fitted_model),
+                *cells(fitted_model, "frequency_hz", ".4f"),
+                *cells(fitted_model, "damping_ratio", ".4g", 100.0),
             )
-            for model in models
+            for fitted_model in fitted_models
         ),
-        notes,
+        table_notes,
         grouped=True,
     )

@@ -37,41 +37,45 @@ _FURTHER_LINES: Final[tuple[dict[str, Any], ...]] = (
 
 
 def frf_figure(analysis: WelchAnalysis) -> Figure:
-    """Draw the measured response, every fitted model's response, and the coherence."""
+    """Draw the measured frequency response, those of all fitted models, and the coherence."""
     settings = analysis.settings
-    types = settings.types
-    columns = min(len(types), 4 if len(types) > 6 else 3)
-    rows = -(-len(types) // columns)
+    type_names = settings.types
+    panel_columns = min(len(type_names), 4 if len(type_names) > 6 else 3)
+    panel_rows = -(-len(type_names) // panel_columns)
     legend_row_count = -(-(len(settings.weightings) + 2) // _LEGEND_COLUMNS)
-    width_in = max(3.2 * columns, 8.0)
+    width_in = max(3.2 * panel_columns, 8.0)
     header_height_in = 1.0 + 0.2 * legend_row_count
-    height_in = 2.9 * rows + 1.0 + header_height_in
+    height_in = 2.9 * panel_rows + 1.0 + header_height_in
     figure = style.new_figure(
         width_in, height_in, "Frequency response by Welch's method",
         f"coupling torque over motor angle  ·  {_estimate_text(analysis)}  ·  "
         "MSE, WMSE in (N·m/rad)²",
     )  # fmt: skip
     grid = figure.add_gridspec(
-        rows + 1, columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
+        panel_rows + 1, panel_columns, left=0.62 / width_in, right=1 - 0.2 / width_in,
         top=1 - header_height_in / height_in, bottom=0.5 / height_in, wspace=0.12, hspace=0.26,
-        height_ratios=(*(1.0,) * rows, 0.22),
+        height_ratios=(*(1.0,) * panel_rows, 0.22),
     )  # fmt: skip
-    lines = line_styles(settings.weightings)
+    style_by_weighting = line_styles(settings.weightings)
     # The scores need room above the highest peak.
     limits_db = style.db_limits(
         [analysis.response.response], [model.response for model in analysis.models],
         headroom_db=5.0 * len(settings.weightings),
     )  # fmt: skip
-    handles: dict[str, Line2D] = {}
-    panels = style.type_panels(figure, grid, types, settings.band_hz, limits_db)
-    for name, magnitude, phase in panels:
-        models = [m for m in analysis.models if m.fit.structure.name == name]
-        handles |= _draw_type_panel(analysis, models, magnitude, phase, lines)
-        _write_scores(magnitude, models, lines)
-    coherence_axes = figure.add_subplot(grid[rows, :])
+    line_by_label: dict[str, Line2D] = {}
+    panel_axes = style.type_panels(figure, grid, type_names, settings.band_hz, limits_db)
+    for type_name, magnitude_axes, phase_axes in panel_axes:
+        type_models = [m for m in analysis.models if m.fit.structure.name == type_name]
+        line_by_label |= _draw_type_panel(
+            analysis, type_models, magnitude_axes, phase_axes, style_by_weighting
+        )
+        _write_scores(magnitude_axes, type_models, style_by_weighting)
+    coherence_axes = figure.add_subplot(grid[panel_rows, :])
     _draw_coherence(coherence_axes, analysis)
-    columns = min(len(handles), _LEGEND_COLUMNS)
-    style.legend(figure, list(handles.values()), list(handles), columns=columns)
+    panel_columns = min(len(line_by_label), _LEGEND_COLUMNS)
+    style.legend(
+        figure, list(line_by_label.values()), list(line_by_label), column_count=panel_columns
+    )
     return figure
 
 
@@ -81,86 +85,99 @@ def line_styles(weightings: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     The paper's two weightings have the styles of the paper.
     """
     further_lines = cycle(_FURTHER_LINES)
-    return {name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings}
+    return {
+        weighting_name: _LINES_BY_WEIGHTING.get(weighting_name) or next(further_lines)
+        for weighting_name in weightings
+    }
 
 
 def _estimate_text(analysis: WelchAnalysis) -> str:
     """Return a description of the response estimate: method, segments, band and bins."""
     settings, response = analysis.settings, analysis.response
-    band = f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
-    how = estimate_text(settings.estimator, analysis.segmentation, response.segments)
-    return f"{how}  ·  {band}"
+    band_text = (
+        f"{settings.band_hz[0]:g} to {settings.band_hz[1]:g} Hz, {len(response.response)} bins"
+    )
+    method_text = estimate_text(settings.estimator, analysis.segmentation, response.segments)
+    return f"{method_text}  ·  {band_text}"
 
 
 def _draw_type_panel(
     analysis: WelchAnalysis,
     models: list[FittedModel],
-    magnitude: Axes,
-    phase: Axes,
-    lines: dict[str, dict[str, Any]],
+    magnitude_axes: Axes,
+    phase_axes: Axes,
+    style_by_weighting: dict[str, dict[str, Any]],
 ) -> dict[str, Line2D]:
     """Draw the measured and modelled curves of one type, and return their lines by label."""
-    handles = {}
-    curves: list[tuple[str, NDArray[np.float64], NDArray[np.complex128], dict[str, Any]]] = []
+    line_by_label = {}
+    type_curves: list[tuple[str, NDArray[np.float64], NDArray[np.complex128], dict[str, Any]]] = []
     if analysis.settings.estimator != "fft":
         whole_record = analysis.whole_record
-        curves.append(
+        type_curves.append(
             (
                 f"measured, {ESTIMATOR_NAMES['fft']}", whole_record.frequency_hz,
                 whole_record.response, {"color": style.FAINT, "linewidth": 0.6},
             )
         )  # fmt: skip
     measured_frf = analysis.response
-    curves.append(
+    type_curves.append(
         (
             f"measured, {ESTIMATOR_NAMES[analysis.settings.estimator]}", measured_frf.frequency_hz,
             measured_frf.response, {"color": style.GREY, "linewidth": 1.3},
         )
     )  # fmt: skip
-    curves.extend(
+    type_curves.extend(
         (
             f"model, weights {model.fit.weighting}", measured_frf.frequency_hz, model.response,
-            {**lines[model.fit.weighting], "linewidth": 1.2},
+            {**style_by_weighting[model.fit.weighting], "linewidth": 1.2},
         )
         for model in models
     )  # fmt: skip
-    for label, frequency_hz, response, line_style in curves:
+    for curve_label, frequency_hz, response, line_style in type_curves:
         is_drawable = np.isfinite(response) & (response != 0)
-        at_hz, values = frequency_hz[is_drawable], response[is_drawable]
-        (handles[label],) = magnitude.plot(
-            *style.envelope(at_hz, magnitude_db(values), _CURVE_COLUMNS, logarithmic=True),
+        line_hz, plotted_values = frequency_hz[is_drawable], response[is_drawable]
+        (line_by_label[curve_label],) = magnitude_axes.plot(
+            *style.envelope(
+                line_hz, magnitude_db(plotted_values), _CURVE_COLUMNS, logarithmic=True
+            ),
             **line_style,
         )
-        if label.startswith("measured"):
+        if curve_label.startswith("measured"):
             # Dots, because a line would jump wherever noise wraps the phase.
-            point_indices = style.log_spaced_indices(at_hz, 2 * _CURVE_COLUMNS)
+            point_indices = style.log_spaced_indices(line_hz, 2 * _CURVE_COLUMNS)
             style.dots(
-                phase,
-                at_hz[point_indices],
-                phase_deg(values[point_indices]),
+                phase_axes,
+                line_hz[point_indices],
+                phase_deg(plotted_values[point_indices]),
                 size_pt=1.8,
                 color=line_style["color"],
             )
         else:
-            phase.plot(
-                *style.envelope(at_hz, phase_deg(values), _CURVE_COLUMNS, logarithmic=True),
+            phase_axes.plot(
+                *style.envelope(
+                    line_hz, phase_deg(plotted_values), _CURVE_COLUMNS, logarithmic=True
+                ),
                 **line_style,
             )
-    for peak in analysis.peaks:
-        if peak is not None:
-            for axes in (magnitude, phase):
-                axes.axvline(peak.frequency_hz, color="#B8B8B8", linewidth=0.6, zorder=0.5)
-    return handles
+    for resonance_peak in analysis.peaks:
+        if resonance_peak is not None:
+            for panel_axes in (magnitude_axes, phase_axes):
+                panel_axes.axvline(
+                    resonance_peak.frequency_hz, color="#B8B8B8", linewidth=0.6, zorder=0.5
+                )
+    return line_by_label
 
 
-def _write_scores(axes: Axes, models: list[FittedModel], lines: dict[str, dict[str, Any]]) -> None:
-    """Write MSE and WMSE of each model into the panel, in the colour of its line."""
-    for number, model in enumerate(models):
-        axes.annotate(
+def _write_scores(
+    panel_axes: Axes, models: list[FittedModel], style_by_weighting: dict[str, dict[str, Any]]
+) -> None:
+    """Write each model's mean square errors (MSE, WMSE) into the panel, in its line's colour."""
+    for line_number, model in enumerate(models):
+        panel_axes.annotate(
             f"MSE {model.indices.mse:.3g}  WMSE {model.indices.wmse:.3g}",
-            (1.0, 1.0), xycoords="axes fraction", xytext=(-3, -3 - 9.5 * number),
+            (1.0, 1.0), xycoords="axes fraction", xytext=(-3, -3 - 9.5 * line_number),
             textcoords="offset points", ha="right", va="top", fontsize=7,
-            color=lines[model.fit.weighting]["color"],
+            color=style_by_weighting[model.fit.weighting]["color"],
             bbox={"facecolor": "white", "edgecolor": "none", "pad": 0.8},
         )  # fmt: skip
 

@@ -17,12 +17,12 @@ Facts = tuple[str, list[tuple[str, str]]]
 """Title of a group of facts, and the name and value of each fact."""
 
 
-def page(template: str, **content: Any) -> str:  # noqa: ANN401 - what the template asks for
+def page(template_name: str, **template_content: Any) -> str:  # noqa: ANN401 - what the template asks for
     """Return a template of this package as HTML, filled with content.
 
     It raises an error if the template uses a name that is not in the content.
     """
-    return _environment().get_template(template).render(content)
+    return _environment().get_template(template_name).render(template_content)
 
 
 @cache
@@ -39,7 +39,7 @@ def _environment() -> jinja2.Environment:
 
 
 def versions(made_at: datetime) -> Facts:
-    """Return the date of the report and the versions of the programs, as facts."""
+    """Return a table of (name, text): date of the report and versions of the programs."""
     return (
         "Versions",
         [

@@ -44,9 +44,10 @@ FIT_NAME_COLUMNS: Final = (
 
 
 def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple[Table, ...]:
-    """Return the paper's tables from the campaign's Welch fits; nothing without Welch fits.
+    """Return the reference paper's tables with the numbers of the campaign's Welch fits.
 
-    On request they contain the paper's own numbers in parentheses.
+    There are none without Welch fits. With `with_paper` the tables also contain the paper's own
+    numbers in parentheses.
     """
     if not campaign.nominal:
         return ()
@@ -60,11 +61,15 @@ def paper_tables(campaign: CampaignResult, *, with_paper: bool = False) -> tuple
 def welch_method_text(campaign: CampaignResult) -> str:
     """Return how the sessions' frequency responses were estimated, as text."""
     settings = campaign.settings
-    counts = [session.segments for session in campaign.sessions]
-    low, high = min(counts), max(counts)
-    segments = f"{low}" if low == high else f"{low} to {high}"
+    segment_counts = [session.segments for session in campaign.sessions]
+    least_segments, most_segments = min(segment_counts), max(segment_counts)
+    segments_text = (
+        f"{least_segments}"
+        if least_segments == most_segments
+        else f"{least_segments} to {most_segments}"
+    )
     # The settings state all lengths, so that the rate has no effect.
-    return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments)
+    return estimate_text(settings.estimator, settings.segmentation(PAPER_RATE_HZ), segments_text)
 
 
 _STATISTICS: Final = ("mean", "median", "std", "min", "max")
@@ -80,26 +85,37 @@ _PARENTHESES_NOTE: Final = "In parentheses: the paper's."
 
 def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Return the table of each parameter's statistics over the sessions (Table 3)."""
-    rows: list[Row] = []
+    table_rows: list[Row] = []
     for statistics in campaign.statistics:
-        symbol, factor = _TABLE_3_HEADINGS[statistics.parameter]
+        parameter_symbol, display_factor = _TABLE_3_HEADINGS[statistics.parameter]
         paper_values: dict[str, float | None] = {}
         if with_paper:
             paper_row = published_table3().get(
                 (statistics.structure, statistics.weighting, statistics.parameter)
             )
-            paper_values = {name: getattr(paper_row, name, None) for name in _STATISTICS}
-        values = [getattr(statistics, name) for name in _STATISTICS]
-        cells = dict(zip(_STATISTICS, estimate_cells(values, statistics.std, factor), strict=True))
-        rows.append(
+            paper_values = {
+                statistic_name: getattr(paper_row, statistic_name, None)
+                for statistic_name in _STATISTICS
+            }
+        statistic_values = [getattr(statistics, statistic_name) for statistic_name in _STATISTICS]
+        statistic_cells = dict(
+            zip(
+                _STATISTICS,
+                estimate_cells(statistic_values, statistics.std, display_factor),
+                strict=True,
+            )
+        )
+        table_rows.append(
             {
                 "type": statistics.structure,
                 "weighting": statistics.weighting,
                 "parameter": Cell(
                     statistics.parameter,
-                    f"{symbol} *{statistics.at_bounds}" if statistics.at_bounds else symbol,
+                    f"{parameter_symbol} *{statistics.at_bounds}"
+                    if statistics.at_bounds
+                    else parameter_symbol,
                 ),
-                **_cells_with_paper_values(cells, paper_values, ".4g", factor),
+                **_cells_with_paper_values(statistic_cells, paper_values, ".4g", display_factor),
                 "at_bounds": statistics.at_bounds,
                 **_paper_entries(paper_values),
                 "mixture": campaign.homogeneity.mixed,
@@ -114,9 +130,9 @@ def table3(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         (
             *FIT_NAME_COLUMNS,
             Column("parameter", "parameter", TEXT_FORMAT),
-            *(Column(name, name) for name in _STATISTICS),
+            *(Column(statistic_name, statistic_name) for statistic_name in _STATISTICS),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (
             f"{welch_method_text(campaign)}; {campaign.settings.band_hz[0]:g} to "
             f"{campaign.settings.band_hz[1]:g} Hz.",
@@ -136,36 +152,41 @@ _PEAK_HEADINGS: Final = {"frequency_rad_s": "ω{} (rad/s)", "magnitude_db": "M{}
 
 
 def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
-    """Return the table of the resonance peaks' mean deviations (Table 4)."""
-    types = list(dict.fromkeys(model.structure for model in campaign.nominal))
-    weightings = list(dict.fromkeys(model.weighting for model in campaign.nominal))
+    """Return the table of mean deviations of the models' resonance peaks from the measured ones.
+
+    It corresponds to the paper's Table 4.
+    """
+    type_names = list(dict.fromkeys(nominal_model.structure for nominal_model in campaign.nominal))
+    weightings = list(dict.fromkeys(nominal_model.weighting for nominal_model in campaign.nominal))
     deviations = {
-        (quantity, deviation.mode, model.weighting, model.structure): getattr(deviation, quantity)
-        for quantity in _PEAK_HEADINGS
-        for model in campaign.nominal
-        for deviation in model.deviations
+        (peak_quantity, deviation.mode, nominal_model.weighting, nominal_model.structure): getattr(
+            deviation, peak_quantity
+        )
+        for peak_quantity in _PEAK_HEADINGS
+        for nominal_model in campaign.nominal
+        for deviation in nominal_model.deviations
     }
-    rows: list[Row] = []
-    for quantity, mode, weighting in sorted(
+    table_rows: list[Row] = []
+    for peak_quantity, mode_number, weighting in sorted(
         {key[:3] for key in deviations}, key=lambda key: (*key[:2], weightings.index(key[2]))
     ):
-        row_key = (quantity, mode, weighting)
-        cells = {
+        row_key = (peak_quantity, mode_number, weighting)
+        deviation_cells = {
             type_name: number_cell(deviations[*row_key, type_name], ".3g")
-            for type_name in types
+            for type_name in type_names
             if (*row_key, type_name) in deviations
         }
         paper_values = {
-            each_type: published_table4().get((each_type, weighting, quantity, mode))
-            for each_type in cells
+            other_type: published_table4().get((other_type, weighting, peak_quantity, mode_number))
+            for other_type in deviation_cells
             if with_paper
         }
-        rows.append(
+        table_rows.append(
             {
-                "quantity": Cell(quantity, _PEAK_HEADINGS[quantity].format(mode)),
-                "mode": mode,
+                "quantity": Cell(peak_quantity, _PEAK_HEADINGS[peak_quantity].format(mode_number)),
+                "mode": mode_number,
                 "weighting": weighting,
-                **_cells_with_paper_values(cells, paper_values, ".3f"),
+                **_cells_with_paper_values(deviation_cells, paper_values, ".3f"),
                 **_paper_entries(paper_values),
                 "mixture": campaign.homogeneity.mixed,
             }
@@ -179,9 +200,9 @@ def table4(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
         (
             Column("peak", "quantity", TEXT_FORMAT),
             Column("weights", "weighting", TEXT_FORMAT),
-            *(Column(f"type {type_name}", type_name) for type_name in types),
+            *(Column(f"type {type_name}", type_name) for type_name in type_names),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (
             "A nominal model has the mean of the sessions' parameters.",
             *([_PARENTHESES_NOTE] if with_paper else []),
@@ -196,7 +217,7 @@ _TABLE_5_FACTORS: Final = {"alpha": 1.0, "zeta": 1e5, "lambda": 1.0, "gamma": 1e
 
 def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     """Return the table of the two best nominal models' parameters and WMSE (Table 5)."""
-    rows: list[Row] = []
+    table_rows: list[Row] = []
     std = {
         (statistics.structure, statistics.weighting, statistics.parameter): statistics.std
         for statistics in campaign.statistics
@@ -204,25 +225,25 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
     for model in best_models(campaign.nominal):
         paper_wmse = published_wmse().get((model.structure, model.weighting))
         paper_values = {"wmse": paper_wmse} if with_paper else {}
-        rows.append(
+        table_rows.append(
             {
                 "type": model.structure,
                 "weighting": model.weighting,
                 **{
-                    name: estimate_cells(
-                        [value],
-                        std.get((model.structure, model.weighting, name)),
-                        _TABLE_5_FACTORS[name],
+                    value_name: estimate_cells(
+                        [model_value],
+                        std.get((model.structure, model.weighting, value_name)),
+                        _TABLE_5_FACTORS[value_name],
                     )[0]
-                    for name, value in model.parameters.items()
+                    for value_name, model_value in model.parameters.items()
                 },
                 **_cells_with_paper_values(
                     {"wmse": number_cell(model.mean_wmse)}, paper_values, ".3f"
                 ),
                 **{
-                    name: value
+                    value_name: model_value
                     for deviation in model.deviations
-                    for name, value in (
+                    for value_name, model_value in (
                         (f"mdr_omega_{deviation.mode}_rad_s", deviation.frequency_rad_s),
                         (f"mdr_magnitude_{deviation.mode}_db", deviation.magnitude_db),
                     )
@@ -242,7 +263,7 @@ def table5(campaign: CampaignResult, *, with_paper: bool = False) -> Table:
             Column("λ", "lambda"), Column("γ (10⁻² s^λ/m⁴)", "gamma"),
             Column("WMSE ((N·m/rad)²)", "wmse"),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (_PARENTHESES_NOTE,) if with_paper else (),
     )  # fmt: skip
 
@@ -255,31 +276,34 @@ _INDEX_HEADINGS: Final = {
 
 def indices_table(campaign: CampaignResult) -> Table:
     """Return the table of the nominal models' distances from the sessions, as in Figure 7."""
-    rows: list[Row] = []
+    table_rows: list[Row] = []
     for model in campaign.nominal:
         row: dict[str, Entry] = {"type": model.structure, "weighting": model.weighting}
-        for index in _INDEX_HEADINGS:
-            values = np.array(
-                [getattr(session_indices, index) for session_indices in model.indices]
+        for index_name in _INDEX_HEADINGS:
+            index_values = np.array(
+                [getattr(session_indices, index_name) for session_indices in model.indices]
             )
-            std = float(values.std(ddof=1)) if values.size > 1 else None
-            row[index], row[f"{index}_std"] = estimate_cells((float(values.mean()), std), std)
-            row[f"{index}_median"] = float(np.median(values))
-        rows.append({**row, "mixture": campaign.homogeneity.mixed})
+            std = float(index_values.std(ddof=1)) if index_values.size > 1 else None
+            row[index_name], row[f"{index_name}_std"] = estimate_cells(
+                (float(index_values.mean()), std), std
+            )
+            row[f"{index_name}_median"] = float(np.median(index_values))
+        table_rows.append({**row, "mixture": campaign.homogeneity.mixed})
     return Table(
         "nominal_indices",
         title("Distance of the nominal models from the sessions", campaign.homogeneity),
         (
             *FIT_NAME_COLUMNS,
             *(
-                column
-                for index, heading in _INDEX_HEADINGS.items()
-                for column in (
-                    Column(heading, index), Column("std", f"{index}_std", std_of_previous=True)
+                value_column
+                for index_name, index_heading in _INDEX_HEADINGS.items()
+                for value_column in (
+                    Column(index_heading, index_name),
+                    Column("std", f"{index_name}_std", std_of_previous=True)
                 )
             ),
         ),
-        tuple(rows),
+        tuple(table_rows),
         ("Eqs. 28 to 30, mean and standard deviation over the sessions, as in Figure 7.",),
         grouped=True,
     )  # fmt: skip
@@ -288,30 +312,37 @@ def indices_table(campaign: CampaignResult) -> Table:
 def bias_table(campaign: CampaignResult) -> Table:
     """Return the table of the Welch fits' bias relative to pooled whole-record estimates."""
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
-    rows: list[Row] = []
+    table_rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
         not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)
         for parameter in fit_bias.parameters:
-            symbol, factor = _TABLE_3_HEADINGS[parameter.parameter]
-            welch = estimate_cells(
-                (parameter.welch, parameter.welch_std), parameter.welch_std, factor
+            parameter_symbol, display_factor = _TABLE_3_HEADINGS[parameter.parameter]
+            welch_cell = estimate_cells(
+                (parameter.welch, parameter.welch_std), parameter.welch_std, display_factor
             )
-            record = estimate_cells(
-                (parameter.record, parameter.record_std), parameter.record_std, factor
+            record_cell = estimate_cells(
+                (parameter.record, parameter.record_std), parameter.record_std, display_factor
             )
-            cells: dict[str, Entry] = dict(
-                zip(("welch", "welch_std", "record", "record_std"), (*welch, *record), strict=True)
+            bias_cells: dict[str, Entry] = dict(
+                zip(
+                    ("welch", "welch_std", "record", "record_std"),
+                    (*welch_cell, *record_cell),
+                    strict=True,
+                )
             )
-            rows.append(
+            table_rows.append(
                 {
                     "type": fit_bias.structure,
                     "weighting": fit_bias.weighting,
                     "parameter": Cell(
                         parameter.parameter,
-                        symbol + NOT_REPORTED_MARK * (parameter.parameter in not_reported),
+                        parameter_symbol
+                        + NOT_REPORTED_MARK * (parameter.parameter in not_reported),
                     ),
-                    **cells,
-                    "bias": estimate_cells((parameter.bias,), parameter.bias_std, factor)[0],
+                    **bias_cells,
+                    "bias": estimate_cells((parameter.bias,), parameter.bias_std, display_factor)[
+                        0
+                    ],
                     "bias_std": parameter.bias_std,
                     "significant": parameter.significant,
                     "reported": parameter.parameter not in not_reported,
@@ -329,7 +360,7 @@ def bias_table(campaign: CampaignResult) -> Table:
             Column("whole records", "record"), Column("std", "record_std", std_of_previous=True),
             Column("difference", "bias"), Column("significant", "significant", TEXT_FORMAT),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (
             "Types whose whole-record residual is noise. Significant: other than zero at the 0.1 % "
             "level. A bias is the same in every session: it does not show in the std of Table 3.",
@@ -340,26 +371,27 @@ def bias_table(campaign: CampaignResult) -> Table:
 
 
 def _cells_with_paper_values(
-    cells: Mapping[str, Cell],
+    own_cells: Mapping[str, Cell],
     paper_values: Mapping[str, float | None],
     number_format: str,
-    factor: float = 1.0,
+    display_factor: float = 1.0,
 ) -> dict[str, Entry]:
     """Return cells with the paper's numbers added in parentheses, where the paper states one."""
     paper_cells = {
-        name: number_cell(value, number_format, factor) for name, value in paper_values.items()
+        cell_key: number_cell(paper_value, number_format, display_factor)
+        for cell_key, paper_value in paper_values.items()
     }
     return {
-        name: replace(cell, text=f"{cell.text} ({paper_cells[name].text})")
-        if paper_values.get(name) is not None
-        else cell
-        for name, cell in cells.items()
+        cell_key: replace(own_cell, text=f"{own_cell.text} ({paper_cells[cell_key].text})")
+        if paper_values.get(cell_key) is not None
+        else own_cell
+        for cell_key, own_cell in own_cells.items()
     }
 
 
 def _paper_entries(paper_values: Mapping[str, float | None]) -> dict[str, Entry]:
     """Return the paper's numbers as table entries for files; their keys begin with ``paper_``."""
-    return {f"paper_{name}": value for name, value in paper_values.items()}
+    return {f"paper_{value_name}": paper_value for value_name, paper_value in paper_values.items()}
 
 
 # The paper's own numbers: "Fractional-Order Models of Damping Phenomena in a Flexible Sensing
@@ -382,7 +414,10 @@ def published_table3() -> Mapping[tuple[str, str, str], PaperStatistics]:
     """Return the paper's Table 3, by type, weighting and parameter."""
     return {
         (row["type"], row["weighting"], row["parameter"]): PaperStatistics(
-            **{name: float(row[name]) for name in ("mean", "median", "std", "min", "max")}
+            **{
+                statistic_name: float(row[statistic_name])
+                for statistic_name in ("mean", "median", "std", "min", "max")
+            }
         )
         for row in _read_data_rows("paper_table3.csv")
     }
@@ -394,12 +429,12 @@ def published_table4() -> Mapping[tuple[str, str, str, int], float]:
 
     The names of the quantities are those of `MeanPeakDeviation`.
     """
-    names = ("quantity", "mode", "weighting")
+    key_names = ("quantity", "mode", "weighting")
     return {
-        (structure, row["weighting"], row["quantity"], int(row["mode"])): float(value)
+        (type_name, row["weighting"], row["quantity"], int(row["mode"])): float(deviation_value)
         for row in _read_data_rows("paper_table4.csv")
-        for structure, value in row.items()
-        if structure not in names
+        for type_name, deviation_value in row.items()
+        if type_name not in key_names
     }
 
 
@@ -415,7 +450,7 @@ def published_wmse() -> Mapping[tuple[str, str], float]:
     }
 
 
-def _read_data_rows(name: str) -> list[dict[str, str]]:
+def _read_data_rows(file_name: str) -> list[dict[str, str]]:
     """Return the rows of a data file of this package, by column name."""
-    text = files("analysis.report").joinpath("data", name).read_text(encoding="utf-8")
-    return list(csv.DictReader(text.splitlines()))
+    file_text = files("analysis.report").joinpath("data", file_name).read_text(encoding="utf-8")
+    return list(csv.DictReader(file_text.splitlines()))

@@ -56,11 +56,11 @@ class _PooledFit:
 
     @classmethod
     def of_campaign(cls, campaign: CampaignResult) -> _PooledFit | None:
-        """Return the estimate to which a campaign's parameters belong; None if there is none."""
-        modal_result, pooled = campaign.modal, campaign.headline
+        """Return the pooled estimate whose parameters a campaign reports; None without one."""
+        modal_result, pooled_estimate = campaign.modal, campaign.headline
         tolerant_estimate = modal_result.tolerant if modal_result else None
         if tolerant_estimate is None:
-            return None if pooled is None else cls.of(pooled)
+            return None if pooled_estimate is None else cls.of(pooled_estimate)
         if tolerant_estimate.basis == "none":
             return None
         return cls(
@@ -73,7 +73,11 @@ class _PooledFit:
 
     @classmethod
     def of(cls, pooled_estimate: PooledEstimate) -> _PooledFit:
-        """Return a pooled estimate with its covariance enlarged for a small number of sessions."""
+        """Return a pooled estimate with an enlarged covariance.
+
+        With it, intervals of 1.96 standard deviations are as wide as those of Student's t for the
+        number of sessions.
+        """
         # Bands are 1.96 standard deviations wide, but Student's t of a few sessions is larger.
         interval_ratio = student_t_quantile(0.95, pooled_estimate.sessions - 1) / NORMAL_95
         return cls(
@@ -102,7 +106,7 @@ def damping_figure(campaign: CampaignResult) -> Figure:
 
     pooled_estimate = campaign.headline
     assert pooled_estimate is not None
-    modes, sessions = campaign.modes, _session_count_of_modes(campaign, pooled_estimate)
+    pooled_modes, session_count = campaign.modes, _session_count_of_modes(campaign, pooled_estimate)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
         width_in, height_in,
@@ -114,35 +118,42 @@ def damping_figure(campaign: CampaignResult) -> Figure:
         "between the modes  ·  below: each mode, frequency from the pooled mean",
     )  # fmt: skip
     grid = figure.add_gridspec(
-        2, len(modes), left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
+        2, len(pooled_modes), left=0.075, right=0.985, top=1 - 0.95 / height_in,
+        bottom=0.5 / height_in,
         height_ratios=(1.25, 1.0), hspace=0.32, wspace=0.28,
     )  # fmt: skip
-    axes = figure.add_subplot(grid[0, :])
-    _draw_loss_factor(axes, modes, _PooledFit.of_campaign(campaign))
-    for column, mode in enumerate(modes):
-        session_modes = _session_estimates_of_mode(campaign, pooled_estimate, mode)
-        axes.plot(
+    upper_axes = figure.add_subplot(grid[0, :])
+    _draw_loss_factor(upper_axes, pooled_modes, _PooledFit.of_campaign(campaign))
+    for panel_number, pooled_mode in enumerate(pooled_modes):
+        session_modes = _session_estimates_of_mode(campaign, pooled_estimate, pooled_mode)
+        upper_axes.plot(
             [session_mode.frequency_hz for session_mode in session_modes],
             [100 * session_mode.damping_ratio for session_mode in session_modes], "o",
             color=style.INK, markersize=3.0,
         )  # fmt: skip
-        _draw_pooled_mode(axes, mode, sessions)
-        _draw_enlarged_mode(figure.add_subplot(grid[1, column]), mode, session_modes, sessions)
+        _draw_pooled_mode(upper_axes, pooled_mode, session_count)
+        _draw_enlarged_mode(
+            figure.add_subplot(grid[1, panel_number]), pooled_mode, session_modes, session_count
+        )
     figure.axes[1].set_ylabel("Damping ratio (%)")
     style.frequency_axis(
-        axes, (modes[0].frequency_hz / _AXIS_END_RATIO, modes[-1].frequency_hz * _AXIS_END_RATIO)
+        upper_axes,
+        (
+            pooled_modes[0].frequency_hz / _AXIS_END_RATIO,
+            pooled_modes[-1].frequency_hz * _AXIS_END_RATIO,
+        ),
     )
-    axes.set_ylim(bottom=0.0)
-    axes.margins(y=0.1)
-    axes.set_ylabel("Damping ratio (%)")
-    axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    upper_axes.set_ylim(bottom=0.0)
+    upper_axes.margins(y=0.1)
+    upper_axes.set_ylabel("Damping ratio (%)")
+    upper_axes.set_xlabel("Frequency (Hz)", labelpad=1)
     legend_entries = [
         Line2D([], [], color=style.INK, marker="o", markersize=3, linewidth=0.9,
                label="session, ± 1.96 of its standard deviation"),
         Line2D([], [], color=style.BLUE, marker="D", markersize=4, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % interval"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=3)
+    style.legend(figure, legend_entries, column_count=3)
     return figure
 
 
@@ -165,7 +176,7 @@ def _session_count_of_modes(campaign: CampaignResult, pooled_estimate: PooledEst
 def _session_estimates_of_mode(
     campaign: CampaignResult, pooled_estimate: PooledEstimate, mode: PooledMode
 ) -> list[ModeEstimate]:
-    """Return the estimates of one mode from every session, by the pooled mode's model."""
+    """Return each session's estimate of one mode, from the same model as the pooled mode."""
     if mode.source == "modal":
         modal_fits = (session.modal for session in campaign.sessions)
         return [
@@ -182,20 +193,26 @@ def _session_estimates_of_mode(
     ]
 
 
-def _draw_loss_factor(axes: Axes, modes: Sequence[PooledMode], fit: _PooledFit | None) -> None:
+def _draw_loss_factor(
+    axes: Axes, pooled_modes: Sequence[PooledMode], fit: _PooledFit | None
+) -> None:
     """Draw half the pooled loss factor, which is the damping ratio, between first and last mode."""
-    if len(modes) < 2 or fit is None:
+    if len(pooled_modes) < 2 or fit is None:
         return
-    frequency_hz = np.geomspace(modes[0].frequency_hz, modes[-1].frequency_hz, _LOSS_FACTOR_POINTS)
+    frequency_hz = np.geomspace(
+        pooled_modes[0].frequency_hz, pooled_modes[-1].frequency_hz, _LOSS_FACTOR_POINTS
+    )
     total_loss_factor = loss_factors(fit, frequency_hz).total
-    low, high = total_loss_factor.limits()
-    axes.fill_between(frequency_hz, 50 * low, 50 * high, color=INTERVAL_COLOR, linewidth=0)
+    lower_limit, upper_limit = total_loss_factor.limits()
+    axes.fill_between(
+        frequency_hz, 50 * lower_limit, 50 * upper_limit, color=INTERVAL_COLOR, linewidth=0
+    )
     axes.plot(frequency_hz, 50 * total_loss_factor.value, color=style.BLUE)
 
 
-def _draw_pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
+def _draw_pooled_mode(axes: Axes, mode: PooledMode, session_count: int) -> None:
     """Draw a pooled mode with the 95 % interval of its damping ratio."""
-    half_width_percent = 100 * student_t_quantile(0.95, sessions - 1) * mode.damping_ratio_std
+    half_width_percent = 100 * student_t_quantile(0.95, session_count - 1) * mode.damping_ratio_std
     axes.errorbar(
         [mode.frequency_hz], [100 * mode.damping_ratio], yerr=[half_width_percent], fmt="D",
         color=style.BLUE, markersize=4.0, capsize=3.0, elinewidth=1.0, zorder=4,
@@ -203,12 +220,12 @@ def _draw_pooled_mode(axes: Axes, mode: PooledMode, sessions: int) -> None:
 
 
 def _draw_enlarged_mode(
-    axes: Axes, mode: PooledMode, session_modes: Sequence[ModeEstimate], sessions: int
+    axes: Axes, mode: PooledMode, session_modes: Sequence[ModeEstimate], session_count: int
 ) -> None:
     """Draw one mode of every session with its intervals, over the pooled 95 % intervals."""
     from matplotlib.patches import Rectangle
 
-    t = student_t_quantile(0.95, sessions - 1)
+    t = student_t_quantile(0.95, session_count - 1)
     half_width_mhz, half_width_percent = (
         1e3 * t * mode.frequency_std_hz,
         100 * t * mode.damping_ratio_std,
@@ -249,9 +266,11 @@ def response_figure(campaign: CampaignResult) -> Figure:
 
     pooled_estimate = campaign.headline
     assert pooled_estimate is not None
-    peaks_hz = [mode.frequency_hz for mode in campaign.modes]
+    peaks_hz = [pooled_mode.frequency_hz for pooled_mode in campaign.modes]
     first_hz, last_hz = _response_band_hz(campaign, peaks_hz)
-    band = response_band(_PooledFit.of(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz))
+    pooled_band = response_band(
+        _PooledFit.of(pooled_estimate), dense_grid(first_hz, last_hz, peaks_hz)
+    )
     is_measured = bool(campaign.sessions[0].frequency_hz.size)
     width_in, height_in = 11.0, 6.6
     figure = style.new_figure(
@@ -273,22 +292,33 @@ def response_figure(campaign: CampaignResult) -> Figure:
         3, 1, left=0.075, right=0.985, top=1 - 0.95 / height_in, bottom=0.5 / height_in,
         height_ratios=(2.4, 1.0, 0.8), hspace=0.1,
     )  # fmt: skip
-    magnitude, phase, width = (figure.add_subplot(grid[row]) for row in range(3))
-    lowest_db = _draw_sessions(campaign, pooled_estimate, magnitude, phase, band.frequency_hz)
-    low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
-    modelled_db = magnitude_db(band.response)
-    magnitude.fill_between(band.frequency_hz, low, high, color=INTERVAL_COLOR, linewidth=0)
-    magnitude.plot(band.frequency_hz, modelled_db, color=style.BLUE)
-    magnitude.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
+    magnitude_axes, phase_axes, width_axes = (figure.add_subplot(grid[row]) for row in range(3))
+    lowest_db = _draw_sessions(
+        campaign, pooled_estimate, magnitude_axes, phase_axes, pooled_band.frequency_hz
+    )
+    lower_db, upper_db = (
+        magnitude_db(magnitude_limit.astype(complex))
+        for magnitude_limit in pooled_band.magnitude_limits()
+    )
+    modelled_db = magnitude_db(pooled_band.response)
+    magnitude_axes.fill_between(
+        pooled_band.frequency_hz, lower_db, upper_db, color=INTERVAL_COLOR, linewidth=0
+    )
+    magnitude_axes.plot(pooled_band.frequency_hz, modelled_db, color=style.BLUE)
+    magnitude_axes.set_ylim(min(lowest_db, float(np.quantile(modelled_db, 0.02))) - 5,
                        float(modelled_db.max()) + 5)  # fmt: skip
-    phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
-    style.response_axes(magnitude, phase)
-    width.plot(band.frequency_hz, 100 * NORMAL_95 * band.log_magnitude_std, color=style.BLUE)
-    width.set_ylim(bottom=0.0)
-    width.set_ylabel("Band (± %)")
-    width.set_xlabel("Frequency (Hz)", labelpad=1)
-    for axes in (magnitude, phase, width):
-        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width)
+    phase_axes.plot(pooled_band.frequency_hz, phase_deg(pooled_band.response), color=style.BLUE)
+    style.response_axes(magnitude_axes, phase_axes)
+    width_axes.plot(
+        pooled_band.frequency_hz, 100 * NORMAL_95 * pooled_band.log_magnitude_std, color=style.BLUE
+    )
+    width_axes.set_ylim(bottom=0.0)
+    width_axes.set_ylabel("Band (± %)")
+    width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
+    for response_panel in (magnitude_axes, phase_axes, width_axes):
+        style.frequency_axis(
+            response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
+        )
     figure.align_ylabels()
     legend_entries = [
         Line2D([], [], color=SESSION_COLOR, linewidth=1.5,
@@ -296,7 +326,7 @@ def response_figure(campaign: CampaignResult) -> Figure:
         Line2D([], [], color=style.BLUE, label="pooled"),
         Patch(facecolor=INTERVAL_COLOR, label="its 95 % band"),
     ]  # fmt: skip
-    style.legend(figure, legend_entries, columns=3)
+    style.legend(figure, legend_entries, column_count=3)
     return figure
 
 
@@ -306,15 +336,15 @@ def _response_band_hz(campaign: CampaignResult, peaks_hz: Sequence[float]) -> tu
     It is the band of the fits, but not below a quarter of the first mode's frequency.
     """
     first_hz, last_hz = campaign.record_band_hz
-    lowest_hz = min([last_hz / 4, *(peak / 4 for peak in peaks_hz)])
+    lowest_hz = min([last_hz / 4, *(peak_hz / 4 for peak_hz in peaks_hz)])
     return max(first_hz, lowest_hz), last_hz
 
 
 def _draw_sessions(
     campaign: CampaignResult,
     pooled_estimate: PooledEstimate,
-    magnitude: Axes,
-    phase: Axes,
+    magnitude_axes: Axes,
+    phase_axes: Axes,
     grid_hz: NDArray[np.float64],
 ) -> float:
     """Draw the response of each session; return the lower limit of their magnitudes in dB."""
@@ -324,15 +354,19 @@ def _draw_sessions(
     for session in shown_sessions(campaign):
         frequency_hz, response = session.frequency_hz, session.response
         if not frequency_hz.size:
-            estimates = [
+            session_estimates = [
                 estimate
                 for estimate in session.record_estimates
                 if estimate.name == pooled_estimate.name
             ]
-            if not estimates:
+            if not session_estimates:
                 continue
             frequency_hz = grid_hz
-            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(estimates[0].plant, ())[0]
+            response = ResponseGrid(2j * np.pi * grid_hz).evaluate(session_estimates[0].plant, ())[
+                0
+            ]
         lowest_db = min(lowest_db, float(np.quantile(magnitude_db(response), 0.005)))
-        draw_session(magnitude, phase, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS)
+        draw_session(
+            magnitude_axes, phase_axes, frequency_hz, response, _RESPONSE_COLUMNS, _RESPONSE_COLUMNS
+        )
     return lowest_db

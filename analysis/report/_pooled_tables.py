@@ -98,7 +98,10 @@ def structures_table(campaign: CampaignResult) -> Table:
 
 
 def likely_estimates(campaign: CampaignResult) -> list[PooledEstimate]:
-    """Return the reported pooled estimate, and the one with the lowest BIC if it differs."""
+    """Return the reported pooled estimate, and that of the structure with the lowest BIC.
+
+    BIC is the Bayesian information criterion. There is one estimate if both are the same.
+    """
     estimates_by_name = {
         estimate.name: estimate
         for estimate in (campaign.headline, *campaign.pooled[:1])
@@ -117,7 +120,10 @@ def session_count_text(estimate: PooledEstimate, campaign: CampaignResult) -> st
 
 
 def exact_condition_text(campaign: CampaignResult) -> str:
-    """Return the condition under which a pooled estimate holds; empty without a condition."""
+    """Return the words for the condition that the beam is exactly uniform.
+
+    They are empty if the pooled estimate does not depend on it.
+    """
     return f", {EXACTLY_UNIFORM_CONDITION}" if campaign.modal and campaign.modal.leads else ""
 
 
@@ -134,7 +140,7 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     """
     unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
     homogeneity, headline = campaign.homogeneity, campaign.headline
-    columns = (
+    table_columns = (
         Column("parameter", "parameter", TEXT_FORMAT),
         Column("pooled", "value"), Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
@@ -143,12 +149,12 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
     )  # fmt: skip
     if only_estimate is None:
         ordered_estimates = sorted(campaign.pooled, key=lambda item: item is not headline)
-        rows = [
+        table_rows = [
             _pooled_row(estimate, parameter, campaign, unsupported_orders)
             for estimate in ordered_estimates
             for parameter in estimate.parameters
         ]
-        rows += [
+        table_rows += [
             {
                 "type": structure.structure,
                 "name": structure.name,
@@ -162,33 +168,33 @@ def pooled_table(campaign: CampaignResult, only_estimate: PooledEstimate | None 
             if not structure.pooled
             for parameter in STRUCTURES[structure.structure].free
         ]
-        return Table("pooled", "Pooled whole-record estimates", columns, tuple(rows))
-    role = "freest structure"
+        return Table("pooled", "Pooled whole-record estimates", table_columns, tuple(table_rows))
+    estimate_role = "freest structure"
     if only_estimate is not headline:
-        role = "lowest BIC; valid only if it is the true one"
-    role += exact_condition_text(campaign)
-    notes = [
+        estimate_role = "lowest BIC; valid only if it is the true one"
+    estimate_role += exact_condition_text(campaign)
+    table_notes = [
         "One session's std: standard deviation that a typical session states. Between sessions: "
         "standard deviation between sessions beyond that (τ). p: p-value of Cochran's Q. "
         f"Residual {only_estimate.misfit:.4g} times the noise."
     ]
     if unreported_parameters(STRUCTURES[only_estimate.structure], unsupported_orders):
-        notes += footnotes(unsupported_orders)
+        table_notes += footnotes(unsupported_orders)
     if any(homogeneity.is_mixed(parameter.name) for parameter in only_estimate.parameters):
-        notes.append(MIXTURE_NOTE)
+        table_notes.append(MIXTURE_NOTE)
     return Table(
         f"pooled_{only_estimate.name.replace(', ', '_').replace(' ', '_')}",
         title(
             f"Pooled over {session_count_text(only_estimate, campaign)}: "
-            f"type {only_estimate.name} ({role})",
+            f"type {only_estimate.name} ({estimate_role})",
             homogeneity,
         ),
-        columns,
+        table_columns,
         tuple(
             _pooled_row(only_estimate, parameter, campaign, unsupported_orders)
             for parameter in only_estimate.parameters
         ),
-        tuple(notes),
+        tuple(table_notes),
     )
 
 
@@ -200,21 +206,21 @@ def _pooled_row(
 ) -> Row:
     """Return the row of a parameter in the table of pooled estimates."""
     homogeneity = campaign.homogeneity
-    _, factor, _ = label(parameter.name)
-    value, std, low, high = estimate_cells(
-        (parameter.value, parameter.std, *parameter.interval), parameter.std, factor
+    _, display_factor, _ = label(parameter.name)
+    value_cell, std_cell, low_cell, high_cell = estimate_cells(
+        (parameter.value, parameter.std, *parameter.interval), parameter.std, display_factor
     )
     is_reported = parameter.name not in unreported_parameters(
         STRUCTURES[pooled_estimate.structure], unsupported_orders
     )
     if not is_reported:
-        value = mark_cell(value)
+        value_cell = mark_cell(value_cell)
     else:
         # Only usable values are bold, so that they catch the eye.
-        value = (
-            grey_cell(value)
+        value_cell = (
+            grey_cell(value_cell)
             if homogeneity.is_mixed(parameter.name)
-            else replace(value, strong=True)
+            else replace(value_cell, strong=True)
         )
     return {
         "type": pooled_estimate.structure,
@@ -226,12 +232,12 @@ def _pooled_row(
         "parameter": Cell(
             parameter.name, with_mark(symbol_with_unit(parameter.name), parameter.name, homogeneity)
         ),
-        "value": value,
-        "std": std,
-        "low_95": low,
-        "high_95": high,
-        "within_std": number_cell(parameter.within_std, ".2g", factor),
-        "between_std": number_cell(parameter.between_std, ".2g", factor),
+        "value": value_cell,
+        "std": std_cell,
+        "low_95": low_cell,
+        "high_95": high_cell,
+        "within_std": number_cell(parameter.within_std, ".2g", display_factor),
+        "between_std": number_cell(parameter.between_std, ".2g", display_factor),
         "p_value": chance_cell(parameter.chance),
         "next_low_95": parameter.next_interval[0],
         "next_high_95": parameter.next_interval[1],
@@ -241,51 +247,58 @@ def _pooled_row(
 
 
 def tolerance_table(campaign: CampaignResult) -> Table:
-    """Return the table of parameters with a tolerance of the geometry.
+    """Return the table of a campaign's parameters if the beam is uniform within a tolerance.
 
-    It also contains the parameters of an exactly uniform beam. It has no rows if no tolerance is
-    stated.
+    It also contains the parameters that an exactly uniform beam would have. It has no rows if no
+    tolerance of the beam's geometry is stated.
     """
-    modal_result, numbers = campaign.modal, campaign_numbers(campaign)
+    modal_result, reported_numbers = campaign.modal, campaign_numbers(campaign)
     tolerant_estimate = modal_result.tolerant if modal_result else None
-    columns = (
+    table_columns = (
         Column("parameter", "parameter", TEXT_FORMAT), Column("value", "value"),
         Column("std", "std", std_of_previous=True),
         Column("95 % from", "low_95"), Column("to", "high_95"),
         Column(EXACTLY_UNIFORM_CONDITION, "exact"),
         Column("std", "exact_std", std_of_previous=True),
     )  # fmt: skip
-    if modal_result is None or tolerant_estimate is None or numbers is None:
-        return Table("parameters", "", columns, ())
-    exact_parameters = numbers.exact.parameters if numbers.exact else {}
-    rows: list[Row] = []
-    for name, quantity in numbers.parameters.items():
-        _, factor, _ = label(name)
-        low, high = quantity.interval_95 or (None, None)
-        value, *others = estimate_cells(
-            (quantity.value, quantity.std, low, high), quantity.std or None, factor
+    if modal_result is None or tolerant_estimate is None or reported_numbers is None:
+        return Table("parameters", "", table_columns, ())
+    exact_parameters = reported_numbers.exact.parameters if reported_numbers.exact else {}
+    table_rows: list[Row] = []
+    for parameter_name, reported_value in reported_numbers.parameters.items():
+        _, display_factor, _ = label(parameter_name)
+        lower_limit, upper_limit = reported_value.interval_95 or (None, None)
+        value_cell, *further_cells = estimate_cells(
+            (reported_value.value, reported_value.std, lower_limit, upper_limit),
+            reported_value.std or None,
+            display_factor,
         )
-        exact_value = exact_parameters.get(name)
+        exact_value = exact_parameters.get(parameter_name)
         exact_cells = (
-            estimate_cells((exact_value.value, exact_value.std), exact_value.std, factor)
+            estimate_cells((exact_value.value, exact_value.std), exact_value.std, display_factor)
             if exact_value
             else (None, None)
         )
-        rows.append(
+        table_rows.append(
             {
                 "parameter": Cell(
-                    name, with_mark(symbol_with_unit(name), name, campaign.homogeneity)
+                    parameter_name,
+                    with_mark(
+                        symbol_with_unit(parameter_name), parameter_name, campaign.homogeneity
+                    ),
                 ),
-                "value": mark_cell(value) if quantity.flag else replace(value, strong=True),
-                **dict(zip(("std", "low_95", "high_95"), others, strict=True)),
+                "value": mark_cell(value_cell)
+                if reported_value.flag
+                else replace(value_cell, strong=True),
+                **dict(zip(("std", "low_95", "high_95"), further_cells, strict=True)),
                 **dict(zip(("exact", "exact_std"), exact_cells, strict=True)),
                 "uniformity_percent": 100 * tolerant_estimate.uniformity,
                 "basis": tolerant_estimate.basis,
-                "flag": quantity.flag,
+                "flag": reported_value.flag,
             }
         )
-    flags = dict.fromkeys(
-        parameter.flag for parameter in numbers.parameters.values() if parameter.flag
+    flag_texts = dict.fromkeys(
+        parameter.flag for parameter in reported_numbers.parameters.values() if parameter.flag
     )
     return Table(
         "parameters",
@@ -298,12 +311,12 @@ def tolerance_table(campaign: CampaignResult) -> Table:
             ),
             campaign.homogeneity,
         ),
-        columns,
-        tuple(rows),
+        table_columns,
+        tuple(table_rows),
         (
             "The tolerance of the geometry is common to all sessions: more of them do not reduce "
             "it.",
-            *(f"{NOT_REPORTED_MARK} {flag}." for flag in flags),
+            *(f"{NOT_REPORTED_MARK} {flag_text}." for flag_text in flag_texts),
         ),
     )
 
@@ -311,19 +324,19 @@ def tolerance_table(campaign: CampaignResult) -> Table:
 def uniform_beam_table(campaign: CampaignResult) -> Table:
     """Return the table of pooled modal constants and those of the best uniform beam."""
     modal_result, homogeneity = campaign.modal, campaign.homogeneity
-    test = modal_result.uniform_beam if modal_result else None
-    rows: list[Row] = []
-    for constant in test.as_json()["constants"] if test else ():
+    uniformity_test = modal_result.uniform_beam if modal_result else None
+    table_rows: list[Row] = []
+    for modal_constant in uniformity_test.as_json()["constants"] if uniformity_test else ():
         measured_value, std, predicted_value = (
-            constant[key] for key in ("measured", "std", "predicted")
+            modal_constant[key] for key in ("measured", "std", "predicted")
         )
         measured_cell, std_cell, predicted_cell = estimate_cells(
             (measured_value, std, predicted_value), std
         )
-        rows.append(
+        table_rows.append(
             {
-                "mode": constant["mode"],
-                "constant": Cell(constant["name"], constant["name"].replace("_", " ")),
+                "mode": modal_constant["mode"],
+                "constant": Cell(modal_constant["name"], modal_constant["name"].replace("_", " ")),
                 "measured": measured_cell,
                 "std": std_cell,
                 "predicted": predicted_cell,
@@ -338,39 +351,49 @@ def uniform_beam_table(campaign: CampaignResult) -> Table:
             Column("measured", "measured"), Column("std", "std", std_of_previous=True),
             Column("uniform beam", "predicted"), Column("difference (std)", "deviation", ".1f"),
         ),
-        tuple(rows),
+        tuple(table_rows),
     )  # fmt: skip
 
 
 def modes_table(campaign: CampaignResult) -> Table:
     """Return the table of pooled modes: means and standard deviations between sessions."""
     homogeneity = campaign.homogeneity
-    rows: list[Row] = []
-    for mode in campaign.modes:
-        cells: dict[str, Entry] = {"mode": mode.number}
-        for name, std, between_std_name, factor in (
+    table_rows: list[Row] = []
+    for pooled_mode in campaign.modes:
+        mode_cells: dict[str, Entry] = {"mode": pooled_mode.number}
+        for quantity_key, std, between_std_name, display_factor in (
             ("frequency_hz", "frequency_std_hz", "frequency_between_std_hz", 1.0),
             ("damping_ratio", "damping_ratio_std", "damping_ratio_between_std", 100.0),
         ):
-            std_value = getattr(mode, std)
-            mean, cells[std] = estimate_cells((getattr(mode, name), std_value), std_value, factor)
-            text = with_mark(mean.text, f"{name}_{mode.number}", homogeneity)
-            cells[name] = replace(mean, text=text)
-            cells[between_std_name] = number_cell(getattr(mode, between_std_name), ".2g", factor)
-        std_value = mode.participation_std_kg_m2
+            std_value = getattr(pooled_mode, std)
+            mean_value, mode_cells[std] = estimate_cells(
+                (getattr(pooled_mode, quantity_key), std_value), std_value, display_factor
+            )
+            value_text = with_mark(
+                mean_value.text, f"{quantity_key}_{pooled_mode.number}", homogeneity
+            )
+            mode_cells[quantity_key] = replace(mean_value, text=value_text)
+            mode_cells[between_std_name] = number_cell(
+                getattr(pooled_mode, between_std_name), ".2g", display_factor
+            )
+        std_value = pooled_mode.participation_std_kg_m2
         inertia_cell, std_cell = estimate_cells(
-            (mode.participation_kg_m2, std_value), std_value, 1e6
+            (pooled_mode.participation_kg_m2, std_value), std_value, 1e6
         )
-        cells |= {"participation_kg_m2": inertia_cell, "participation_std_kg_m2": std_cell}
-        rows.append(
+        mode_cells |= {"participation_kg_m2": inertia_cell, "participation_std_kg_m2": std_cell}
+        table_rows.append(
             {
-                **cells,
-                "source": mode.source,
-                "frequency_mixture": homogeneity.is_mixed(f"frequency_hz_{mode.number}"),
-                "damping_ratio_mixture": homogeneity.is_mixed(f"damping_ratio_{mode.number}"),
+                **mode_cells,
+                "source": pooled_mode.source,
+                "frequency_mixture": homogeneity.is_mixed(f"frequency_hz_{pooled_mode.number}"),
+                "damping_ratio_mixture": homogeneity.is_mixed(
+                    f"damping_ratio_{pooled_mode.number}"
+                ),
             }
         )
-    has_mixture = any(row["frequency_mixture"] or row["damping_ratio_mixture"] for row in rows)
+    has_mixture = any(
+        row["frequency_mixture"] or row["damping_ratio_mixture"] for row in table_rows
+    )
     return Table(
         "pooled_modes",
         title("Modes with locked hub (clamped–free), mean of the sessions", homogeneity),
@@ -382,9 +405,9 @@ def modes_table(campaign: CampaignResult) -> Table:
             Column("damping ratio (%)", "damping_ratio"),
             Column("std", "damping_ratio_std", std_of_previous=True),
             Column("between sessions", "damping_ratio_between_std"),
-            *(_INERTIA_COLUMNS if any(row["source"] == "modal" for row in rows) else ()),
+            *(_INERTIA_COLUMNS if any(row["source"] == "modal" for row in table_rows) else ()),
         ),
-        tuple(rows),
+        tuple(table_rows),
         (MIXTURE_NOTE,) if has_mixture else (),
     )
 
@@ -394,45 +417,46 @@ def modes_table(campaign: CampaignResult) -> Table:
 
 def specimens_table(campaign: CampaignResult) -> Table:
     """Return the table of specimens as the files state them, the campaign's first."""
-    specimens = campaign.homogeneity.specimens
+    stated_specimens = campaign.homogeneity.specimens
     return Table(
         "specimens",
         "Specimens, as the files state them",
         (
             Column("this report's", "here", TEXT_FORMAT),
-            *(Column(key, key, TEXT_FORMAT) for key in differing_fact_keys(specimens)),
+            *(Column(key, key, TEXT_FORMAT) for key in differing_fact_keys(stated_specimens)),
             Column("files", "files"),
             Column("their names", "names", TEXT_FORMAT),
         ),
         tuple(
             {
                 **{
-                    key: Cell(value, fact_text(key, value)) for key, value in specimen.facts.items()
+                    key: Cell(stated_value, fact_text(key, stated_value))
+                    for key, stated_value in specimen.facts.items()
                 },
                 "files": len(specimen.files),
-                "here": specimen is specimens[0],
+                "here": specimen is stated_specimens[0],
                 "names": Cell(" ".join(specimen.files), ", ".join(specimen.files)),
             }
-            for specimen in specimens
+            for specimen in stated_specimens
         ),
         selected=0,
     )
 
 
 def homogeneity_table(campaign: CampaignResult) -> Table:
-    """Return the table of each mode's and parameter's scatter between the sessions."""
+    """Return the table of each quantity's scatter between sessions: of modes and parameters."""
     homogeneity = campaign.homogeneity
 
     def row(scatter: Heterogeneity) -> Row:
-        _, factor, _ = label(scatter.quantity)
+        _, display_factor, _ = label(scatter.quantity)
         return {
             "quantity": Cell(
                 scatter.quantity,
                 with_mark(symbol_with_unit(scatter.quantity), scatter.quantity, homogeneity),
             ),
             "sessions": len(scatter.values),
-            "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", factor),
-            "between_std": number_cell(scatter.between_std, ".2g", factor),
+            "mean": number_cell(scatter.mean, f".{_decimals_of_scatter(scatter)}f", display_factor),
+            "between_std": number_cell(scatter.between_std, ".2g", display_factor),
             "between_in_own_std": scatter.between_std_in_own_stds,
             "cochran_q": scatter.cochran_q,
             "i_squared": replace(number_cell(scatter.i_squared), text=percent(scatter.i_squared)),
@@ -462,17 +486,24 @@ def homogeneity_table(campaign: CampaignResult) -> Table:
 
 
 def _decimals_of_scatter(scatter: Heterogeneity) -> int:
-    """Return the number of decimals that show the scatter or the sessions' own uncertainty."""
-    _, factor, _ = label(scatter.quantity)
-    smallest_visible = factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
-    return min(decimals(smallest_visible), 9)
+    """Return the number of decimals for the mean of a quantity over the sessions.
+
+    It follows from the larger one of the scatter between the sessions and their smallest standard
+    deviation.
+    """
+    _, display_factor, _ = label(scatter.quantity)
+    shown_std = display_factor * max(scatter.between_std, min(std for _, _, std in scatter.values))
+    return min(decimals(shown_std), 9)
 
 
-def chance_cell(chance: float) -> Cell:
-    """Return a cell with a p-value, which may be too small to write as a number."""
-    return replace(number_cell(chance), text=probability(chance))
+def chance_cell(p_value: float) -> Cell:
+    """Return a cell with a p-value; a very small one is displayed as a bound, such as "< 1e-99"."""
+    return replace(number_cell(p_value), text=probability(p_value))
 
 
-def with_mark(text: str, quantity: str, homogeneity: Homogeneity) -> str:
-    """Return a text with the mark of a mixture, if the sessions differ in kind in the quantity."""
-    return f"{text} {MIXTURE_MARK}" if homogeneity.is_mixed(quantity) else text
+def with_mark(cell_text: str, quantity_name: str, homogeneity: Homogeneity) -> str:
+    """Return a text, with a symbol if the sessions form groups with different values.
+
+    `quantity_name` is the name of the quantity in which the groups differ.
+    """
+    return f"{cell_text} {MIXTURE_MARK}" if homogeneity.is_mixed(quantity_name) else cell_text

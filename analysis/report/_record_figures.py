@@ -48,21 +48,21 @@ _LEAST_LABELS_PER_DECADE: Final = 1 / math.log10(2.0)
 """Number of labels per decade for which there must be room, so that 1, 2 and 5 are labelled."""
 
 
-def plain_logarithmic(axes: Axes, low: float, high: float) -> None:
-    """Make the vertical axis logarithmic from `low` to `high`, with as many labels as fit."""
+def plain_logarithmic(axes: Axes, lower_limit: float, upper_limit: float) -> None:
+    """Make the vertical axis logarithmic within the limits, with as many labels as fit."""
     axes.set_yscale("log")
-    axes.set_ylim(low, high)
-    if high < 5 * low:
+    axes.set_ylim(lower_limit, upper_limit)
+    if upper_limit < 5 * lower_limit:
         axes.yaxis.set_major_locator(MaxNLocator(4))
     else:
         height_in = axes.bbox.height / axes.figure.dpi
-        labels_per_decade = height_in / (_LABEL_HEIGHT_IN * math.log10(high / low))
-        digits = (
+        labels_per_decade = height_in / (_LABEL_HEIGHT_IN * math.log10(upper_limit / lower_limit))
+        leading_digits = (
             (1.0, 2.0, 5.0)
-            if high < 1000 * low and labels_per_decade > _LEAST_LABELS_PER_DECADE
+            if upper_limit < 1000 * lower_limit and labels_per_decade > _LEAST_LABELS_PER_DECADE
             else (1.0,)
         )
-        axes.yaxis.set_major_locator(LogLocator(subs=digits, numticks=12))
+        axes.yaxis.set_major_locator(LogLocator(subs=leading_digits, numticks=12))
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _position: f"{value:g}"))
     axes.yaxis.set_minor_formatter(NullFormatter())
 
@@ -93,9 +93,15 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
         Model of the record, with the modes that get an enlarged panel.
     """
     first_hz, last_hz = float(measured_frf.frequency_hz[0]), float(measured_frf.frequency_hz[-1])
-    visible_modes = [mode for mode in model.modes if first_hz < mode.frequency_hz < last_hz]
-    grid_hz = dense_grid(first_hz, last_hz, [mode.frequency_hz for mode in visible_modes])
-    band = model.band(grid_hz)
+    visible_modes = [
+        visible_mode
+        for visible_mode in model.modes
+        if first_hz < visible_mode.frequency_hz < last_hz
+    ]
+    grid_hz = dense_grid(
+        first_hz, last_hz, [visible_mode.frequency_hz for visible_mode in visible_modes]
+    )
+    model_band = model.band(grid_hz)
     measured_without_delay = measured_frf.response * np.exp(
         2j * np.pi * model.delay_s * measured_frf.frequency_hz
     )
@@ -106,60 +112,70 @@ def frf_figure(measured_frf: FrequencyResponse, model: ShownModel) -> Figure:
         height_ratios=(3.4, 1.0),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(3, 1, height_ratios=(2.4, 1.0, 0.8), hspace=0.1)
-    magnitude, phase, width_axes = (figure.add_subplot(upper_grid[row]) for row in range(3))
-    _draw_magnitude(
-        magnitude, measured_frf.frequency_hz, measured_without_delay, band, _MEASURED_COLOR
+    magnitude_axes, phase_axes, width_axes = (
+        figure.add_subplot(upper_grid[row]) for row in range(3)
     )
-    modelled_db = magnitude_db(band.response)
+    _draw_magnitude(
+        magnitude_axes,
+        measured_frf.frequency_hz,
+        measured_without_delay,
+        model_band,
+        _MEASURED_COLOR,
+    )
+    modelled_db = magnitude_db(model_band.response)
     lowest_db = min(
         float(np.quantile(magnitude_db(measured_without_delay), 0.005)),
         float(np.quantile(modelled_db, 0.05)),
     )
-    magnitude.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
+    magnitude_axes.set_ylim(lowest_db - 5, float(modelled_db.max()) + 5)
     point_indices = style.log_spaced_indices(measured_frf.frequency_hz, _RESPONSE_POINTS)
     style.dots(
-        phase,
+        phase_axes,
         measured_frf.frequency_hz[point_indices],
         phase_deg(measured_without_delay[point_indices]),
         size_pt=2.0,
         color=style.GREY,
     )
-    phase.plot(band.frequency_hz, phase_deg(band.response), color=style.BLUE)
-    style.response_axes(magnitude, phase)
-    half_percent = 100 * NORMAL_95 * band.log_magnitude_std
-    width_axes.plot(band.frequency_hz, half_percent, color=style.BLUE, linewidth=1.0)
-    plain_logarithmic(width_axes, 0.8 * half_percent.min(), 1.4 * half_percent.max())
+    phase_axes.plot(model_band.frequency_hz, phase_deg(model_band.response), color=style.BLUE)
+    style.response_axes(magnitude_axes, phase_axes)
+    half_width_percent = 100 * NORMAL_95 * model_band.log_magnitude_std
+    width_axes.plot(model_band.frequency_hz, half_width_percent, color=style.BLUE, linewidth=1.0)
+    plain_logarithmic(width_axes, 0.8 * half_width_percent.min(), 1.4 * half_width_percent.max())
     width_axes.set_ylabel("Band (± %)")
     width_axes.set_xlabel("Frequency (Hz)", labelpad=1)
-    for axes in (magnitude, phase, width_axes):
-        style.frequency_axis(axes, (first_hz, last_hz), labels=axes is width_axes)
-    for column, mode in enumerate(visible_modes):
-        detail_axes = figure.add_subplot(grid[1, column])
-        detail_limits_hz = _detail_range_hz(mode, measured_frf.frequency_hz)
-        in_detail = (measured_frf.frequency_hz >= detail_limits_hz[0]) & (
+    for response_panel in (magnitude_axes, phase_axes, width_axes):
+        style.frequency_axis(
+            response_panel, (first_hz, last_hz), with_labels=response_panel is width_axes
+        )
+    for panel_number, visible_mode in enumerate(visible_modes):
+        detail_axes = figure.add_subplot(grid[1, panel_number])
+        detail_limits_hz = _detail_range_hz(visible_mode, measured_frf.frequency_hz)
+        is_in_detail = (measured_frf.frequency_hz >= detail_limits_hz[0]) & (
             measured_frf.frequency_hz <= detail_limits_hz[1]
         )
         detail_band = model.band(np.linspace(*detail_limits_hz, _DETAIL_POINTS))
         _draw_magnitude(
             detail_axes,
-            measured_frf.frequency_hz[in_detail],
-            measured_without_delay[in_detail],
+            measured_frf.frequency_hz[is_in_detail],
+            measured_without_delay[is_in_detail],
             detail_band,
             style.GREY,
         )
         detail_axes.set_xlim(detail_limits_hz)
         detail_axes.set_ylim(
             style.limits(
-                magnitude_db(measured_without_delay[in_detail]), magnitude_db(detail_band.response)
+                magnitude_db(measured_without_delay[is_in_detail]),
+                magnitude_db(detail_band.response),
             )
         )
-        detail_axes.set_title(f"Mode {mode.number}", fontweight="normal", fontsize=8.5)
+        detail_axes.set_title(f"Mode {visible_mode.number}", fontweight="normal", fontsize=8.5)
         detail_axes.set_facecolor("#FCFAF4")
         detail_axes.set_xlabel("Frequency (Hz)", labelpad=1)
-        if column == 0:
+        if panel_number == 0:
             detail_axes.set_ylabel("Magnitude (dB)")
     figure.legend(
-        *magnitude.get_legend_handles_labels(), loc="upper right", bbox_to_anchor=(0.985, 0.995),
+        *magnitude_axes.get_legend_handles_labels(), loc="upper right",
+        bbox_to_anchor=(0.985, 0.995),
         ncols=3, borderaxespad=0.0,
     )  # fmt: skip
     return figure
@@ -169,34 +185,37 @@ def _draw_magnitude(
     axes: Axes,
     frequency_hz: NDArray[np.float64],
     measured_frf: NDArray[np.complex128],
-    band: ResponseBand,
-    color: str,
+    model_band: ResponseBand,
+    curve_color: str,
 ) -> None:
     """Draw the measured magnitude, the model's magnitude over it, and the model's 95 % band."""
     axes.plot(
         *style.envelope(
             frequency_hz, magnitude_db(measured_frf), _RESPONSE_POINTS, logarithmic=True
         ),
-        color=color, linewidth=0.8, label="measured",
+        color=curve_color, linewidth=0.8, label="measured",
     )  # fmt: skip
-    low, high = (magnitude_db(limit.astype(complex)) for limit in band.magnitude_limits())
+    lower_db, upper_db = (
+        magnitude_db(magnitude_limit.astype(complex))
+        for magnitude_limit in model_band.magnitude_limits()
+    )
     axes.fill_between(
-        band.frequency_hz, low, high, color=_BAND_COLOR, linewidth=0, alpha=0.6,
+        model_band.frequency_hz, lower_db, upper_db, color=_BAND_COLOR, linewidth=0, alpha=0.6,
         label="95 % band of the model",
     )  # fmt: skip
     axes.plot(
-        band.frequency_hz, magnitude_db(band.response), color=style.BLUE, linewidth=1.1,
+        model_band.frequency_hz, magnitude_db(model_band.response), color=style.BLUE, linewidth=1.1,
         label="model",
     )  # fmt: skip
 
 
 def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> tuple[float, float]:
     """Return the frequency range of a mode's enlarged panel, with at least one bin."""
-    spacing_hz = float(np.diff(frequency_hz).max())
+    bin_spacing_hz = float(np.diff(frequency_hz).max())
     relative_width = max(_DETAIL_TO_HALF_WIDTH * mode.damping_ratio, _LEAST_RELATIVE_DETAIL)
-    half_hz = max(relative_width * mode.frequency_hz, spacing_hz)
+    half_width_hz = max(relative_width * mode.frequency_hz, bin_spacing_hz)
     lowest_hz = float(frequency_hz[0]) / 2
-    return max(mode.frequency_hz - half_hz, lowest_hz), mode.frequency_hz + half_hz
+    return max(mode.frequency_hz - half_width_hz, lowest_hz), mode.frequency_hz + half_width_hz
 
 
 _LOSS_POINTS: Final = 400
@@ -214,8 +233,8 @@ Smaller loss factors do not matter for the total."""
 
 
 def loss_figure(
-    modes: Sequence[ModeEstimate],
-    beam: Estimate | None,
+    mode_estimates: Sequence[ModeEstimate],
+    loss_model: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     *,
@@ -226,9 +245,9 @@ def loss_figure(
 
     Parameters
     ----------
-    modes : sequence of ModeEstimate
+    mode_estimates : sequence of ModeEstimate
         Modes to draw as points.
-    beam : Estimate or None
+    loss_model : Estimate or None
         Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
     axis_hz : tuple of float
         Lowest and highest frequency of the axis, positive.
@@ -242,38 +261,50 @@ def loss_figure(
     """
     figure = style.new_figure(9.0, 3.6)
     axes = figure.add_axes((0.085, 0.13, 0.90, 0.775))
-    drawn_values = _draw_loss_factors(axes, beam, axis_hz, supported_hz, unsupported_orders)
-    for label, is_filled in (("modes", True), ("modes, doubtful", False)):
-        drawn_modes = [mode for mode in modes if (mode.number not in flagged_modes) is is_filled]
+    drawn_values = _draw_loss_factors(axes, loss_model, axis_hz, supported_hz, unsupported_orders)
+    for legend_label, is_filled in (("modes", True), ("modes, doubtful", False)):
+        drawn_modes = [
+            mode_estimate
+            for mode_estimate in mode_estimates
+            if (mode_estimate.number not in flagged_modes) is is_filled
+        ]
         if drawn_modes:
             axes.errorbar(
-                [mode.frequency_hz for mode in drawn_modes],
-                [2 * mode.damping_ratio for mode in drawn_modes],
-                [2 * NORMAL_95 * mode.damping_ratio_std for mode in drawn_modes],
+                [mode_estimate.frequency_hz for mode_estimate in drawn_modes],
+                [2 * mode_estimate.damping_ratio for mode_estimate in drawn_modes],
+                [2 * NORMAL_95 * mode_estimate.damping_ratio_std for mode_estimate in drawn_modes],
                 fmt="o", color=style.INK, markersize=4.0, capsize=3.0, elinewidth=1.0,
-                markerfacecolor=style.INK if is_filled else "white", label=label, zorder=5,
+                markerfacecolor=style.INK if is_filled else "white", label=legend_label, zorder=5,
             )  # fmt: skip
-    modes_hz = [mode.frequency_hz for mode in modes]
-    grey_bands_hz = [] if beam is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
-    for edge_hz, end_hz in grey_bands_hz:
-        axes.axvspan(edge_hz, end_hz, color="#F4F4F4", linewidth=0, zorder=0)
+    modes_hz = [mode_estimate.frequency_hz for mode_estimate in mode_estimates]
+    grey_bands_hz = (
+        [] if loss_model is None else _unsupported_ranges_hz(axis_hz, supported_hz, modes_hz)
+    )
+    for band_edge_hz, band_end_hz in grey_bands_hz:
+        axes.axvspan(band_edge_hz, band_end_hz, color="#F4F4F4", linewidth=0, zorder=0)
     style.frequency_axis(axes, axis_hz)
-    mode_loss_factors = [2 * mode.damping_ratio for mode in modes]
+    mode_loss_factors = [2 * mode_estimate.damping_ratio for mode_estimate in mode_estimates]
     # A quantile of each curve, because a total may rise without bound towards an end.
-    top = max(
-        [*mode_loss_factors, *(float(np.nanquantile(value, 0.98)) for value in drawn_values)],
+    highest_loss = max(
+        [
+            *mode_loss_factors,
+            *(float(np.nanquantile(loss_values, 0.98)) for loss_values in drawn_values),
+        ],
         default=1.0,
     )
-    low = min(
-        [*mode_loss_factors, *(float(np.nanmin(value)) for value in drawn_values)], default=top
+    lowest_loss = min(
+        [*mode_loss_factors, *(float(np.nanmin(loss_values)) for loss_values in drawn_values)],
+        default=highest_loss,
     )
-    plain_logarithmic(axes, max(low / 2, 3 * top / _MOST_LOSS_AXIS_RATIO), 3 * top)
+    plain_logarithmic(
+        axes, max(lowest_loss / 2, 3 * highest_loss / _MOST_LOSS_AXIS_RATIO), 3 * highest_loss
+    )
     axes.set_ylabel("Loss factor (1)")
     axes.set_xlabel("Frequency (Hz)", labelpad=1)
-    handles, labels = axes.get_legend_handles_labels()
-    if handles:
+    legend_handles, legend_labels = axes.get_legend_handles_labels()
+    if legend_handles:
         figure.legend(
-            handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.99), ncols=4,
+            legend_handles, legend_labels, loc="upper right", bbox_to_anchor=(0.985, 0.99), ncols=4,
             borderaxespad=0.0,
         )  # fmt: skip
     return figure
@@ -281,19 +312,24 @@ def loss_figure(
 
 def _draw_loss_factors(
     axes: Axes,
-    beam: Estimate | None,
+    loss_model: Estimate | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     unsupported_orders: Collection[str],
 ) -> list[NDArray[np.float64]]:
-    """Draw the loss factors where the data support them, and return the drawn values."""
-    if supported_hz is None or beam is None:
+    """Draw the loss factors in the band in which the data determine them.
+
+    Returns the values of each curve.
+    """
+    if supported_hz is None or loss_model is None:
         return []
     first_hz, last_hz = max(axis_hz[0], supported_hz[0]), min(axis_hz[1], supported_hz[1])
     if first_hz >= last_hz:
         return []
-    loss_factors_over_frequency = loss_factors(beam, np.geomspace(first_hz, last_hz, _LOSS_POINTS))
-    curves = dict(
+    loss_factors_over_frequency = loss_factors(
+        loss_model, np.geomspace(first_hz, last_hz, _LOSS_POINTS)
+    )
+    loss_curves = dict(
         zip(
             _CURVE_STYLES,
             (
@@ -304,28 +340,32 @@ def _draw_loss_factors(
             strict=True,
         )
     )
-    has_both_parts = None not in curves.values()
+    has_both_parts = None not in loss_curves.values()
     drawn_values = []
-    for (label, factor), order in zip(curves.items(), ("alpha", "lambda", None), strict=True):
+    for (curve_label, loss_factor), draw_order in zip(
+        loss_curves.items(), ("alpha", "lambda", None), strict=True
+    ):
         # If one part is unknown, the parts are not distinguished; alone, a part is the total.
-        if factor is None or (order is not None and (not has_both_parts or unsupported_orders)):
+        if loss_factor is None or (
+            draw_order is not None and (not has_both_parts or unsupported_orders)
+        ):
             continue
-        color, dash = _CURVE_STYLES[label]
+        curve_color, line_dash = _CURVE_STYLES[curve_label]
         axes.fill_between(
             loss_factors_over_frequency.frequency_hz,
-            *factor.limits(),
-            color=color,
+            *loss_factor.limits(),
+            color=curve_color,
             alpha=0.2,
             linewidth=0,
         )
         axes.plot(
             loss_factors_over_frequency.frequency_hz,
-            factor.value,
-            color=color,
-            linestyle=dash,
-            label=label,
+            loss_factor.value,
+            color=curve_color,
+            linestyle=line_dash,
+            label=curve_label,
         )
-        drawn_values.append(factor.value)
+        drawn_values.append(loss_factor.value)
     return drawn_values
 
 
@@ -354,7 +394,7 @@ A short record has fewer independent values."""
 
 
 def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
-    """Draw the residual's spectrum, its cumulative periodogram, and its power over time.
+    """Draw the spectrum, cumulative periodogram and power over time of a model's residual.
 
     Parameters
     ----------
@@ -376,14 +416,16 @@ def residual_figure(model: ShownModel, analysis: RecordAnalysis) -> Figure:
 def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     """Draw the spectrum of the residual with the noise model, the modes and the hum."""
     frequency_hz = analysis.frequency_hz
-    density = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
+    density_nm2_per_hz = analysis.noise_nm2_per_hz * np.abs(model.residual) ** 2 / 2
     is_compared = analysis.compared
     compared_bins = np.flatnonzero(is_compared)
-    blocks = np.array_split(compared_bins, max(compared_bins.size // _BINS_PER_POINT, 1))
-    middle_hz = [float(frequency_hz[block].mean()) for block in blocks]
-    rms_values = [1e3 * float(np.sqrt(density[block].mean())) for block in blocks]
+    bin_blocks = np.array_split(compared_bins, max(compared_bins.size // _BINS_PER_POINT, 1))
+    block_middle_hz = [float(frequency_hz[bin_block].mean()) for bin_block in bin_blocks]
+    rms_mnm_values = [
+        1e3 * float(np.sqrt(density_nm2_per_hz[bin_block].mean())) for bin_block in bin_blocks
+    ]
     axes.plot(
-        middle_hz, rms_values, ".", color=style.VERMILION, markersize=3.5,
+        block_middle_hz, rms_mnm_values, ".", color=style.VERMILION, markersize=3.5,
         label=f"residual, mean of {_BINS_PER_POINT} bins",
     )  # fmt: skip
     point_slice = slice(None, None, max(frequency_hz.size // _NOISE_MODEL_POINTS, 1))
@@ -393,14 +435,14 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
     )  # fmt: skip
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
-    for line in analysis.lines:
+    for hum_line in analysis.lines:
         axes.annotate(
-            f"{line.frequency_hz:.4g} Hz disturbance", (line.frequency_hz, 1.0),
+            f"{hum_line.frequency_hz:.4g} Hz disturbance", (hum_line.frequency_hz, 1.0),
             xycoords=("data", "axes fraction"), xytext=(0, 2), textcoords="offset points",
             ha="center", fontsize=7.5, color=style.PURPLE,
         )  # fmt: skip
-        axes.axvline(line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
-    plain_logarithmic(axes, min(rms_values) / 1.6, max(rms_values) * 1.6)
+        axes.axvline(hum_line.frequency_hz, color=style.PURPLE, linewidth=1.0, linestyle=":")
+    plain_logarithmic(axes, min(rms_mnm_values) / 1.6, max(rms_mnm_values) * 1.6)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Spectrum (grey: modes)")
     axes.set_ylabel("Torque (mN·m/√Hz)")
@@ -411,11 +453,11 @@ def _draw_spectrum(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> N
 def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     """Draw the residual's cumulative periodogram less that of white noise, with its 95 % range."""
     is_compared = analysis.compared
-    power = np.abs(model.residual[is_compared]) ** 2
-    cumulative = np.cumsum(power) / power.sum()
-    uniform_distribution = np.arange(1, power.size + 1) / power.size
+    bin_power = np.abs(model.residual[is_compared]) ** 2
+    cumulative_power = np.cumsum(bin_power) / bin_power.sum()
+    uniform_distribution = np.arange(1, bin_power.size + 1) / bin_power.size
     frequency_hz = analysis.frequency_hz[is_compared]
-    half_range_percent = 100 * KOLMOGOROV_95 / np.sqrt(power.size)
+    half_range_percent = 100 * KOLMOGOROV_95 / np.sqrt(bin_power.size)
     axes.axhspan(
         -half_range_percent,
         half_range_percent,
@@ -424,12 +466,12 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
         zorder=0,
         label="95 % of white noise",
     )
-    difference = 100 * (cumulative - uniform_distribution)
-    axes.plot(*style.envelope(frequency_hz, difference, 400), color=style.VERMILION)
+    difference_percent = 100 * (cumulative_power - uniform_distribution)
+    axes.plot(*style.envelope(frequency_hz, difference_percent, 400), color=style.VERMILION)
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7)
     for mode in model.modes:
         axes.axvline(mode.frequency_hz, color="#B8B8B8", linewidth=0.8, zorder=0.5)
-    axis_limit = 1.25 * max(half_range_percent, float(np.abs(difference).max()))
+    axis_limit = 1.25 * max(half_range_percent, float(np.abs(difference_percent).max()))
     axes.set_ylim(-axis_limit, axis_limit)
     axes.set_xlim(0.0, frequency_hz[-1])
     axes.set_title("Cumulative periodogram less that of white noise")
@@ -440,15 +482,15 @@ def _draw_cumulative_periodogram(axes: Axes, model: ShownModel, analysis: Record
 
 def _draw_power_over_time(axes: Axes, model: ShownModel, analysis: RecordAnalysis) -> None:
     """Draw the power of the whitened residual over time, with the 95 % range of white noise."""
-    times_s, power = residual_power(analysis, model.residual)
+    times_s, interval_power = residual_power(analysis, model.residual)
     half_range = NORMAL_95 * np.sqrt(times_s.size / np.count_nonzero(analysis.compared))
     axes.axhspan(
         max(1 - half_range, 0.0), 1 + half_range, color=style.SHADE_COLOR, linewidth=0, zorder=0,
         label="95 % of white noise",
     )  # fmt: skip
-    axes.plot(times_s, power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
+    axes.plot(times_s, interval_power, ".-", color=style.VERMILION, linewidth=0.7, markersize=3.0)
     axes.set_xlim(0.0, times_s[-1] + times_s[0])
-    axes.set_ylim(0.0, 1.15 * max(float(power.max()), 1 + half_range))
+    axes.set_ylim(0.0, 1.15 * max(float(interval_power.max()), 1 + half_range))
     axes.set_title("Power in time, whitened")
     axes.set_ylabel("Over the mean of noise (1)")
     axes.set_xlabel("Time from the record's start (s)", labelpad=1)
@@ -469,16 +511,21 @@ def residual_power(
         Time of the middle of each interval since the first compared sample, and mean power in the
         interval.
     """
-    spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
-    bins = residual.size
-    envelope = np.abs(np.fft.ifft(residual)) ** 2 * bins / 2
-    envelope *= bins / np.count_nonzero(analysis.compared)
-    interval_count = min(_MOST_INTERVALS, bins)
-    power: NDArray[np.float64] = np.array(
-        [interval.mean() for interval in np.array_split(envelope, interval_count)]
+    bin_spacing_hz = float(analysis.frequency_hz[1] - analysis.frequency_hz[0])
+    bin_count = residual.size
+    envelope_power = np.abs(np.fft.ifft(residual)) ** 2 * bin_count / 2
+    envelope_power *= bin_count / np.count_nonzero(analysis.compared)
+    interval_count = min(_MOST_INTERVALS, bin_count)
+    interval_power: NDArray[np.float64] = np.array(
+        [
+            interval_envelope.mean()
+            for interval_envelope in np.array_split(envelope_power, interval_count)
+        ]
     )
-    times_s = (np.arange(interval_count, dtype=np.float64) + 0.5) / (interval_count * spacing_hz)
-    return times_s, power
+    times_s = (np.arange(interval_count, dtype=np.float64) + 0.5) / (
+        interval_count * bin_spacing_hz
+    )
+    return times_s, interval_power
 
 
 @dataclass(frozen=True, slots=True)
@@ -503,44 +550,47 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline
     model = ShownModel.of(headline, whole_record.record)
     analysis = model.compared(whole_record.analysis)
-    modes = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
+    modes_text = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss_name, residual_name, signals_name = FIGURES
     measured_frf = measured_response(whole_record)
-    delay = "delay" if model.modal is None else "the delay that the file states"
+    delay_text = "delay" if model.modal is None else "the delay that the file states"
     yield Illustration(
         frf,
         frf_figure(measured_frf, model),
         "Frequency response from motor angle to coupling torque: magnitude and phase, measured "
-        f"(empirical transfer function estimate, {delay} removed) and of {model.name}; half-width "
-        f"of the model's 95 % band; details of the modes ({modes} Hz). The band is narrower than "
-        "the line where it is not seen.",
+        f"(empirical transfer function estimate, {delay_text} removed) and of {model.name}; "
+        f"half-width of the model's 95 % band; details of the modes ({modes_text} Hz). The band is "
+        "narrower "
+        "than the line where it is not seen.",
     )
-    test = headline.uniform_beam
-    if test is not None and test.p_value is not None:
-        yield Illustration(UNIFORMITY, uniformity_figure(test), uniformity_description(test))
-    beam = loss_estimate(whole_record)
+    uniformity_test = headline.uniform_beam
+    if uniformity_test is not None and uniformity_test.p_value is not None:
+        yield Illustration(
+            UNIFORMITY, uniformity_figure(uniformity_test), uniformity_description(uniformity_test)
+        )
+    loss_model = loss_estimate(whole_record)
     flagged_modes = [mode.number for mode in headline.modes if mode.damping_ratio.flag is not None]
     yield Illustration(
         loss_name,
         loss_figure(
             model.modes,
-            beam,
+            loss_model,
             (float(measured_frf.frequency_hz[0]), highest_hz),
             supported_band_hz(whole_record),
             unsupported_orders=whole_record.withheld,
             flagged_modes=flagged_modes,
         ),
-        _loss_description(whole_record, has_curves=beam is not None),
+        _loss_description(whole_record, has_curves=loss_model is not None),
     )
-    power = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
+    mean_power_ratio = float(np.mean(np.abs(model.residual[analysis.compared]) ** 2)) / 2
     yield Illustration(
         residual_name,
         residual_figure(model, analysis),
         f"Residual of the torque, measured minus that of {model.name}: its spectrum beside the "
         "noise model; its cumulative periodogram, which stays in the shaded range in 95 of 100 "
         "records or more if only noise is left; and its power through the record. Excess at a "
-        f"mode or at one time is what the model lacks. Mean power {power:.4g} times that of the "
-        "noise.",
+        f"mode or at one time is what the model lacks. Mean power {mean_power_ratio:.4g} times "
+        "that of the noise.",
     )
     yield Illustration(
         signals_name,
@@ -554,47 +604,47 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
 
 def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
     """Return the caption of the loss factor's figure."""
-    points = "twice the damping ratio of each mode with its 95 % interval"
-    reasons = _reasons_of_hollow_points(whole_record.headline)
+    points_text = "twice the damping ratio of each mode with its 95 % interval"
+    reasons_text = _reasons_of_hollow_points(whole_record.headline)
     if not has_curves:
         return (
-            f"Loss factor over frequency: {points}. There is no curve, because no beam with one "
-            f"internal and one external order explains the losses.{reasons}"
+            f"Loss factor over frequency: {points_text}. There is no curve, because no beam with "
+            f"one internal and one external order explains the losses.{reasons_text}"
         )
-    beginning = (
+    curves_text = (
         f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
-        f"points: {points}. "
+        f"points: {points_text}. "
     )
     if whole_record.withheld:
-        return beginning + (
+        return curves_text + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "
-            f"do not support would decide.{reasons}"
+            f"do not support would decide.{reasons_text}"
         )
-    return beginning + (
+    return curves_text + (
         "At a mode the loss factor is about twice the damping ratio. Between the modes the model "
         "interpolates, outside them (grey) it extrapolates; where the torque does not stand out of "
-        f"the noise nothing is drawn.{reasons}"
+        f"the noise nothing is drawn.{reasons_text}"
     )
 
 
 def _describe_curve_model(whole_record: WholeRecord) -> str:
-    """Return to which beam the curves of the loss factors belong, for the figure's caption."""
+    """Return of which beam model the curves of the loss factors are, for the figure's caption."""
     tolerant_estimate = whole_record.headline.tolerant
     if tolerant_estimate is None:
         return f"type {whole_record.headline.name}"
     if tolerant_estimate.basis == "losses":
         return "of both dampings by damping ratios and residue phases alone"
-    percent = 100 * tolerant_estimate.uniformity
-    return f"of a beam whose modes lie where those of a uniform one do, to {percent:g} %"
+    tolerance_percent = 100 * tolerant_estimate.uniformity
+    return f"of a beam whose modes lie where those of a uniform one do, to {tolerance_percent:g} %"
 
 
 def _reasons_of_hollow_points(headline: Headline) -> str:
-    """Return why points are hollow, for the figure's caption; empty if none are."""
-    reasons = dict.fromkeys(
+    """Return why damping ratios are drawn as hollow points, for a caption; empty if none are."""
+    flag_texts = dict.fromkeys(
         mode.damping_ratio.flag for mode in headline.modes if mode.shown and mode.damping_ratio.flag
     )
-    return f" Hollow points are doubtful: {'; '.join(map(str, reasons))}." if reasons else ""
+    return f" Hollow points are doubtful: {'; '.join(map(str, flag_texts))}." if flag_texts else ""
 
 
 def measured_response(whole_record: WholeRecord) -> FrequencyResponse:

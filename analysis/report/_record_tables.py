@@ -53,13 +53,15 @@ def modes_table(whole_record: WholeRecord) -> Table:
     """
     headline = whole_record.headline
     has_inertias = any(mode.participation is not None for mode in headline.modes)
-    rows: list[tuple[Entry, ...]] = []
+    table_rows: list[tuple[Entry, ...]] = []
     for mode in headline.modes:
-        cells = *_mode_cells(mode), *_inertia_cells(mode.participation)
+        mode_cells = *_mode_cells(mode), *_inertia_cells(mode.participation)
         if mode.damping_ratio.flag is None:
-            rows.append((mode.number, *cells, mode.source))
+            table_rows.append((mode.number, *mode_cells, mode.source))
         else:
-            rows.append((mark_cell(count_cell(mode.number)), *map(grey_cell, cells), mode.source))
+            table_rows.append(
+                (mark_cell(count_cell(mode.number)), *map(grey_cell, mode_cells), mode.source)
+            )
     return Table.of(
         "modes",
         f"Modes with locked hub (clamped–free): {_modes_source(headline)}",
@@ -69,7 +71,7 @@ def modes_table(whole_record: WholeRecord) -> Table:
             Column("std" if has_inertias else "", "participation_std_kg_m2"),
             Column("Source" if has_inertias else "", "source", TEXT_FORMAT),
         ),
-        rows,
+        table_rows,
         (
             "Intervals are statistical only; no torque scale, length or density acts on "
             "frequencies and damping ratios.",
@@ -82,19 +84,19 @@ def modes_table(whole_record: WholeRecord) -> Table:
 def exact_modes_table(whole_record: WholeRecord) -> Table | None:
     """Return the table of a uniform beam's modes; None if no such beam explains the record."""
     headline = whole_record.headline
-    test, exact_estimates = headline.uniform_beam, headline.exact
-    if test is None or exact_estimates is None or test.status != "passed":
+    uniformity_test, exact_estimates = headline.uniform_beam, headline.exact
+    if uniformity_test is None or exact_estimates is None or uniformity_test.status != "passed":
         return None
-    modes = [
+    shown_mode_values = [
         mode for mode in exact_estimates.modes if mode.shown and mode.damping_ratio.flag is None
     ]
-    if not modes:
+    if not shown_mode_values:
         return None
     return Table.of(
         "exact_geometry_modes",
         f"Modes {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         _MODE_COLUMNS,
-        ((mode.number, *_mode_cells(mode)) for mode in modes),
+        ((mode.number, *_mode_cells(mode)) for mode in shown_mode_values),
         ("A condition: narrower than the modal model, and right only if the beam is uniform.",),
     )
 
@@ -133,12 +135,12 @@ def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
     """Return the cells of a mode's effective inertia and of its standard deviation."""
     if participation is None:
         return number_cell(None), number_cell(None)
-    value, std, *_ = _quantity_cells(participation, _SQUARE_MM_PER_SQUARE_M)
-    return value, std
+    value_cell, std_cell, *_ = _quantity_cells(participation, _SQUARE_MM_PER_SQUARE_M)
+    return value_cell, std_cell
 
 
 def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
-    """Yield notes on the fit of the modal model and on its resonances that are not the beam's."""
+    """Yield notes on how well the modal model fits, and on resonances that are not the beam's."""
     modal_fit = whole_record.headline.modal
     if modal_fit is None:
         return
@@ -146,33 +148,34 @@ def _modal_notes(whole_record: WholeRecord) -> Iterator[str]:
         "Inertia: effective inertia about the motor axis that takes part in the mode; it is "
         "proportional to the torque scale."
     )
-    percent = ShownModel.of(whole_record.headline, whole_record.record).fit_percent(
+    nrmse_percent = ShownModel.of(whole_record.headline, whole_record.record).fit_percent(
         whole_record.analysis
     )
-    yield f"Fit of the modal model {percent:.2f} % (NRMSE)."
-    further_hz = [
+    yield f"Fit of the modal model {nrmse_percent:.2f} % (NRMSE)."
+    other_resonances_hz = [
         f"{frequency_hz:.4g}"
-        for mode, frequency_hz in zip(
+        for mode_number, frequency_hz in zip(
             modal_fit.numbers, modal_fit.model.frequencies_hz, strict=True
         )
-        if mode == 0
+        if mode_number == 0
     ]
-    if further_hz:
+    if other_resonances_hz:
         yield (
-            f"The modal model has a further resonance at {listed(further_hz)} Hz, which is not one "
-            "of the beam's (sensor, mount)."
+            f"The modal model has a further resonance at {listed(other_resonances_hz)} Hz, which "
+            "is not one of the beam's (sensor, mount)."
         )
 
 
 def parameters_table(whole_record: WholeRecord) -> Table:
-    """Return the table of all parameters with uncertainties; flagged ones are marked.
+    """Return the table of all reported parameters with uncertainties.
 
     If the file states the uncertainties of the scales, the table also contains intervals that
-    include them. The last column states the reason for a mark.
+    include them. Parameters that are not properties of the antenna are marked, and the last column
+    states why.
     """
     headline = whole_record.headline
-    values_with_scales = whole_record.combined
-    including_scales = (
+    parameters_with_scales = whole_record.combined
+    scale_columns = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),
         Column("to", "combined_high_95"),
@@ -183,15 +186,15 @@ def parameters_table(whole_record: WholeRecord) -> Table:
     return Table.of(
         "parameters",
         f"Parameters{_condition_text(headline)}",
-        (*_PARAMETER_COLUMNS, *(including_scales if values_with_scales else ()), _REMARK_COLUMN),
+        (*_PARAMETER_COLUMNS, *(scale_columns if parameters_with_scales else ()), _REMARK_COLUMN),
         (
             _parameter_row(
-                name,
-                headline.parameters[name],
-                values_with_scales,
-                is_fixed=_is_fixed(headline, name),
+                parameter_name,
+                headline.parameters[parameter_name],
+                parameters_with_scales,
+                is_fixed=_is_fixed(headline, parameter_name),
             )
-            for name in parameter_names(headline)
+            for parameter_name in parameter_names(headline)
         ),
         (
             f"{_UNCERTAINTY_NOTE}{fit_note}",
@@ -223,7 +226,7 @@ _UNCERTAINTY_NOTE: Final = (
 def parameter_names(headline: Headline) -> tuple[str, ...]:
     """Return the names of the reported parameters in the order damping, beam, rig."""
     exact_parameters = () if headline.exact is None else headline.exact.parameters
-    return tuple(dict.fromkeys((*(name for name in exact_parameters if name in headline.parameters),
+    return tuple(dict.fromkeys((*(key for key in exact_parameters if key in headline.parameters),
                                 *headline.parameters)))  # fmt: skip
 
 
@@ -231,11 +234,11 @@ def _condition_text(headline: Headline) -> str:
     """Return the condition under which a table's parameters hold, for the table's caption."""
     tolerant_estimate = headline.tolerant
     if tolerant_estimate is None:
-        exact = "" if headline.modal is None else f", {EXACTLY_UNIFORM_CONDITION}"
-        return f", type {headline.name}{exact}"
+        condition_text = "" if headline.modal is None else f", {EXACTLY_UNIFORM_CONDITION}"
+        return f", type {headline.name}{condition_text}"
     if tolerant_estimate.basis == "geometry":
-        percent = 100 * tolerant_estimate.uniformity
-        return f" if each mode lies where that of a uniform beam does, to {percent:g} %"
+        tolerance_percent = 100 * tolerant_estimate.uniformity
+        return f" if each mode lies where that of a uniform beam does, to {tolerance_percent:g} %"
     if tolerant_estimate.basis == "losses":
         return " by damping ratios and residue phases alone, whatever the positions of the modes"
     return " of the beam that fits the losses best: it does not explain them"
@@ -249,30 +252,35 @@ def exact_geometry_table(whole_record: WholeRecord) -> Table | None:
     exact_estimates = whole_record.headline.exact
     if exact_estimates is None:
         return None
-    flags = [parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag]
+    flag_texts = [
+        parameter.flag for parameter in exact_estimates.parameters.values() if parameter.flag
+    ]
     return Table.of(
         "exact_geometry",
         f"Parameters {EXACTLY_UNIFORM_CONDITION}: type {exact_estimates.name}",
         (*_PARAMETER_COLUMNS, _REMARK_COLUMN),
         (
             _parameter_row(
-                name, parameter, {}, is_fixed=_is_fixed(whole_record.headline, name, exact=True)
+                parameter_name,
+                parameter,
+                {},
+                is_fixed=_is_fixed(whole_record.headline, parameter_name, exact=True),
             )
-            for name, parameter in exact_estimates.parameters.items()
+            for parameter_name, parameter in exact_estimates.parameters.items()
         ),
         (
             "A condition, not a result: no antenna is known to be uniform to 1e-5. "
             f"Fit {whole_record.analysis.fit_percent(whole_record.fit):.2f} % (NRMSE).",
-            *((_MARK_NOTE,) if flags else ()),
+            *((_MARK_NOTE,) if flag_texts else ()),
         ),
     )
 
 
-def _is_fixed(headline: Headline, name: str, *, exact: bool = False) -> bool:
+def _is_fixed(headline: Headline, parameter_name: str, *, exact: bool = False) -> bool:
     """Return whether a parameter was held at a fixed value in its fit."""
-    if headline.tolerant is not None and not exact and name in headline.tolerant.values:
+    if headline.tolerant is not None and not exact and parameter_name in headline.tolerant.values:
         return False
-    return name not in headline.fit.interval and name != "drag"
+    return parameter_name not in headline.fit.interval and parameter_name != "drag"
 
 
 def loss_factors_table(whole_record: WholeRecord) -> Table:
@@ -304,38 +312,48 @@ def loss_factors_table(whole_record: WholeRecord) -> Table:
 
 
 def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
-    """Return the table that compares reported values with a simpler structure's.
+    """Return the table of the parameters of a simpler damping structure next to the reported ones.
 
-    It is None if no simpler structure is sufficient.
+    It is None if no structure with fewer free parameters is sufficient for the record.
     """
     headline: Estimates = whole_record.headline.exact or whole_record.headline
     simpler_estimates = headline.simpler
     if simpler_estimates is None:
         return None
-    assumption = " and ".join(
-        f"{QUANTITIES[name][0]} = {at:g}" for name, at in simpler_estimates.fixed.items()
+    assumption_text = " and ".join(
+        f"{QUANTITIES[parameter_name][0]} = {fixed_value:g}"
+        for parameter_name, fixed_value in simpler_estimates.fixed.items()
     )
-    rows: list[tuple[Entry, ...]] = []
-    for name, value in simpler_estimates.parameters.items():
-        symbol, _meaning, unit, factor = _parameter_description(name)
-        free_value = headline.parameters.get(name)
-        rows.append(
+    table_rows: list[tuple[Entry, ...]] = []
+    for parameter_name, simpler_value in simpler_estimates.parameters.items():
+        parameter_symbol, _meaning, unit_symbol, display_factor = _parameter_description(
+            parameter_name
+        )
+        free_value = headline.parameters.get(parameter_name)
+        table_rows.append(
             (
-                Cell(name, symbol),
-                _unit_cell(unit),
-                *estimate_cells((value.value, *_interval_ends(value)), value.std, factor),
+                Cell(parameter_name, parameter_symbol),
+                _unit_cell(unit_symbol),
+                *estimate_cells(
+                    (simpler_value.value, *_interval_ends(simpler_value)),
+                    simpler_value.std,
+                    display_factor,
+                ),
                 *(
                     [number_cell(None)] * 3
                     if free_value is None
                     else estimate_cells(
-                        (free_value.value, *_interval_ends(free_value)), free_value.std, factor
+                        (free_value.value, *_interval_ends(free_value)),
+                        free_value.std,
+                        display_factor,
                     )
                 ),
             )
         )
     return Table.of(
         "on_condition",
-        f"If {assumption or 'the rest'} is assumed: type {simpler_estimates.name} (sufficient)",
+        f"If {assumption_text or 'the rest'} is assumed: type {simpler_estimates.name} "
+        "(sufficient)",
         (
             Column("Parameter", "parameter", TEXT_FORMAT),
             Column("Unit", "unit", TEXT_FORMAT),
@@ -346,7 +364,7 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
             Column("95 % from", "free_low_95"),
             Column("to", "free_high_95"),
         ),
-        rows,
+        table_rows,
         (
             "The intervals on the left hold only if the assumption is true"
             + (f", and both {EXACTLY_UNIFORM_CONDITION}." if whole_record.headline.exact else "."),
@@ -357,19 +375,30 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
 def correlations_table(whole_record: WholeRecord) -> Table:
     """Return the table of correlations between the determined parameters of the selected fit."""
     fit = whole_record.fit
-    symbols = [_parameter_symbol(name) for name in fit.determined]
+    parameter_symbols = [_parameter_symbol(parameter_name) for parameter_name in fit.determined]
     return Table.of(
         "correlations",
         "Correlations of the parameters on an exactly uniform beam, "
         f"type {whole_record.headline.name}",
         (
             Column("Parameter", "parameter", TEXT_FORMAT),
-            *(Column(symbol, name) for symbol, name in zip(symbols, fit.determined, strict=True)),
+            *(
+                Column(parameter_symbol, parameter_name)
+                for parameter_symbol, parameter_name in zip(
+                    parameter_symbols, fit.determined, strict=True
+                )
+            ),
         ),
         (
-            (Cell(name, symbol), *(_correlation_cell(i == j, value) for j, value in enumerate(row)))
-            for i, (name, symbol, row) in enumerate(
-                zip(fit.determined, symbols, fit.correlation.tolist(), strict=True)
+            (
+                Cell(parameter_name, parameter_symbol),
+                *(
+                    _correlation_cell(i == j, correlation_value)
+                    for j, correlation_value in enumerate(row)
+                ),
+            )
+            for i, (parameter_name, parameter_symbol, row) in enumerate(
+                zip(fit.determined, parameter_symbols, fit.correlation.tolist(), strict=True)
             )
         ),
         ("For ζ, γ, ρ/EI and EI, of their logarithms. Bold: 0.9 or more.",),
@@ -377,32 +406,36 @@ def correlations_table(whole_record: WholeRecord) -> Table:
 
 
 def _parameter_row(
-    name: str,
+    parameter_name: str,
     parameter: ReportedValue,
-    values_with_scales: Mapping[str, ReportedValue],
+    parameters_with_scales: Mapping[str, ReportedValue],
     *,
     is_fixed: bool,
 ) -> tuple[Entry, ...]:
     """Return the row of a parameter in a table: symbol, meaning, unit, values and remark."""
-    symbol, meaning, unit, factor = _parameter_description(name)
-    cells = estimate_cells(
-        (parameter.value, parameter.std or None, *_interval_ends(parameter)), parameter.std, factor
+    parameter_symbol, parameter_meaning, unit_symbol, display_factor = _parameter_description(
+        parameter_name
     )
-    if values_with_scales:
+    value_cells = estimate_cells(
+        (parameter.value, parameter.std or None, *_interval_ends(parameter)),
+        parameter.std,
+        display_factor,
+    )
+    if parameters_with_scales:
         # A parameter that depends on no scale has the same interval with scales.
-        with_scale_uncertainty = values_with_scales.get(name, parameter)
-        cells += estimate_cells(
+        with_scale_uncertainty = parameters_with_scales.get(parameter_name, parameter)
+        value_cells += estimate_cells(
             (with_scale_uncertainty.std or None, *_interval_ends(with_scale_uncertainty)),
             with_scale_uncertainty.std,
-            factor,
+            display_factor,
         )
     if parameter.flag is not None:
-        cells = (mark_cell(cells[0]), *map(grey_cell, cells[1:]))
+        value_cells = (mark_cell(value_cells[0]), *map(grey_cell, value_cells[1:]))
     return (
-        Cell(name, symbol),
-        meaning,
-        _unit_cell(unit),
-        *cells,
+        Cell(parameter_name, parameter_symbol),
+        parameter_meaning,
+        _unit_cell(unit_symbol),
+        *value_cells,
         "fixed" if is_fixed else parameter.flag or "",
     )
 
@@ -413,64 +446,78 @@ _SI_UNITS: Final = {"µs": "s", "ms": "s", "g": "kg", "mm": "m", "ppm": "1", "%"
 
 def _unit_cell(unit_text: str) -> Cell:
     """Return the cell of a unit, with the SI unit for programs, whose numbers are in SI units."""
-    power, _, unit = unit_text.rpartition(" ")
-    return Cell(_SI_UNITS.get(unit_text, unit if power.startswith("1e") else unit_text), unit_text)
+    power_text, _, unit_symbol = unit_text.rpartition(" ")
+    return Cell(
+        _SI_UNITS.get(unit_text, unit_symbol if power_text.startswith("1e") else unit_text),
+        unit_text,
+    )
 
 
 def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tuple[Entry, ...]:
     """Return the table row of the loss factor of internal or external damping."""
-    size, internal = loss_factor.size, loss_factor.damping == "internal"
-    symbol = "ζ ω^α sin(απ/2)" if internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
-    flag = size.flag
+    loss_size, is_internal = loss_factor.size, loss_factor.damping == "internal"
+    loss_symbol = "ζ ω^α sin(απ/2)" if is_internal else "γ ω^λ sin(λπ/2) / (ρ/EI ω²)"
+    flag_text = loss_size.flag
     if loss_factor.omega_rad_s is None:
         # Without a pivot frequency the value is the coefficient for an order that was only assumed.
-        flag = flag or headline.parameters["zeta" if internal else "gamma"].flag
-        symbol = symbol[0]
-    value, std, low, high = _quantity_cells(size)
-    relative_std = number_cell(None if size.std is None else size.std / size.value, "#.2g", 100.0)
-    further_cells: tuple[Cell, ...] = (std, relative_std, low, high)
-    if flag is not None:
-        value, further_cells = mark_cell(value), tuple(map(grey_cell, further_cells))
-    return (loss_factor.damping, symbol, loss_factor.omega_rad_s, value, *further_cells)
+        flag_text = flag_text or headline.parameters["zeta" if is_internal else "gamma"].flag
+        loss_symbol = loss_symbol[0]
+    value_cell, std_cell, low_cell, high_cell = _quantity_cells(loss_size)
+    relative_std = number_cell(
+        None if loss_size.std is None else loss_size.std / loss_size.value, "#.2g", 100.0
+    )
+    further_cells: tuple[Cell, ...] = (std_cell, relative_std, low_cell, high_cell)
+    if flag_text is not None:
+        value_cell, further_cells = mark_cell(value_cell), tuple(map(grey_cell, further_cells))
+    return (loss_factor.damping, loss_symbol, loss_factor.omega_rad_s, value_cell, *further_cells)
 
 
-def _quantity_cells(quantity: ReportedValue, factor: float = 1.0) -> tuple[Cell, ...]:
+def _quantity_cells(reported_value: ReportedValue, display_factor: float = 1.0) -> tuple[Cell, ...]:
     """Return the cells of a quantity, its standard deviation and the ends of its interval."""
     return estimate_cells(
-        (quantity.value, quantity.std, *_interval_ends(quantity)), quantity.std, factor
+        (reported_value.value, reported_value.std, *_interval_ends(reported_value)),
+        reported_value.std,
+        display_factor,
     )
 
 
-def _interval_ends(quantity: ReportedValue) -> tuple[float | None, float | None]:
+def _interval_ends(reported_value: ReportedValue) -> tuple[float | None, float | None]:
     """Return the ends of a quantity's 95 % interval; None twice without an interval."""
-    return quantity.interval_95 or (None, None)
+    return reported_value.interval_95 or (None, None)
 
 
-def _reason_notes(quantities: Iterable[ReportedValue]) -> tuple[str, ...]:
-    """Return a note for each reason for which quantities are marked."""
-    reasons = dict.fromkeys(quantity.flag for quantity in quantities if quantity.flag is not None)
-    return tuple(f"{NOT_REPORTED_MARK} {reason}." for reason in reasons)
+def _reason_notes(reported_values: Iterable[ReportedValue]) -> tuple[str, ...]:
+    """Return one note for each different reason for which values are marked as not reported."""
+    flag_texts = dict.fromkeys(
+        reported_value.flag for reported_value in reported_values if reported_value.flag is not None
+    )
+    return tuple(f"{NOT_REPORTED_MARK} {flag_text}." for flag_text in flag_texts)
 
 
-def _parameter_description(name: str) -> tuple[str, str, str, float]:
+def _parameter_description(parameter_name: str) -> tuple[str, str, str, float]:
     """Return the symbol, meaning, unit and factor of a parameter."""
-    default = (_parameter_symbol(name), "stiffness beyond the uniform beam's", "%", 100.0)
-    return QUANTITIES.get(name, default)
+    default_description = (
+        _parameter_symbol(parameter_name),
+        "stiffness beyond the uniform beam's",
+        "%",
+        100.0,
+    )
+    return QUANTITIES.get(parameter_name, default_description)
 
 
-def _parameter_symbol(name: str) -> str:
+def _parameter_symbol(parameter_name: str) -> str:
     """Return the symbol of a parameter; of a stiffness correction, δ and the mode's number."""
-    if name in QUANTITIES:
-        return QUANTITIES[name][0]
-    return f"δ{name.rsplit('_', 1)[-1]}"
+    if parameter_name in QUANTITIES:
+        return QUANTITIES[parameter_name][0]
+    return f"δ{parameter_name.rsplit('_', 1)[-1]}"
 
 
-def _correlation_cell(is_diagonal: bool, value: float) -> Cell:
+def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:
     """Return the cell of a correlation, in bold if it is strong and of two different parameters."""
-    cell = number_cell(value, ".3f")
-    if is_diagonal or abs(value) < _STRONG_CORRELATION:
-        return cell
-    return replace(cell, strong=True)
+    correlation_cell = number_cell(correlation_value, ".3f")
+    if is_diagonal or abs(correlation_value) < _STRONG_CORRELATION:
+        return correlation_cell
+    return replace(correlation_cell, strong=True)
 
 
 def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
@@ -478,11 +525,13 @@ def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     damping_by_amplitude = whole_record.verdict.damping_with_amplitude
     if not damping_by_amplitude:
         return ()
-    rows: list[tuple[Entry, ...]] = []
+    table_rows: list[tuple[Entry, ...]] = []
     for at in damping_by_amplitude:
-        ratio, std, half_width = at.damping_ratio, at.std, NORMAL_95 * at.std
-        cells = estimate_cells((ratio, std, ratio - half_width, ratio + half_width), std, 100.0)
-        rows.append((at.mode, at.tip_amplitude_m, *cells))
+        damping_ratio, std, half_width = at.damping_ratio, at.std, NORMAL_95 * at.std
+        ratio_cells = estimate_cells(
+            (damping_ratio, std, damping_ratio - half_width, damping_ratio + half_width), std, 100.0
+        )
+        table_rows.append((at.mode, at.tip_amplitude_m, *ratio_cells))
     return (
         Table.of(
             "damping_with_amplitude",
@@ -495,7 +544,7 @@ def amplitude_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
                 Column("95 % from (%)", "damping_ratio_low_95"),
                 Column("to (%)", "damping_ratio_high_95"),
             ),
-            rows,
+            table_rows,
             ("Amplitude 0 is the beam without air, as in the table of the modes.",),
         ),
     )

@@ -160,14 +160,14 @@ class ChartPage:
 
 
 def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
-    """Return the pages of the Welch fits: the measured response, then one for each model type."""
-    magnitude = _magnitude_axis(analysis)
+    """Return the charts of the Welch fits, with one tab for the measured response and each type."""
+    level_axis = _magnitude_axis(analysis)
     keys_by_weighting = line_keys(analysis.settings.weightings)
     return (
-        _measured_page(analysis, magnitude),
+        _measured_page(analysis, level_axis),
         *(
-            _type_page(analysis, name, magnitude, keys_by_weighting)
-            for name in analysis.settings.types
+            _type_page(analysis, type_name, level_axis, keys_by_weighting)
+            for type_name in analysis.settings.types
         ),
     )
 
@@ -175,91 +175,104 @@ def welch_pages(analysis: WelchAnalysis) -> tuple[ChartPage, ...]:
 def line_keys(weightings: tuple[str, ...]) -> dict[str, LegendEntry]:
     """Return label and line style of the fitted models, by the weighting of the fit."""
     further_lines = cycle(_FURTHER_LINES)
-    keys_by_weighting = {
-        name: _LINES_BY_WEIGHTING.get(name) or next(further_lines) for name in weightings
+    entry_by_weighting = {
+        weighting_name: _LINES_BY_WEIGHTING.get(weighting_name) or next(further_lines)
+        for weighting_name in weightings
     }
     return {
-        name: LegendEntry(f"model, weights {name}", color, width)
-        for name, (color, width) in keys_by_weighting.items()
+        weighting_name: LegendEntry(f"model, weights {weighting_name}", line_color, line_width)
+        for weighting_name, (line_color, line_width) in entry_by_weighting.items()
     }
 
 
-def draw_welch_fits(analysis: WelchAnalysis, tables: str, stream: RecordingStream) -> None:
-    """Draw all pages of the Welch fits, which are the same at any time of the session.
+def draw_welch_fits(analysis: WelchAnalysis, tables_markdown: str, stream: RecordingStream) -> None:
+    """Send the charts and tables of the Welch fits to Rerun, independent of the session's time.
 
     Parameters
     ----------
     analysis
         Welch fits of the session.
-    tables
+    tables_markdown
         Tables of the fits as plain text.
     stream
         Recording to draw into.
     """
-    for page in welch_pages(analysis):
-        _draw_page(page, stream)
-    _draw_text(TABLES_ENTITY, f"```\n{tables}\n```", stream)
+    for fit_page in welch_pages(analysis):
+        _draw_page(fit_page, stream)
+    _draw_text(TABLES_ENTITY, f"```\n{tables_markdown}\n```", stream)
 
 
 def welch_fits_tab(analysis: WelchAnalysis) -> rrb.Container:
     """Return the tab of the Welch fits, which contains tabs for each page and for the tables."""
     import rerun.blueprint as rrb
 
-    tables = rrb.TextDocumentView(name=TABLES_TITLE, origin=TABLES_ENTITY)
-    return rrb.Tabs(*map(_page_view, welch_pages(analysis)), tables, name=FITS_TITLE)
+    tables_view = rrb.TextDocumentView(name=TABLES_TITLE, origin=TABLES_ENTITY)
+    return rrb.Tabs(*map(_page_view, welch_pages(analysis)), tables_view, name=FITS_TITLE)
 
 
-def _draw_page(page: ChartPage, stream: RecordingStream) -> None:
-    """Draw the charts of a page with their curves, reduced to the pixels of a view."""
-    thinning = CurveDecimation.logarithmic(page.frequency_hz, *page.band_hz, _FREQUENCY_GROUPS)
-    for graph in page.graphs:
+def _draw_page(fit_page: ChartPage, stream: RecordingStream) -> None:
+    """Draw the three charts of a tab with their curves, which are decimated for the screen."""
+    decimation = CurveDecimation.logarithmic(
+        fit_page.frequency_hz, *fit_page.band_hz, _FREQUENCY_GROUPS
+    )
+    for graph in fit_page.graphs:
         graph.chart.draw_frame(stream)
-        for order, curve in enumerate(graph.curves):
-            strips = thinning.strips(curve.values)
+        for curve_order, curve in enumerate(graph.curves):
+            curve_strips = decimation.strips(curve.values)
             graph.chart.draw_curve(
-                stream, curve.name, strips, curve.key, static=True, dotted=curve.dotted, order=order
+                stream,
+                curve.name,
+                curve_strips,
+                curve.key,
+                static=True,
+                dotted=curve.dotted,
+                curve_order=curve_order,
             )
 
 
-def _draw_text(entity: str, text: str, stream: RecordingStream) -> None:
+def _draw_text(entity_path: str, markdown_text: str, stream: RecordingStream) -> None:
     """Send a Markdown text that is the same at any time of the session."""
     import rerun as rr
 
-    document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
-    stream.log(entity, document, static=True)
+    text_document = rr.TextDocument(markdown_text, media_type=rr.MediaType.MARKDOWN)
+    stream.log(entity_path, text_document, static=True)
 
 
-def _page_view(page: ChartPage) -> rrb.Container:
-    """Return the tab of a page: a wide chart above two narrow ones."""
+def _page_view(fit_page: ChartPage) -> rrb.Container:
+    """Return the tab with the three charts of `fit_page`: a wide one above two narrow ones."""
 
     def view(graph: Graph) -> rrb.Spatial2DView:
-        chart = graph.chart
-        return chart_view(graph.title, chart.entity, (chart.width, chart.height))
+        graph_chart = graph.chart
+        return chart_view(graph.title, graph_chart.entity, (graph_chart.width, graph_chart.height))
 
-    return chart_page(*map(view, page.graphs), name=page.title)
+    return chart_page(*map(view, fit_page.graphs), tab_title=fit_page.title)
 
 
-def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
-    """Return the page of the measured response: magnitude, phase and coherence."""
+def _measured_page(analysis: WelchAnalysis, level_axis: Axis) -> ChartPage:
+    """Return the charts of the measured response for one tab: magnitude, phase and coherence."""
     response, band_hz = analysis.response, analysis.settings.band_hz
     coherence = response.coherence
     if coherence is None:
         coherence = np.full(response.frequency_hz.shape, np.nan)
-    entity = f"{FITS_ENTITY}/measured"
+    page_entity = f"{FITS_ENTITY}/measured"
     return ChartPage(
         MEASURED_TITLE,
         (
             Graph(
                 "Magnitude of torque over angle, as estimated for the fits",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY
+                    f"{page_entity}/magnitude",
+                    _WIDE_CHART_SIZE,
+                    band_hz,
+                    level_axis,
+                    MEASURED_ENTRY,
                 ),
                 (ChartCurve("measured", MEASURED_ENTRY, magnitude_db(response.response)),),
             ),
             Graph(
                 "Phase of torque over angle",
                 response_chart(
-                    f"{entity}/phase", _NARROW_CHART_SIZE, band_hz, PHASE_AXIS, MEASURED_ENTRY
+                    f"{page_entity}/phase", _NARROW_CHART_SIZE, band_hz, PHASE_AXIS, MEASURED_ENTRY
                 ),
                 (
                     ChartCurve(
@@ -270,7 +283,7 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
             Graph(
                 "Coherence of angle and torque",
                 response_chart(
-                    f"{entity}/coherence",
+                    f"{page_entity}/coherence",
                     _NARROW_CHART_SIZE,
                     band_hz,
                     COHERENCE_AXIS,
@@ -285,42 +298,45 @@ def _measured_page(analysis: WelchAnalysis, magnitude: Axis) -> ChartPage:
 
 
 def _type_page(
-    analysis: WelchAnalysis, name: str, magnitude: Axis, keys_by_weighting: dict[str, LegendEntry]
+    analysis: WelchAnalysis,
+    type_name: str,
+    level_axis: Axis,
+    entry_by_weighting: dict[str, LegendEntry],
 ) -> ChartPage:
-    """Return the page of a model type: magnitude, phase and residuals of its models."""
-    models = [model for model in analysis.models if model.fit.structure.name == name]
-    keys = [keys_by_weighting[model.fit.weighting] for model in models]
+    """Return the charts of one damping type for one tab: magnitude, phase and residuals."""
+    models = [model for model in analysis.models if model.fit.structure.name == type_name]
+    legend_entries = [entry_by_weighting[model.fit.weighting] for model in models]
     # Short labels on the narrow charts, because long ones would overlap the axis title.
     label_format = "weights {}" if len(models) <= _MOST_MODELS_WITH_LONG_LABEL else "{}"
-    short_keys = [
+    short_entries = [
         replace(key, label=label_format.format(model.fit.weighting))
-        for key, model in zip(keys, models, strict=True)
+        for key, model in zip(legend_entries, models, strict=True)
     ]
     measured_frf, band_hz = analysis.response.response, analysis.settings.band_hz
-    entity = f"{FITS_ENTITY}/type_{name}"
+    page_entity = f"{FITS_ENTITY}/type_{type_name}"
 
-    def model_curves(values: Callable[[FittedModel], Real]) -> list[ChartCurve]:
+    def model_curves(values_of_model: Callable[[FittedModel], Real]) -> list[ChartCurve]:
         return [
-            ChartCurve(_entity_name(model.fit.weighting), key, values(model))
-            for key, model in zip(keys, models, strict=True)
+            ChartCurve(_entity_name(model.fit.weighting), key, values_of_model(model))
+            for key, model in zip(legend_entries, models, strict=True)
         ]
 
-    scores = "; ".join(
+    score_text = "; ".join(
         f"{model.fit.weighting}: MSE {model.indices.mse:.3g}, WMSE {model.indices.wmse:.3g}"
         for model in models
     )
     return ChartPage(
-        f"Type {name}",
+        f"Type {type_name}",
         (
             Graph(
-                f"Magnitude, type {name} ({scores})",
+                f"Magnitude, type {type_name} ({score_text})",
                 response_chart(
-                    f"{entity}/magnitude",
+                    f"{page_entity}/magnitude",
                     _WIDE_CHART_SIZE,
                     band_hz,
-                    magnitude,
+                    level_axis,
                     MEASURED_ENTRY,
-                    *keys,
+                    *legend_entries,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
@@ -330,12 +346,12 @@ def _type_page(
             Graph(
                 "Phase",
                 response_chart(
-                    f"{entity}/phase",
+                    f"{page_entity}/phase",
                     _NARROW_CHART_SIZE,
                     band_hz,
                     PHASE_AXIS,
                     MEASURED_ENTRY,
-                    *short_keys,
+                    *short_entries,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
@@ -345,12 +361,12 @@ def _type_page(
             Graph(
                 "Residual, measured − model",
                 response_chart(
-                    f"{entity}/residual",
+                    f"{page_entity}/residual",
                     _NARROW_CHART_SIZE,
                     band_hz,
-                    magnitude,
+                    level_axis,
                     _MEASURED_MAGNITUDE_ENTRY,
-                    *short_keys,
+                    *short_entries,
                 ),
                 (
                     ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
@@ -374,18 +390,21 @@ def _magnitude_axis(analysis: WelchAnalysis) -> Axis:
     )
 
 
-def _axis_of_responses(measured_frf: Complex, models: Sequence[Complex]) -> Axis:
+def _axis_of_responses(measured_frf: Complex, modelled_frf: Sequence[Complex]) -> Axis:
     """Return a magnitude axis for measured and modelled responses, and for their residuals."""
-    responses = [measured_frf, *models]
-    measured_and_residuals = [measured_frf, *(measured_frf - model for model in models)]
+    responses = [measured_frf, *modelled_frf]
+    measured_and_residuals = [measured_frf, *(measured_frf - model for model in modelled_frf)]
     return magnitude_axis(
-        min(float(np.nanquantile(magnitude_db(values), 0.02)) for values in measured_and_residuals),
-        max(float(np.nanmax(magnitude_db(values))) for values in responses) + 3.0,
+        min(
+            float(np.nanquantile(magnitude_db(frf_values), 0.02))
+            for frf_values in measured_and_residuals
+        ),
+        max(float(np.nanmax(magnitude_db(frf_values))) for frf_values in responses) + 3.0,
     )
 
 
 def _entity_name(weighting: str) -> str:
-    """Return the name of a weighting in a form that an entity path can contain."""
+    """Return the name of a fit's weighting in a form that an entity path of Rerun can contain."""
     return "model_" + "".join(c if c.isalnum() else "_" for c in weighting)
 
 
@@ -441,7 +460,7 @@ _PLOTS_OVER_TIME: Final = (
 
 
 def record_page(whole_record: WholeRecord) -> ChartPage:
-    """Return the page with the response and residual of the whole record's displayed model.
+    """Return the charts of response and residual of the whole record's displayed model.
 
     The measured response is the ratio of the whole record's transforms, without the model's delay.
     """
@@ -453,15 +472,15 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
     )
     grid_hz = measured_with_delay.frequency_hz
     delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
-    measured_frf, model = (
+    measured_frf, model_response = (
         measured_with_delay.response * delay_phasor,
         shown_model.band(grid_hz).response,
     )
     band_hz = float(grid_hz[0]), float(grid_hz[-1])
-    magnitude = _axis_of_responses(measured_frf, [model])
-    key, name = LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
-    short_key = replace(key, label="model")
-    entity = f"{RECORD_ENTITY}/response"
+    level_axis = _axis_of_responses(measured_frf, [model_response])
+    key, curve_name = LegendEntry(shown_model.name.removeprefix("the "), ORANGE, 2.0), "model"
+    short_entry = replace(key, label="model")
+    page_entity = f"{RECORD_ENTITY}/response"
     return ChartPage(
         "Response",
         (
@@ -469,41 +488,46 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
                 "Magnitude of torque over angle, whole record, "
                 f"{shown_model.name.removeprefix('the ')}",
                 response_chart(
-                    f"{entity}/magnitude", _WIDE_CHART_SIZE, band_hz, magnitude, MEASURED_ENTRY, key
+                    f"{page_entity}/magnitude",
+                    _WIDE_CHART_SIZE,
+                    band_hz,
+                    level_axis,
+                    MEASURED_ENTRY,
+                    key,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, magnitude_db(measured_frf)),
-                    ChartCurve(name, key, magnitude_db(model)),
+                    ChartCurve(curve_name, key, magnitude_db(model_response)),
                 ),
             ),
             Graph(
                 "Phase",
                 response_chart(
-                    f"{entity}/phase",
+                    f"{page_entity}/phase",
                     _NARROW_CHART_SIZE,
                     band_hz,
                     PHASE_AXIS,
                     MEASURED_ENTRY,
-                    short_key,
+                    short_entry,
                 ),
                 (
                     ChartCurve("measured", MEASURED_ENTRY, phase_deg(measured_frf), dotted=True),
-                    ChartCurve(name, key, phase_deg(model)),
+                    ChartCurve(curve_name, key, phase_deg(model_response)),
                 ),
             ),
             Graph(
                 "Residual, measured − model",
                 response_chart(
-                    f"{entity}/residual",
+                    f"{page_entity}/residual",
                     _NARROW_CHART_SIZE,
                     band_hz,
-                    magnitude,
+                    level_axis,
                     _MEASURED_MAGNITUDE_ENTRY,
-                    short_key,
+                    short_entry,
                 ),
                 (
                     ChartCurve("measured", _MEASURED_MAGNITUDE_ENTRY, magnitude_db(measured_frf)),
-                    ChartCurve(name, key, magnitude_db(measured_frf - model)),
+                    ChartCurve(curve_name, key, magnitude_db(measured_frf - model_response)),
                 ),
             ),
         ),
@@ -513,7 +537,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
 
 
 def draw_record(
-    whole_record: WholeRecord, torque: TorqueInBand, tables: str, stream: RecordingStream
+    whole_record: WholeRecord, torque: TorqueInBand, tables_markdown: str, stream: RecordingStream
 ) -> None:
     """Draw the results of the whole record: verdict, response, and torque over time.
 
@@ -523,21 +547,25 @@ def draw_record(
         Whole record with its fits.
     torque
         Measured torque, and the torque of the displayed model.
-    tables
+    tables_markdown
         Tables of the record as plain text.
     stream
         Recording to draw into.
     """
-    sentences = [
+    verdict_sentences = [
         *(f"**{sentence}**" for sentence in damping_sentences(whole_record.headline)),
         *whole_record.verdict.sentences,
         *(f"* {advice}" for advice in whole_record.verdict.experiments),
     ]
-    _draw_text(VERDICT_ENTITY, "\n\n".join((*sentences, f"```\n{tables}\n```")), stream)
+    _draw_text(
+        VERDICT_ENTITY, "\n\n".join((*verdict_sentences, f"```\n{tables_markdown}\n```")), stream
+    )
     _draw_page(record_page(whole_record), stream)
     t_ns = np.round(1e9 * whole_record.record.time_s).astype(np.int64)
-    for lines in _PLOTS_OVER_TIME:
-        send_columns(stream, lines.entity, t_ns, {_SCALARS_COMPONENT: lines.values(torque)})
+    for plot_lines in _PLOTS_OVER_TIME:
+        send_columns(
+            stream, plot_lines.entity, t_ns, {_SCALARS_COMPONENT: plot_lines.values(torque)}
+        )
 
 
 def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container:
@@ -550,8 +578,8 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
         _page_view(record_page(whole_record)),
         rrb.Vertical(
             *(
-                _lines_view(lines, end_s, float(np.abs(lines.values(torque)).max()))
-                for lines in _PLOTS_OVER_TIME
+                _lines_view(plot_lines, end_s, float(np.abs(plot_lines.values(torque)).max()))
+                for plot_lines in _PLOTS_OVER_TIME
             ),
             name=TORQUE_TITLE,
         ),
@@ -559,28 +587,28 @@ def record_tab(whole_record: WholeRecord, torque: TorqueInBand) -> rrb.Container
     )
 
 
-def _lines_view(lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSeriesView:
+def _lines_view(plot_lines: Lines, end_s: float, largest_value: float) -> rrb.TimeSeriesView:
     """Return a plot over the whole session, independent of the current time."""
     import rerun as rr
     import rerun.blueprint as rrb
 
-    start = rrb.TimeRangeBoundary.absolute(seconds=0.0)
-    end = rrb.TimeRangeBoundary.absolute(seconds=end_s)
+    start_boundary = rrb.TimeRangeBoundary.absolute(seconds=0.0)
+    end_boundary = rrb.TimeRangeBoundary.absolute(seconds=end_s)
     series_style = rr.SeriesLines(
-        names=lines.names,
-        colors=lines.colors,
-        widths=lines.widths,
+        names=plot_lines.names,
+        colors=plot_lines.colors,
+        widths=plot_lines.widths,
         # The default averages the values of a pixel, which understates peaks.
         aggregation_policy="MinMax",
     )
     return rrb.TimeSeriesView(
-        name=lines.title,
-        origin=lines.entity,
-        overrides={lines.entity: series_style},
-        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(lines.names) > 1),
-        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        name=plot_lines.title,
+        origin=plot_lines.entity,
+        overrides={plot_lines.entity: series_style},
+        plot_legend=rrb.PlotLegend(corner="LeftTop", visible=len(plot_lines.names) > 1),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start_boundary, end=end_boundary)),
         axis_y=rrb.ScalarAxis(range=_labelled_axis_range(largest_value)),
-        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start_boundary, end=end_boundary),
     )
 
 
@@ -589,9 +617,13 @@ def _labelled_axis_range(largest_value: float) -> tuple[float, float]:
 
     Rerun labels multiples of a power of ten if there is room for all of them.
     """
-    step = 10.0 ** np.floor(np.log10(max(largest_value, 1e-12)))
-    end = 1.1 * largest_value if largest_value < _MOST_LABELS_PER_SIDE * step else 11.0 * step
-    return -end, end
+    label_step = 10.0 ** np.floor(np.log10(max(largest_value, 1e-12)))
+    axis_end = (
+        1.1 * largest_value
+        if largest_value < _MOST_LABELS_PER_SIDE * label_step
+        else 11.0 * label_step
+    )
+    return -axis_end, axis_end
 
 
 # File
@@ -624,7 +656,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
     """
     from rigd.view import draw_session
 
-    whole_record, welch_analysis, tabs = result.whole, result.welch, []
+    whole_record, welch_analysis, result_tabs = result.whole, result.welch, []
     if whole_record is not None:
         from analysis.report._signal_figures import torque_in_band
 
@@ -633,14 +665,14 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
             ShownModel.of(whole_record.headline, whole_record.record).transfer,
             whole_record.band_hz[1],
         )
-        tabs.append(record_tab(whole_record, torque))
+        result_tabs.append(record_tab(whole_record, torque))
     if welch_analysis is not None:
-        tabs.append(welch_fits_tab(welch_analysis))
-    session = read_session(result.record.path)
-    timings = read_timings(result.record.path)
+        result_tabs.append(welch_fits_tab(welch_analysis))
+    recorded_session = read_session(result.record.path)
+    tick_timings = read_timings(result.record.path)
     try:
         with new_rrd_file(path) as stream:
-            draw_session(stream, session, timings, front=tabs)
+            draw_session(stream, recorded_session, tick_timings, front_tabs=result_tabs)
             if whole_record is not None:
                 draw_record(whole_record, torque, as_text(record_tables(whole_record)), stream)
             if welch_analysis is not None:

@@ -22,7 +22,7 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the scales: which uncertainties the intervals include, and which not."""
     if not parameters_compensate_scales(whole_record.fit):
-        held_parameters = ", ".join(QUANTITIES[name][0] for name in whole_record.fixed)
+        held_parameters = ", ".join(QUANTITIES[scale_key][0] for scale_key in whole_record.fixed)
         yield (
             f"Intervals are statistical only: the file's values of {held_parameters}, "
             "which were held, the torque scale and the length are assumed exact."
@@ -30,12 +30,14 @@ def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
         return
     stated_uncertainty = whole_record.record.uncertainty
     known_scales = [
-        f"{scale_name} {100 * stated_uncertainty[name]:.3g} %"
-        for name, scale_name in _SCALE_NAMES.items()
-        if name in stated_uncertainty
+        f"{scale_name} {100 * stated_uncertainty[scale_key]:.3g} %"
+        for scale_key, scale_name in _SCALE_NAMES.items()
+        if scale_key in stated_uncertainty
     ]
     unknown_scales = [
-        scale_name for name, scale_name in _SCALE_NAMES.items() if name not in stated_uncertainty
+        scale_name
+        for scale_key, scale_name in _SCALE_NAMES.items()
+        if scale_key not in stated_uncertainty
     ]
     if known_scales:
         yield (
@@ -51,41 +53,42 @@ def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
         f"A wrong scale shows as {_scale_dependence(whole_record)}; no other parameter depends on "
         "these, and none on the stated density."
     )
-    density = density_check(
+    density_result = density_check(
         whole_record.fit, whole_record.record.beam.density_kg_per_m, stated_uncertainty
     )
-    if density is None:
+    if density_result is None:
         return
-    pairs = (
-        (density.found_kg_per_m, density.found_std_kg_per_m),
-        (density.stated_kg_per_m, density.stated_std_kg_per_m),
+    value_std_pairs = (
+        (density_result.found_kg_per_m, density_result.found_std_kg_per_m),
+        (density_result.stated_kg_per_m, density_result.stated_std_kg_per_m),
     )
-    (value, std), (stated_value, stated_std) = (
-        estimate_cells(pair, pair[1], 1e3) for pair in pairs
+    (found_value, found_std), (stated_value, stated_std) = (
+        estimate_cells(value_std_pair, value_std_pair[1], 1e3) for value_std_pair in value_std_pairs
     )
     yield (
-        f"Mass per length from the record, ρ/EI times EI: {value.text} ± {std.text} g/m (std); "
-        f"stated: {stated_value.text} ± {stated_std.text} g/m. "
+        f"Mass per length from the record, ρ/EI times EI: {found_value.text} ± {found_std.text} "
+        f"g/m (std); stated: {stated_value.text} ± {stated_std.text} g/m. "
         + (
             "They agree."
-            if density.agree
+            if density_result.agree
             else "The difference is significant (95 %): check torque scale and length."
         )
     )
 
 
 def _scale_dependence(whole_record: WholeRecord) -> str:
-    """Return how each parameter depends on the scales, as a list of powers."""
+    """Return as text how each parameter depends on the scales, as products of their powers."""
     return ", ".join(
-        f"{QUANTITIES[name][0]} ∝ {_product_text(SCALE_EXPONENTS[name])}"
-        for name in whole_record.headline.parameters
-        if name in SCALE_EXPONENTS
+        f"{QUANTITIES[parameter_name][0]} ∝ {_product_text(SCALE_EXPONENTS[parameter_name])}"
+        for parameter_name in whole_record.headline.parameters
+        if parameter_name in SCALE_EXPONENTS
     )
 
 
 def _product_text(exponents: Mapping[str, int]) -> str:
     """Return a product of powers of scales as text."""
     return " · ".join(
-        _SCALE_NAMES[scale] + ("" if power == 1 else str(power).translate(_SUPERSCRIPTS))
-        for scale, power in exponents.items()
+        _SCALE_NAMES[scale_name]
+        + ("" if scale_power == 1 else str(scale_power).translate(_SUPERSCRIPTS))
+        for scale_name, scale_power in exponents.items()
     )

@@ -78,7 +78,10 @@ class ShownModel:
 
     @property
     def delay_s(self) -> float:
-        """Delay to remove from the response: the fitted one of a beam, else the file's."""
+        """Delay of the torque channel in s, which is removed from the displayed response.
+
+        It is fitted for a beam model. For a modal model it is the delay that the file states.
+        """
         return self.beam.parameters["delay_s"] if self.modal is None else self.stated_delay_s
 
     def band(self, frequency_hz: Real) -> ResponseBand:
@@ -94,7 +97,7 @@ class ShownModel:
         return modal_response_band(self.modal, frequency_hz, self.delay_s)
 
     def compared(self, analysis: RecordAnalysis) -> RecordAnalysis:
-        """Return the record's analysis with the noise and the bins of this model's residual.
+        """Return a record's analysis with the noise density and the bins of this model's residual.
 
         Parameters
         ----------
@@ -106,7 +109,7 @@ class ShownModel:
         return RecordAnalysis.of(analysis.fits, self.modal.noise, analysis.comparison)
 
     def fit_percent(self, analysis: RecordAnalysis) -> float:
-        """Return the fit to the measured torque in the band, in percent (NRMSE).
+        """Return how well the model reproduces the measured torque in the band, in percent.
 
         Parameters
         ----------

@@ -59,25 +59,27 @@ class RecordInterval:
     last_s: float
 
 
-def resonance_intervals(record: Record, count: int) -> tuple[RecordInterval, ...]:
+def resonance_intervals(record: Record, mode_count: int) -> tuple[RecordInterval, ...]:
     """Return the interval in which each mode below the Nyquist frequency vibrates most."""
     duration_s = len(record.time_s) / record.rate_hz
     intervals = []
-    modes_hz = undamped_frequencies_rad_s(record.beam, count) / (2 * math.pi)
-    for number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
+    modes_hz = undamped_frequencies_rad_s(record.beam, mode_count) / (2 * math.pi)
+    for mode_number, frequency_hz in enumerate(modes_hz.tolist(), start=1):
         if frequency_hz >= record.rate_hz / 2:
             break
-        centre_s = largest_oscillation_time_s(record.torque_nm, record.rate_hz, frequency_hz)
-        length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
-        length_s = max(length_s, _LEAST_DETAIL_S)
-        samples = min(round(length_s * record.rate_hz), len(record.time_s))
-        first_sample = round((centre_s - length_s / 2) * record.rate_hz)
-        first_sample = min(max(first_sample, 0), len(record.time_s) - samples)
-        sample_range = slice(first_sample, first_sample + samples)
+        interval_centre_s = largest_oscillation_time_s(
+            record.torque_nm, record.rate_hz, frequency_hz
+        )
+        interval_length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
+        interval_length_s = max(interval_length_s, _LEAST_DETAIL_S)
+        sample_count = min(round(interval_length_s * record.rate_hz), len(record.time_s))
+        first_sample = round((interval_centre_s - interval_length_s / 2) * record.rate_hz)
+        first_sample = min(max(first_sample, 0), len(record.time_s) - sample_count)
+        sample_range = slice(first_sample, first_sample + sample_count)
         times_s = record.time_s[sample_range]
         intervals.append(
             RecordInterval(
-                name=f"Mode {number}, {frequency_hz:.3g} Hz",
+                name=f"Mode {mode_number}, {frequency_hz:.3g} Hz",
                 samples=sample_range,
                 first_s=float(times_s[0]),
                 last_s=float(times_s[-1]),
@@ -88,20 +90,20 @@ def resonance_intervals(record: Record, count: int) -> tuple[RecordInterval, ...
 
 def shade_intervals(axes: Axes, intervals: tuple[RecordInterval, ...]) -> None:
     """Shade time intervals in the panel of the whole record and number them from 1."""
-    for number, interval in enumerate(intervals, start=1):
+    for interval_number, interval in enumerate(intervals, start=1):
         axes.axvspan(
             interval.first_s, interval.last_s, color=style.SHADE_COLOR, linewidth=0, zorder=0
         )
         axes.text(
-            (interval.first_s + interval.last_s) / 2, 1.01, str(number),
+            (interval.first_s + interval.last_s) / 2, 1.01, str(interval_number),
             transform=axes.get_xaxis_transform(), ha="center", va="bottom", fontsize=7.5,
             color="#8A7A4A",
         )  # fmt: skip
 
 
-def set_up_detail(axes: Axes, number: int, interval: RecordInterval) -> None:
+def set_up_detail(axes: Axes, interval_number: int, interval: RecordInterval) -> None:
     """Set title and time axis of an enlarged panel, with the number of its interval."""
-    axes.set_title(f"{number}  {interval.name}", fontsize=8.5, fontweight="normal")
+    axes.set_title(f"{interval_number}  {interval.name}", fontsize=8.5, fontweight="normal")
     axes.set_xlim(interval.first_s, interval.last_s)
     axes.set_facecolor("#FCFAF4")
 
@@ -131,9 +133,9 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     modelled_nm, _ = TorquePredictor(
         band_limited(angle, record.rate_hz, band_hz), record.rate_hz, all_samples
     ).torque(plant)
-    offset = float(np.mean(record.torque_nm - modelled_nm))
+    offset_nm = float(np.mean(record.torque_nm - modelled_nm))
     return TorqueInBand(
-        measured=band_limited(record.torque_nm - offset, record.rate_hz, band_hz),
+        measured=band_limited(record.torque_nm - offset_nm, record.rate_hz, band_hz),
         modelled=modelled_nm,
     )
 
@@ -152,15 +154,17 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     highest_hz : float
         Highest frequency of the fit's band.
     """
-    torque = torque_in_band(record, model.transfer, highest_hz)
+    shown_torque = torque_in_band(record, model.transfer, highest_hz)
     record_of_fitted_beam = replace(record, beam=model.beam.plant.beam)
-    modes = {mode.number: mode for mode in model.modes}
+    mode_by_number = {mode.number: mode for mode in model.modes}
     intervals = tuple(
-        replace(interval, name=f"Mode {number}, {modes[number].frequency_hz:.4g} Hz")
-        for number, interval in enumerate(
-            resonance_intervals(record_of_fitted_beam, max(modes, default=0)), start=1
+        replace(
+            interval, name=f"Mode {mode_number}, {mode_by_number[mode_number].frequency_hz:.4g} Hz"
         )
-        if number in modes
+        for mode_number, interval in enumerate(
+            resonance_intervals(record_of_fitted_beam, max(mode_by_number, default=0)), start=1
+        )
+        if mode_number in mode_by_number
     )
     figure = style.new_figure(9.0, 6.8)
     grid = figure.add_gridspec(
@@ -168,40 +172,51 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
         wspace=0.25, height_ratios=(4.0, 1.2),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))
-    angle, torque_axes, residual = (figure.add_subplot(upper_grid[row]) for row in range(3))
+    angle_axes, torque_axes, residual_axes = (
+        figure.add_subplot(upper_grid[row]) for row in range(3)
+    )
     angle_lines = (
         (1e3 * record.reference_rad, {"color": style.ORANGE, "label": "reference angle"}),
         (1e3 * record.angle_rad, _ANGLE_LINE | {"color": style.PURPLE, "label": "measured angle"}),
     )
     torque_lines = (
-        (torque.measured, _MEASURED_LINE | {"label": "measured torque"}),
-        (torque.modelled, _MODELLED_LINE | {"label": "modelled torque"}),
+        (shown_torque.measured, _MEASURED_LINE | {"label": "measured torque"}),
+        (shown_torque.modelled, _MODELLED_LINE | {"label": "modelled torque"}),
     )
-    _draw_whole_record(angle, record, angle_lines, "Motor angle", _ANGLE_LABEL, pad=14)
+    _draw_whole_record(angle_axes, record, angle_lines, "Motor angle", _ANGLE_LABEL, title_pad=14)
     _draw_whole_record(torque_axes, record, torque_lines, "Coupling torque", _TORQUE_LABEL)
     _draw_whole_record(
-        residual, record, ((torque.residual, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
+        residual_axes,
+        record,
+        ((shown_torque.residual, _RESIDUAL_LINE),),
+        _RESIDUAL_TITLE,
+        _TORQUE_LABEL,
     )
-    residual.set_xlabel("Time (s)", labelpad=1)
-    for axes in (angle, torque_axes, residual):
-        axes.tick_params(labelbottom=axes is residual)
-    shade_intervals(angle, intervals)
-    detail_signals = (torque.measured, torque.modelled, torque.residual)
-    for column, interval in enumerate(intervals):
-        axes = figure.add_subplot(grid[1, column])
+    residual_axes.set_xlabel("Time (s)", labelpad=1)
+    for axes in (angle_axes, torque_axes, residual_axes):
+        axes.tick_params(labelbottom=axes is residual_axes)
+    shade_intervals(angle_axes, intervals)
+    detail_signals = (shown_torque.measured, shown_torque.modelled, shown_torque.residual)
+    for panel_number, interval in enumerate(intervals):
+        axes = figure.add_subplot(grid[1, panel_number])
         axes.xaxis.set_major_locator(MaxNLocator(4))
         _draw_detail(
             axes,
             record,
             zip(detail_signals, _DETAIL_LINES, strict=True),
-            column,
+            panel_number,
             interval,
             _TORQUE_LABEL,
         )
         axes.set_xlabel("Time (s)", labelpad=1)
-    handles = [handle for axes in (angle, torque_axes, residual) for handle in axes.get_lines()]
+    legend_handles = [
+        legend_handle
+        for axes in (angle_axes, torque_axes, residual_axes)
+        for legend_handle in axes.get_lines()
+    ]
     figure.legend(
-        handles, [str(handle.get_label()) for handle in handles], loc="upper right",
+        legend_handles, [str(legend_handle.get_label()) for legend_handle in legend_handles],
+        loc="upper right",
         bbox_to_anchor=(0.985, 0.995), ncols=5, borderaxespad=0.0,
     )  # fmt: skip
     return figure
@@ -232,35 +247,35 @@ _DETAIL_LINES: Final[tuple[LineStyle, ...]] = (
 def _draw_whole_record(
     axes: Axes,
     record: Record,
-    lines: Iterable[StyledSignal],
-    title: str,
-    label: str,
-    pad: float | None = None,
+    styled_signals: Iterable[StyledSignal],
+    panel_title: str,
+    axis_label: str,
+    title_pad: float | None = None,
 ) -> None:
     """Draw signals over the whole record."""
-    decimated_line = tuple(lines)
-    for values, line_style in decimated_line:
-        axes.plot(*style.envelope(record.time_s, values), **line_style)
-    axes.set_title(title, pad=pad)
-    axes.set_ylabel(label)
-    axes.set_ylim(style.limits(*(values for values, _ in decimated_line)))
+    signal_list = tuple(styled_signals)
+    for signal_values, line_style in signal_list:
+        axes.plot(*style.envelope(record.time_s, signal_values), **line_style)
+    axes.set_title(panel_title, pad=title_pad)
+    axes.set_ylabel(axis_label)
+    axes.set_ylim(style.limits(*(signal_values for signal_values, _ in signal_list)))
     axes.set_xlim(record.time_s[0], record.time_s[-1])
 
 
 def _draw_detail(
     axes: Axes,
     record: Record,
-    lines: Iterable[StyledSignal],
-    column: int,
+    styled_signals: Iterable[StyledSignal],
+    panel_number: int,
     interval: RecordInterval,
-    label: str,
+    axis_label: str,
 ) -> None:
     """Draw signals in the enlarged panel of one interval. The first panel of a row has a legend."""
-    for values, line_style in lines:
-        axes.plot(record.time_s[interval.samples], values[interval.samples], **line_style)
-    set_up_detail(axes, column + 1, interval)
-    if column == 0:
-        axes.set_ylabel(label)
+    for signal_values, line_style in styled_signals:
+        axes.plot(record.time_s[interval.samples], signal_values[interval.samples], **line_style)
+    set_up_detail(axes, panel_number + 1, interval)
+    if panel_number == 0:
+        axes.set_ylabel(axis_label)
 
 
 def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
@@ -268,57 +283,63 @@ def paper_signals_figure(analysis: WelchAnalysis) -> Figure:
     record = analysis.record
     intervals = resonance_intervals(record, len(analysis.peaks))
     sweep_s = record.sweep_samples / record.rate_hz
-    parts = [
+    subtitle_parts = [
         record.metadata.get("excitation", "record"),
         f"sweep {sweep_s:.6g} s of {len(record.time_s) / record.rate_hz:.6g} s at "
         f"{record.rate_hz:g} Hz",
         f"outcome {record.outcome}",
     ]
     if record.gaps.missing_ticks:
-        parts.append(f"{record.gaps.missing_ticks} missing ticks interpolated")
-    figure = style.new_figure(13.0, 8.0, "Signals", "  ·  ".join(parts))
-    columns = max(len(intervals), 1)
+        subtitle_parts.append(f"{record.gaps.missing_ticks} missing ticks interpolated")
+    figure = style.new_figure(13.0, 8.0, "Signals", "  ·  ".join(subtitle_parts))
+    panel_columns = max(len(intervals), 1)
     grid = figure.add_gridspec(
-        4, columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
+        4, panel_columns, left=0.06, right=0.985, top=0.88, bottom=0.065, hspace=0.58, wspace=0.17,
         height_ratios=(1.25, 1.0, 1.25, 1.0),
     )  # fmt: skip
     reference_mrad, angle_mrad = 1e3 * record.reference_rad, 1e3 * record.angle_rad
-    angle, torque = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
+    angle_axes, torque_axes = figure.add_subplot(grid[0, :]), figure.add_subplot(grid[2, :])
     angle_lines = (
         (reference_mrad, {"color": style.ORANGE, "label": "reference"}),
         (angle_mrad, _ANGLE_LINE | {"color": style.BLUE, "label": "measured"}),
     )
-    _draw_whole_record(angle, record, angle_lines, "(a) Motor angle", _ANGLE_LABEL, pad=14)
-    angle.legend(loc="lower right", bbox_to_anchor=(1.0, 1.07), ncols=2, borderaxespad=0.0)
+    _draw_whole_record(
+        angle_axes, record, angle_lines, "(a) Motor angle", _ANGLE_LABEL, title_pad=14
+    )
+    angle_axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.07), ncols=2, borderaxespad=0.0)
     green_line = {"color": style.GREEN}
     torque_lines = ((record.torque_nm, _ANGLE_LINE | green_line),)
-    _draw_whole_record(torque, record, torque_lines, "(b) Coupling torque", _TORQUE_LABEL, pad=14)
-    for axes in (angle, torque):
+    _draw_whole_record(
+        torque_axes, record, torque_lines, "(b) Coupling torque", _TORQUE_LABEL, title_pad=14
+    )
+    for axes in (angle_axes, torque_axes):
         axes.set_xlabel("Time (s)", labelpad=1)
         shade_intervals(axes, intervals)
     detail_angle_lines = (
         (reference_mrad, {"color": style.ORANGE}),
         (angle_mrad, {"color": style.BLUE}),
     )
-    for column, interval in enumerate(intervals):
-        angle_detail = figure.add_subplot(grid[1, column])
-        _draw_detail(angle_detail, record, detail_angle_lines, column, interval, _ANGLE_LABEL)
-        torque_detail = figure.add_subplot(grid[3, column])
+    for panel_number, interval in enumerate(intervals):
+        angle_detail_axes = figure.add_subplot(grid[1, panel_number])
+        _draw_detail(
+            angle_detail_axes, record, detail_angle_lines, panel_number, interval, _ANGLE_LABEL
+        )
+        torque_detail_axes = figure.add_subplot(grid[3, panel_number])
         line_style = green_line | {"linewidth": 0.9}
         _draw_detail(
-            torque_detail,
+            torque_detail_axes,
             record,
             ((record.torque_nm, line_style),),
-            column,
+            panel_number,
             interval,
             _TORQUE_LABEL,
         )
-        torque_detail.set_xlabel("Time (s)", labelpad=1)
+        torque_detail_axes.set_xlabel("Time (s)", labelpad=1)
     return figure
 
 
 def best_model(analysis: WelchAnalysis) -> FittedModel:
-    """Return the fitted model with the lowest WMSE, by which the paper selects a model."""
+    """Return the fitted model with the lowest weighted mean square error (WMSE)."""
     return min(analysis.models, key=lambda model: model.indices.wmse)
 
 
@@ -329,16 +350,19 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
     noise, and the modelled torque is the encoder's quantisation.
     """
     record = analysis.record
-    model = best_model(analysis)
+    fitted_model = best_model(analysis)
     band_hz = (0.0, analysis.settings.band_hz[1])
-    modelled_nm = band_limited(modelled_torque(record, model.fit.damping), record.rate_hz, band_hz)
+    modelled_nm = band_limited(
+        modelled_torque(record, fitted_model.fit.damping), record.rate_hz, band_hz
+    )
     measured_nm = band_limited(record.torque_nm, record.rate_hz, band_hz)
     residual_nm = measured_nm - modelled_nm
     residual_fraction = _rms(residual_nm) / _rms(measured_nm) if measured_nm.any() else np.nan
     figure = style.new_figure(
         13.0, 8.0, "Torque, measured and modelled",
-        f"type {model.fit.structure.name}, weights {model.fit.weighting} (lowest WMSE)  ·  exact "
-        f"model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  residual "
+        f"type {fitted_model.fit.structure.name}, weights {fitted_model.fit.weighting} (lowest "
+        f"WMSE)  ·  exact model's response to the measured angle  ·  0 to {band_hz[1]:g} Hz  ·  "
+        "residual "
         f"{1e3 * _rms(residual_nm):.3g} mN·m rms, {100 * residual_fraction:.3g} % of the torque, "
         "the bias of Welch's estimate included",
     )  # fmt: skip
@@ -348,29 +372,34 @@ def torque_figure(analysis: WelchAnalysis) -> Figure:
         wspace=0.17, height_ratios=(1.7, 1.0),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(2, 1, hspace=0.2, height_ratios=(1.7, 1.0))
-    top, residual_axes = figure.add_subplot(upper_grid[0]), figure.add_subplot(upper_grid[1])
+    torque_axes, residual_axes = (
+        figure.add_subplot(upper_grid[0]),
+        figure.add_subplot(upper_grid[1]),
+    )
     torque_lines = ((measured_nm, _MEASURED_LINE), (modelled_nm, _MODELLED_LINE))
-    _draw_whole_record(top, record, torque_lines, "Whole record", _TORQUE_LABEL, pad=14)
-    top.tick_params(labelbottom=False)
+    _draw_whole_record(
+        torque_axes, record, torque_lines, "Whole record", _TORQUE_LABEL, title_pad=14
+    )
+    torque_axes.tick_params(labelbottom=False)
     _draw_whole_record(
         residual_axes, record, ((residual_nm, _RESIDUAL_LINE),), _RESIDUAL_TITLE, _TORQUE_LABEL
     )
     residual_axes.set_xlabel("Time (s)", labelpad=1)
-    shade_intervals(top, intervals)
-    styles = (_DETAIL_LINES[0], _DETAIL_LINES[1] | {"linewidth": 1.1}, _DETAIL_LINES[2])
-    detail_lines = tuple(zip((measured_nm, modelled_nm, residual_nm), styles, strict=True))
-    for column, interval in enumerate(intervals):
-        axes = figure.add_subplot(grid[1, column])
-        _draw_detail(axes, record, detail_lines, column, interval, _TORQUE_LABEL)
+    shade_intervals(torque_axes, intervals)
+    detail_styles = (_DETAIL_LINES[0], _DETAIL_LINES[1] | {"linewidth": 1.1}, _DETAIL_LINES[2])
+    detail_lines = tuple(zip((measured_nm, modelled_nm, residual_nm), detail_styles, strict=True))
+    for panel_number, interval in enumerate(intervals):
+        axes = figure.add_subplot(grid[1, panel_number])
+        _draw_detail(axes, record, detail_lines, panel_number, interval, _TORQUE_LABEL)
         axes.set_xlabel("Time (s)", labelpad=1)
-    handles = [*top.get_lines()[:2], residual_axes.get_lines()[0]]
+    legend_handles = [*torque_axes.get_lines()[:2], residual_axes.get_lines()[0]]
     figure.legend(
-        handles, ["measured", "modelled", "residual"], loc="upper right",
+        legend_handles, ["measured", "modelled", "residual"], loc="upper right",
         bbox_to_anchor=(0.985, 0.925), ncols=3, borderaxespad=0.0,
     )  # fmt: skip
     return figure
 
 
-def _rms(values: np.ndarray) -> float:
-    """Return the root mean square of values."""
-    return float(np.sqrt(np.mean(values**2)))
+def _rms(signal_values: np.ndarray) -> float:
+    """Return the root mean square of a signal, in the unit of the signal."""
+    return float(np.sqrt(np.mean(signal_values**2)))

@@ -129,19 +129,36 @@ def new_figure(width_in: float, height_in: float, title: str = "", subtitle: str
     FigureCanvasAgg(figure)
     if not title:
         return figure
-    left, top = 0.35 / width_in, 1.0 - 0.17 / height_in
+    left_fraction, top_fraction = 0.35 / width_in, 1.0 - 0.17 / height_in
     # A file name may hold dollar signs, which are not mathematics, and bytes that are not text.
     text_options: dict[str, Any] = {"va": "top", "parse_math": False}
-    title, subtitle = (line.encode("utf-8", "replace").decode() for line in (title, subtitle))
-    for text in (
-        figure.text(left, top, title, fontsize=12, fontweight="bold", color=INK, **text_options),
+    title, subtitle = (
+        title_line.encode("utf-8", "replace").decode() for title_line in (title, subtitle)
+    )
+    for figure_text in (
         figure.text(
-            left, top - 0.26 / height_in, subtitle, fontsize=8.5, color="#606060", **text_options
+            left_fraction,
+            top_fraction,
+            title,
+            fontsize=12,
+            fontweight="bold",
+            color=INK,
+            **text_options,
+        ),
+        figure.text(
+            left_fraction,
+            top_fraction - 0.26 / height_in,
+            subtitle,
+            fontsize=8.5,
+            color="#606060",
+            **text_options,
         ),
     ):
-        width_fraction = text.get_window_extent().width / (DPI * width_in)
-        text.set_fontsize(
-            float(text.get_fontsize()) * (1 - 2 * left) / max(width_fraction, 1 - 2 * left)
+        width_fraction = figure_text.get_window_extent().width / (DPI * width_in)
+        figure_text.set_fontsize(
+            float(figure_text.get_fontsize())
+            * (1 - 2 * left_fraction)
+            / max(width_fraction, 1 - 2 * left_fraction)
         )
     return figure
 
@@ -174,10 +191,10 @@ class Picture:
         It is the SVG image, which can be searched and is sharp on paper. It is the PNG image if the
         SVG image is more than twice as large, as with many sessions' responses.
         """
-        image_format, content = "png", self.png
+        image_format, image_bytes = "png", self.png
         if self.svg is not None and len(self.svg) < 2 * len(self.png):
-            image_format, content = "svg+xml", self.svg
-        return f"data:image/{image_format};base64,{base64.b64encode(content).decode('ascii')}"
+            image_format, image_bytes = "svg+xml", self.svg
+        return f"data:image/{image_format};base64,{base64.b64encode(image_bytes).decode('ascii')}"
 
 
 def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
@@ -196,19 +213,21 @@ def render_figure(figure: Figure, file_format: FigureFormat) -> bytes:
             if not axis.get_label_text():
                 # Otherwise the empty label is placed clear of the ticks: two more layouts.
                 axis.set_label_coords(0, 0)
-    buffer = io.BytesIO()
+    image_buffer = io.BytesIO()
     if file_format == "png":
         # Fast compression: a tenth more bytes for a quarter of the time.
         figure.savefig(
-            buffer,
+            image_buffer,
             format=file_format,
             dpi=DPI,
             pil_kwargs={"compress_level": _PNG_COMPRESSION_LEVEL},
         )
     else:
         with rc_context(_VECTOR_FORMAT_SETTINGS):
-            figure.savefig(buffer, format=file_format, metadata=_OMITTED_METADATA[file_format])
-    return buffer.getvalue()
+            figure.savefig(
+                image_buffer, format=file_format, metadata=_OMITTED_METADATA[file_format]
+            )
+    return image_buffer.getvalue()
 
 
 def save(figure: Figure, path: Path) -> bytes:
@@ -231,14 +250,16 @@ def save(figure: Figure, path: Path) -> bytes:
     OutputError
         If the file exists or cannot be written.
     """
-    (file_format,) = (name for name in FIGURE_FORMATS if path.suffix == f".{name}")
-    content = render_figure(figure, file_format)
-    write_new(path, content)
-    return content
+    (file_format,) = (
+        format_name for format_name in FIGURE_FORMATS if path.suffix == f".{format_name}"
+    )
+    figure_bytes = render_figure(figure, file_format)
+    write_new(path, figure_bytes)
+    return figure_bytes
 
 
 def save_picture(
-    figure: Figure, stem: Path, description: str, formats: Collection[FigureFormat]
+    figure: Figure, path_stem: Path, description: str, formats: Collection[FigureFormat]
 ) -> Picture:
     """Write a figure in several formats and return it for a page; call it within `figure_style`.
 
@@ -246,7 +267,7 @@ def save_picture(
     ----------
     figure : Figure
         Figure to write.
-    stem : Path
+    path_stem : Path
         Path of the new files without their suffixes.
     description : str
         Caption of the picture.
@@ -259,25 +280,27 @@ def save_picture(
         If a file exists or cannot be written.
     """
     file_formats: set[FigureFormat] = {"png", "svg", *formats}
-    content = {
+    bytes_by_format = {
         file_format: render_figure(figure, file_format)
         for file_format in FIGURE_FORMATS
         if file_format in file_formats
     }
     for file_format in formats:
         # The suffix is appended, because a name may contain dots.
-        write_new(stem.with_name(f"{stem.name}.{file_format}"), content[file_format])
-    return Picture(stem.name, description, content["png"], content["svg"])
+        write_new(
+            path_stem.with_name(f"{path_stem.name}.{file_format}"), bytes_by_format[file_format]
+        )
+    return Picture(path_stem.name, description, bytes_by_format["png"], bytes_by_format["svg"])
 
 
 def envelope(
     x: NDArray[np.float64],
     y: NDArray[np.float64],
-    columns: int = SCREEN_COLUMNS,
+    interval_count: int = SCREEN_COLUMNS,
     *,
     logarithmic: bool = False,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return a line decimated to its minimum and maximum in each of `columns` equal intervals of x.
+    """Return a line decimated to the least and greatest y in each of equal intervals of x.
 
     Parameters
     ----------
@@ -285,7 +308,7 @@ def envelope(
         Increasing values; positive if `logarithmic`.
     y : ndarray, shape (n,)
         Values of the line.
-    columns : int
+    interval_count : int
         Number of intervals.
     logarithmic : bool
         Whether the intervals are equal in log x, for a logarithmic axis.
@@ -295,24 +318,26 @@ def envelope(
     x, y : ndarray, shape (m,)
         Decimated line; the line itself if it has at most two points per column.
     """
-    if len(x) <= 2 * columns:
+    if len(x) <= 2 * interval_count:
         return x, y
-    position = np.log(x) if logarithmic else x
-    edges = np.linspace(position[0], position[-1], columns, endpoint=False)
-    starts = np.unique(np.searchsorted(position, edges))
-    pairs = np.empty((len(starts), 2))
-    pairs[:, 0] = np.minimum.reduceat(y, starts)
-    pairs[:, 1] = np.maximum.reduceat(y, starts)
-    return np.repeat(x[starts], 2), pairs.ravel()
+    axis_position = np.log(x) if logarithmic else x
+    interval_edges = np.linspace(
+        axis_position[0], axis_position[-1], interval_count, endpoint=False
+    )
+    interval_starts = np.unique(np.searchsorted(axis_position, interval_edges))
+    extreme_pairs = np.empty((len(interval_starts), 2))
+    extreme_pairs[:, 0] = np.minimum.reduceat(y, interval_starts)
+    extreme_pairs[:, 1] = np.maximum.reduceat(y, interval_starts)
+    return np.repeat(x[interval_starts], 2), extreme_pairs.ravel()
 
 
-def log_spaced_indices(x: NDArray[np.float64], count: int) -> NDArray[np.intp]:
-    """Return the indices of at most `count` values of x that are evenly spaced in log x.
+def log_spaced_indices(x: NDArray[np.float64], most_indices: int) -> NDArray[np.intp]:
+    """Return the indices of at most `most_indices` values of x that are evenly spaced in log x.
 
     x is positive and increasing.
     """
-    targets = np.geomspace(x[0], x[-1], count)
-    return np.unique(np.clip(np.searchsorted(x, targets), 0, len(x) - 1))
+    spaced_values = np.geomspace(x[0], x[-1], most_indices)
+    return np.unique(np.clip(np.searchsorted(x, spaced_values), 0, len(x) - 1))
 
 
 def dots(
@@ -324,17 +349,21 @@ def dots(
     color: str,
 ) -> None:
     """Draw points as one line with round caps, which SVG writes faster than markers."""
-    corners = np.repeat(np.column_stack([x, y]), 2, axis=0)
-    corners[1::2, 0] *= 1 + 1e-9  # Agg draws no caps where nothing lies between them
-    codes = np.tile([Outline.MOVETO, Outline.LINETO], len(x))
+    line_points = np.repeat(np.column_stack([x, y]), 2, axis=0)
+    line_points[1::2, 0] *= 1 + 1e-9  # Agg draws no caps where nothing lies between them
+    path_codes = np.tile([Outline.MOVETO, Outline.LINETO], len(x))
     axes.add_artist(
         PathPatch(
-            Outline(corners, codes), fill=False, color=color, linewidth=size_pt, capstyle="round"
+            Outline(line_points, path_codes),
+            fill=False,
+            color=color,
+            linewidth=size_pt,
+            capstyle="round",
         )
     )
 
 
-def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = True) -> None:
+def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, with_labels: bool = True) -> None:
     """Make the horizontal axis a logarithmic frequency axis, with labels at 1, 2 and 5."""
     axes.set_xscale("log")
     axes.set_xlim(band_hz)
@@ -343,76 +372,87 @@ def frequency_axis(axes: Axes, band_hz: tuple[float, float], *, labels: bool = T
     )
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_major_formatter(
-        FuncFormatter(lambda f, _position: f"{f:g}") if labels else NullFormatter()
+        FuncFormatter(lambda f, _position: f"{f:g}") if with_labels else NullFormatter()
     )
-    axes.tick_params(axis="x", which="both", labelbottom=labels)
+    axes.tick_params(axis="x", which="both", labelbottom=with_labels)
 
 
-def response_axes(magnitude: Axes, phase: Axes, *, labels: bool = True) -> None:
+def response_axes(magnitude_axes: Axes, phase_axes: Axes, *, with_labels: bool = True) -> None:
     """Label the axes of a frequency response, and set the range of the phase.
 
     The phase of torque over angle is from 0 to 180°, well inside the range.
     """
-    phase.set_ylim(-60, 240)
-    phase.set_yticks((0, 90, 180))
-    if labels:
-        magnitude.set_ylabel("Magnitude (dB re 1 N·m/rad)")
-        phase.set_ylabel("Phase (°)")
+    phase_axes.set_ylim(-60, 240)
+    phase_axes.set_yticks((0, 90, 180))
+    if with_labels:
+        magnitude_axes.set_ylabel("Magnitude (dB re 1 N·m/rad)")
+        phase_axes.set_ylabel("Phase (°)")
 
 
 def type_panels(
     figure: Figure,
-    cells: GridSpec,
-    types: Sequence[str],
+    grid_cells: GridSpec,
+    type_names: Sequence[str],
     band_hz: tuple[float, float],
     db_limits: tuple[float, float],
 ) -> Iterator[tuple[str, Axes, Axes]]:
     """Yield each model type with new axes for magnitude and phase, in the first cells of a grid."""
-    for number, name in enumerate(types):
-        row, column = divmod(number, cells.ncols)
-        subgrid = cells[row, column].subgridspec(2, 1, height_ratios=(2.3, 1.0), hspace=0.07)
-        magnitude, phase = figure.add_subplot(subgrid[0]), figure.add_subplot(subgrid[1])
-        symbols = ", ".join(QUANTITIES[parameter][0] for parameter in STRUCTURES[name].free)
-        magnitude.set_title(f"({ascii_lowercase[number]}) Type {name}   {symbols}")
-        magnitude.set_ylim(db_limits)
-        response_axes(magnitude, phase, labels=column == 0)
-        frequency_axis(magnitude, band_hz, labels=False)
-        frequency_axis(phase, band_hz, labels=number >= len(types) - cells.ncols)
-        for axes in (magnitude, phase):
-            axes.tick_params(labelleft=column == 0)
-        yield name, magnitude, phase
+    for panel_number, type_name in enumerate(type_names):
+        row, panel_column = divmod(panel_number, grid_cells.ncols)
+        subgrid = grid_cells[row, panel_column].subgridspec(
+            2, 1, height_ratios=(2.3, 1.0), hspace=0.07
+        )
+        magnitude_axes, phase_axes = figure.add_subplot(subgrid[0]), figure.add_subplot(subgrid[1])
+        symbols = ", ".join(
+            QUANTITIES[parameter_name][0] for parameter_name in STRUCTURES[type_name].free
+        )
+        magnitude_axes.set_title(f"({ascii_lowercase[panel_number]}) Type {type_name}   {symbols}")
+        magnitude_axes.set_ylim(db_limits)
+        response_axes(magnitude_axes, phase_axes, with_labels=panel_column == 0)
+        frequency_axis(magnitude_axes, band_hz, with_labels=False)
+        frequency_axis(
+            phase_axes, band_hz, with_labels=panel_number >= len(type_names) - grid_cells.ncols
+        )
+        for axes in (magnitude_axes, phase_axes):
+            axes.tick_params(labelleft=panel_column == 0)
+        yield type_name, magnitude_axes, phase_axes
 
 
 def db_limits(
-    measured: Sequence[NDArray[np.complex128]],
-    models: Sequence[NDArray[np.complex128]],
+    measured_frf: Sequence[NDArray[np.complex128]],
+    modelled_frf: Sequence[NDArray[np.complex128]],
     headroom_db: float,
 ) -> tuple[float, float]:
     """Return magnitude limits in dB that contain the measured responses and the models' peaks.
 
     The depth of narrow zeros is not included.
     """
-    measured_db = magnitude_db(np.concatenate(measured) + 1e-300)
+    measured_db = magnitude_db(np.concatenate(measured_frf) + 1e-300)
     top_db = float(measured_db.max())
-    peaks_db = max(float(magnitude_db(model).max()) for model in models)
+    peaks_db = max(float(magnitude_db(model_frf).max()) for model_frf in modelled_frf)
     low_db = float(np.quantile(measured_db, 0.002)) - 4.0
     return low_db, min(max(top_db, peaks_db), top_db + 15.0) + headroom_db
 
 
 def legend(
-    figure: Figure, handles: Sequence[Artist], names: Sequence[str] | None = None, *, columns: int
+    figure: Figure,
+    legend_handles: Sequence[Artist],
+    legend_labels: Sequence[str] | None = None,
+    *,
+    column_count: int,
 ) -> Legend:
     """Add a legend under the subtitle of a figure and return it."""
     width_in, height_in = figure.get_size_inches()
     return figure.legend(
-        handles=handles, labels=names, loc="upper left", ncols=columns, borderaxespad=0.0,
+        handles=legend_handles, labels=legend_labels, loc="upper left", ncols=column_count,
+        borderaxespad=0.0,
         bbox_to_anchor=(0.3 / width_in, 1 - 0.62 / height_in),
     )  # fmt: skip
 
 
-def limits(*values: NDArray[np.float64]) -> tuple[float, float]:
+def limits(*signal_arrays: NDArray[np.float64]) -> tuple[float, float]:
     """Return axis limits with a margin around all values. The limits always differ."""
-    low = min(float(v.min()) for v in values)
-    high = max(float(v.max()) for v in values)
-    margin = 0.06 * (high - low) or max(abs(high), 1e-12)
-    return low - margin, high + margin
+    lowest_value = min(float(v.min()) for v in signal_arrays)
+    highest_value = max(float(v.max()) for v in signal_arrays)
+    limit_margin = 0.06 * (highest_value - lowest_value) or max(abs(highest_value), 1e-12)
+    return lowest_value - limit_margin, highest_value + limit_margin

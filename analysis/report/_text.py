@@ -33,13 +33,13 @@ _WIDTH_CHARACTERS: Final = 120
 def as_text(renderable: RenderableType) -> str:
     """Return one of Rich's renderables as plain text."""
     console = Console(width=_WIDTH_CHARACTERS, color_system=None, force_terminal=False)
-    with console.capture() as capture:
+    with console.capture() as console_capture:
         console.print(renderable)
-    return capture.get()
+    return console_capture.get()
 
 
 def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
-    """Return the terminal's text on one record: verdict, tables and warnings.
+    """Return the results of one record for the terminal: verdict, tables and warnings.
 
     Parameters
     ----------
@@ -50,22 +50,24 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         parameters of damping and beam, or without a whole-record fit the Welch fits.
     """
     whole_record, welch_analysis = result.whole, result.welch
-    parts: list[RenderableType] = []
+    text_parts: list[RenderableType] = []
     if whole_record is not None:
-        parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
+        text_parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
     if welch_analysis is not None and verbose:
-        parts.append(analysis_tables(result))
+        text_parts.append(analysis_tables(result))
     elif welch_analysis is not None:
         if whole_record is None:
-            parts.append(Text(result.validity.sentence))
-            parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
-        parts += _warning_lines(result.warnings)
+            text_parts.append(Text(result.validity.sentence))
+            text_parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
+        text_parts += _warning_lines(result.warnings)
     else:
         # The reason for missing Welch fits was reported before.
-        parts += _warning_lines(
-            warning for warning in result.warnings if not warning.startswith(WELCH_OMITTED_TEXT)
+        text_parts += _warning_lines(
+            warning_text
+            for warning_text in result.warnings
+            if not warning_text.startswith(WELCH_OMITTED_TEXT)
         )
-    return Group(*parts)
+    return Group(*text_parts)
 
 
 _RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
@@ -73,33 +75,41 @@ _RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
 
 
 def _main_results(whole_record: WholeRecord) -> RenderableType:
-    """Return the verdict, the modes and the parameters of damping and beam."""
-    parameters = tables.parameters_table(whole_record)
-    names = tables.parameter_names(whole_record.headline)
-    rows = [
-        row for name, row in zip(names, parameters.rows, strict=True) if name not in _RIG_PARAMETERS
+    """Return the main results of a record for the terminal: verdict, modes and parameters."""
+    parameter_table = tables.parameters_table(whole_record)
+    parameter_names = tables.parameter_names(whole_record.headline)
+    shown_rows = [
+        row
+        for parameter_name, row in zip(parameter_names, parameter_table.rows, strict=True)
+        if parameter_name not in _RIG_PARAMETERS
     ]
     # The terminal has room for one column of text.
-    omitted_column = "meaning" if any(row["remark"] for row in rows) else "remark"
-    columns = tuple(column for column in parameters.columns if column.key != omitted_column)
-    short_table = replace(parameters, columns=columns, rows=tuple(rows))
-    modes = tables.modes_table(whole_record)
+    omitted_column = "meaning" if any(row["remark"] for row in shown_rows) else "remark"
+    shown_columns = tuple(
+        table_column
+        for table_column in parameter_table.columns
+        if table_column.key != omitted_column
+    )
+    short_table = replace(parameter_table, columns=shown_columns, rows=tuple(shown_rows))
+    mode_table = tables.modes_table(whole_record)
     return Group(
         *map(Text, whole_record.verdict.sentences),
         "",
         *with_empty_lines(
             (
-                _with_mark_notes_only(modes),
-                _with_mark_notes_only(short_table, caption=parameters.caption),
+                _with_mark_notes_only(mode_table),
+                _with_mark_notes_only(short_table, caption=parameter_table.caption),
             )
         ),
     )
 
 
 def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
-    """Return a table without notes, except those that explain marked numbers."""
-    notes = tuple(note for note in table.notes if note.startswith(NOT_REPORTED_MARK))
-    return replace(table, caption=caption, notes=notes)
+    """Return a table with only those notes that explain numbers marked as not reported."""
+    mark_notes = tuple(
+        table_note for table_note in table.notes if table_note.startswith(NOT_REPORTED_MARK)
+    )
+    return replace(table, caption=caption, notes=mark_notes)
 
 
 def _warning_lines(sentences: Iterable[str]) -> list[Text]:
@@ -121,7 +131,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
     """
     welch_analysis = result.welch
     assert welch_analysis is not None
-    modes = fit_tables.welch_modes_table(welch_analysis)
+    mode_table = fit_tables.welch_modes_table(welch_analysis)
     return Group(
         Text(f"{result.name}: Welch method (as in the paper)", style="italic"),
         Text(result.validity.sentence),
@@ -130,7 +140,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
             (
                 fit_tables.welch_fits_table(welch_analysis, result.unsupported),
                 fit_tables.peaks_table(welch_analysis),
-                *(() if modes is None else (modes,)),
+                *(() if mode_table is None else (mode_table,)),
             )
         ),
         *_warning_lines(result.warnings),
@@ -139,27 +149,27 @@ def analysis_tables(result: RecordResult) -> RenderableType:
 
 def summary_table(results: Sequence[RecordResult]) -> RenderableType:
     """Return the mean and standard deviation of the Welch fits of several files as a table."""
-    analyses = [result.welch for result in results if result.welch is not None]
-    table = fit_tables.summary_table(analyses)
-    notes = [
+    welch_analyses = [result.welch for result in results if result.welch is not None]
+    fit_summary = fit_tables.summary_table(welch_analyses)
+    validity_notes = [
         f"{result.name}: {result.validity.sentence}"
         for result in results
         if result.welch is not None
     ]
-    return terminal_table(replace(table, notes=(*table.notes, *notes)))
+    return terminal_table(replace(fit_summary, notes=(*fit_summary.notes, *validity_notes)))
 
 
 def record_text(whole_record: WholeRecord) -> RenderableType:
     """Return the verdict on one whole record, and its tables."""
-    verdict = whole_record.verdict
-    sentences = [
+    record_verdict = whole_record.verdict
+    verdict_sentences = [
         *(Text(sentence, style="bold") for sentence in damping_sentences(whole_record.headline)),
-        *map(Text, verdict.sentences),
-        *(Text(advice, style="dim") for advice in verdict.experiments),
+        *map(Text, record_verdict.sentences),
+        *(Text(advice, style="dim") for advice in record_verdict.experiments),
     ]
     return Group(
         Text(f"{whole_record.record.path.name}: verdict", style="italic"),
-        *(Padding(sentence, (0, 0, 0, 2)) for sentence in sentences),
+        *(Padding(sentence, (0, 0, 0, 2)) for sentence in verdict_sentences),
         "",
         record_tables(whole_record),
     )
@@ -218,7 +228,7 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     tuple of str
         Sentences with 95 % intervals in brackets.
     """
-    sentences = []
+    damping_texts = []
     if any(mode.damping_ratio.flag == CONTRADICTED_FILE_REASON for mode in headline.modes):
         return ()
     visible_modes = [_mode_text(mode) for mode in headline.modes if mode.shown]
@@ -230,67 +240,85 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
             f"ratio would be {listed(visible_modes)}.",
         )
     if visible_modes:
-        sentences.append(
+        damping_texts.append(
             f"The antenna's damping ratio is {listed(visible_modes)} (in brackets: 95 % intervals, "
             "statistical only)."
         )
-    sentences.extend(
-        f"The {damping.damping} damping {_size_text(damping)}{_order_text(headline, damping)}."
-        for damping in headline.sizes
+    damping_texts.extend(
+        f"The {loss_factor.damping} damping "
+        f"{_size_text(loss_factor)}{_order_text(headline, loss_factor)}."
+        for loss_factor in headline.sizes
         # A coefficient for an assumed order is no property of the antenna.
-        if damping.size.flag is None
-        and (damping.omega_rad_s is not None or not _coefficient_is_flagged(headline, damping))
+        if loss_factor.size.flag is None
+        and (
+            loss_factor.omega_rad_s is not None
+            or not _coefficient_is_flagged(headline, loss_factor)
+        )
     )
-    return tuple(sentences)
+    return tuple(damping_texts)
 
 
 def _mode_text(mode: ReportedMode) -> str:
     """Return a mode's damping ratio and frequency as text."""
-    ratio = mode.damping_ratio
-    return f"{_percent_text(ratio)} at {mode.frequency_hz.value:.4g} Hz"
+    damping_ratio = mode.damping_ratio
+    return f"{_percent_text(damping_ratio)} at {mode.frequency_hz.value:.4g} Hz"
 
 
-def _percent_text(ratio: ReportedValue) -> str:
+def _percent_text(damping_ratio: ReportedValue) -> str:
     """Return a damping ratio in percent as text, with its interval unless it is flagged."""
-    value, low, high = estimate_cells(
-        (ratio.value, *(ratio.interval_95 or (None, None))), ratio.std, 100.0
+    value_cell, lower_cell, upper_cell = estimate_cells(
+        (damping_ratio.value, *(damping_ratio.interval_95 or (None, None))),
+        damping_ratio.std,
+        100.0,
     )
-    if ratio.flag is not None:
-        return f"{value.text} %"
-    return f"{value.text} % ({low.text} to {high.text} %)"
+    if damping_ratio.flag is not None:
+        return f"{value_cell.text} %"
+    return f"{value_cell.text} % ({lower_cell.text} to {upper_cell.text} %)"
 
 
-def _size_text(damping: ReportedLossFactor) -> str:
-    """Return the loss factor or the coefficient of a damping as part of a sentence."""
-    coefficient, unit, *_names = _DAMPING_SYMBOLS[damping.damping]
-    size = damping.size
-    factor, power_of_ten = (1e5, " · 10⁻⁵") if size.value < _LEAST_PLAIN_VALUE else (1.0, "")
-    value, low, high = estimate_cells(
-        (size.value, *(size.interval_95 or (None, None))), size.std, factor
+def _size_text(loss_factor: ReportedLossFactor) -> str:
+    """Return the loss factor, or else the coefficient, of a damping as part of a sentence."""
+    coefficient_symbol, unit_text, *_names = _DAMPING_SYMBOLS[loss_factor.damping]
+    damping_size = loss_factor.size
+    display_factor, power_of_ten = (
+        (1e5, " · 10⁻⁵") if damping_size.value < _LEAST_PLAIN_VALUE else (1.0, "")
     )
-    bounds = f"{value.text} ({low.text} to {high.text}){power_of_ten}"
-    if damping.omega_rad_s is None:
-        return f"is {coefficient}\u00a0=\u00a0{bounds}{unit}"
-    return f"has a loss factor of {bounds} at {damping.omega_rad_s / (2 * math.pi):.3g} Hz"
+    value_cell, lower_cell, upper_cell = estimate_cells(
+        (damping_size.value, *(damping_size.interval_95 or (None, None))),
+        damping_size.std,
+        display_factor,
+    )
+    interval_text = f"{value_cell.text} ({lower_cell.text} to {upper_cell.text}){power_of_ten}"
+    if loss_factor.omega_rad_s is None:
+        return f"is {coefficient_symbol}\u00a0=\u00a0{interval_text}{unit_text}"
+    return (
+        f"has a loss factor of {interval_text} at {loss_factor.omega_rad_s / (2 * math.pi):.3g} Hz"
+    )
 
 
-def _coefficient_is_flagged(headline: Headline, damping: ReportedLossFactor) -> bool:
-    """Return whether the coefficient of a damping carries a flag."""
-    return headline.parameters[_DAMPING_SYMBOLS[damping.damping][2]].flag is not None
+def _coefficient_is_flagged(headline: Headline, loss_factor: ReportedLossFactor) -> bool:
+    """Return whether the coefficient of a damping is flagged as not a property of the antenna."""
+    return headline.parameters[_DAMPING_SYMBOLS[loss_factor.damping][2]].flag is not None
 
 
-def _order_text(headline: Headline, damping: ReportedLossFactor) -> str:
-    """Return the order of a damping as the end of a sentence."""
-    *_others, name, symbol = _DAMPING_SYMBOLS[damping.damping]
-    order = headline.parameters[name]
-    if headline.tolerant is None and name not in headline.fit.structure.free:
-        return f", of the fixed order {symbol}\u00a0=\u00a0{order.value:g}"
-    if order.interval_95 is None or order.flag is not None:
-        return f"; its order {symbol} is not known"
+def _order_text(headline: Headline, loss_factor: ReportedLossFactor) -> str:
+    """Return the fractional order of a damping as the end of a sentence.
+
+    It is empty for parameters with a tolerance of the geometry.
+    """
+    *_others, order_name, order_symbol = _DAMPING_SYMBOLS[loss_factor.damping]
+    order_value = headline.parameters[order_name]
+    if headline.tolerant is None and order_name not in headline.fit.structure.free:
+        return f", of the fixed order {order_symbol}\u00a0=\u00a0{order_value.value:g}"
+    if order_value.interval_95 is None or order_value.flag is not None:
+        return f"; its order {order_symbol} is not known"
     if headline.tolerant is not None:
         return ""  # the verdict has the slope of the loss, with its condition
-    value, low, high = estimate_cells((order.value, *order.interval_95), order.std)
-    condition = f", {EXACTLY_UNIFORM_CONDITION}" if headline.modal is not None else ""
+    value_cell, lower_cell, upper_cell = estimate_cells(
+        (order_value.value, *order_value.interval_95), order_value.std
+    )
+    condition_text = f", {EXACTLY_UNIFORM_CONDITION}" if headline.modal is not None else ""
     return (
-        f" and the order {symbol}\u00a0=\u00a0{value.text} ({low.text} to {high.text}{condition})"
+        f" and the order {order_symbol}\u00a0=\u00a0{value_cell.text} "
+        f"({lower_cell.text} to {upper_cell.text}{condition_text})"
     )

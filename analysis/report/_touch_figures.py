@@ -43,14 +43,14 @@ def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustra
             "contact cannot be told); the antenna (grey) as it was bent at each touch, from the "
             "motor's axis (black). The angle is zero along x.",
         )
-    number = 0
+    touch_number = 0
     for session in sessions:
         for touch in session.touches:
             if touch.estimate is None:
                 continue
-            number += 1
+            touch_number += 1
             yield Illustration(
-                f"touch_{number}",
+                f"touch_{touch_number}",
                 touch_figure(touch, touch.estimate),
                 f"Touch {touch.number} of {session.path.name}: log-likelihood of each point "
                 "whatever the force, with the estimate and its 95 % interval; innovations of "
@@ -69,19 +69,19 @@ def touch_figure(touch: Touch, estimate: TouchEstimate) -> Figure:
     estimate : TouchEstimate
         Estimate of this touch.
     """
-    rows = estimate.channels
+    channel_count = estimate.channels
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(1, 2, left=0.075, right=0.985, top=0.94, bottom=0.1, wspace=0.2)
     left_grid = grid[0].subgridspec(2, 1, hspace=0.42)
-    right_grid = grid[1].subgridspec(rows, 1, hspace=0.28)
+    right_grid = grid[1].subgridspec(channel_count, 1, hspace=0.28)
     _draw_likelihood(figure.add_subplot(left_grid[0]), estimate)
     touch_time_s = touch.noticed_s if estimate.time_s is None else estimate.time_s.value
     _draw_force(figure.add_subplot(left_grid[1]), estimate, touch_time_s)
-    for row, name in zip(range(rows), ("Torque", "Base shear"), strict=False):
-        axes = figure.add_subplot(right_grid[row])
-        _draw_innovations(axes, estimate, row, name, touch_time_s)
-        if row == rows - 1:
-            axes.set_xlabel("Time from the touch (ms)", labelpad=1)
+    for row, channel_name in zip(range(channel_count), ("Torque", "Base shear"), strict=False):
+        panel_axes = figure.add_subplot(right_grid[row])
+        _draw_innovations(panel_axes, estimate, row, channel_name, touch_time_s)
+        if row == channel_count - 1:
+            panel_axes.set_xlabel("Time from the touch (ms)", labelpad=1)
     return figure
 
 
@@ -90,8 +90,8 @@ def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
     relative_log_likelihood = estimate.log_likelihood - estimate.log_likelihood.max()
     axes.plot(estimate.positions_m, relative_log_likelihood, color=style.BLUE)
     if estimate.x_m is not None:
-        low, high = estimate.x_m.interval_95
-        axes.axvspan(low, high, color=style.SHADE_COLOR, linewidth=0, zorder=0)
+        lower_m, upper_m = estimate.x_m.interval_95
+        axes.axvspan(lower_m, upper_m, color=style.SHADE_COLOR, linewidth=0, zorder=0)
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
     axes.set_ylim(
@@ -116,90 +116,108 @@ def _draw_force(axes: Axes, estimate: TouchEstimate, touch_time_s: float) -> Non
 
 
 def _draw_innovations(
-    axes: Axes, estimate: TouchEstimate, row: int, name: str, touch_time_s: float
+    axes: Axes, estimate: TouchEstimate, channel_row: int, channel_name: str, touch_time_s: float
 ) -> None:
-    """Draw the innovations of one channel over time, in standard deviations."""
+    """Draw one channel's deviations from the prediction (innovations), in standard deviations."""
     times_ms = 1e3 * (estimate.innovation_times_s - touch_time_s)
     axes.axhspan(-NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0)
     axes.axvline(0.0, color=style.GREY, linewidth=0.8)
     axes.plot(
-        times_ms, estimate.innovations[row], ".-", color=style.BLUE, linewidth=0.7, markersize=2.5
+        times_ms,
+        estimate.innovations[channel_row],
+        ".-",
+        color=style.BLUE,
+        linewidth=0.7,
+        markersize=2.5,
     )
     axes.set_yscale("symlog", linthresh=_LINEAR_RANGE_STD)
-    axis_limit = max(2 * _LINEAR_RANGE_STD, 1.2 * float(np.abs(estimate.innovations[row]).max()))
+    axis_limit = max(
+        2 * _LINEAR_RANGE_STD, 1.2 * float(np.abs(estimate.innovations[channel_row]).max())
+    )
     axes.set_ylim(-axis_limit, axis_limit)
     axes.yaxis.set_major_formatter(lambda value, _position: f"{value:g}".replace("-", "−"))
     axes.set_xlim(-_SHOWN_BEFORE_MS, _SHOWN_AFTER_MS)
-    axes.set_title(f"{name}: innovations")
+    axes.set_title(f"{channel_name}: innovations")
     axes.set_ylabel("Standard deviations")
 
 
 # Map
 
 
-def map_figure(sessions: Sequence[TouchedSession]) -> Figure:
+def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with at least one contact point.
     """
-    points = np.array(
-        [t.point_m for session in sessions for t in session.touches if t.point_m is not None]
+    contact_points_m = np.array(
+        [
+            t.point_m
+            for session in touched_sessions
+            for t in session.touches
+            if t.point_m is not None
+        ]
     )
-    length_m = max(session.model.beam.length_m for session in sessions)
-    spread_m = float(np.ptp(points, axis=0).max())
+    length_m = max(session.model.beam.length_m for session in touched_sessions)
+    spread_m = float(np.ptp(contact_points_m, axis=0).max())
     has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
-    overview = figure.add_subplot(grid[0])
-    _draw_map(overview, sessions, with_numbers=not has_detail)
-    overview.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
-    overview.set_aspect("equal", adjustable="datalim")
-    overview.set_title("Seen from above")
+    overview_axes = figure.add_subplot(grid[0])
+    _draw_map(overview_axes, touched_sessions, with_numbers=not has_detail)
+    overview_axes.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
+    overview_axes.set_aspect("equal", adjustable="datalim")
+    overview_axes.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, sessions, with_numbers=True)
-        ends = np.concatenate(
-            [t.ends_m for session in sessions for t in session.touches if t.ends_m is not None]
+        _draw_map(detail_axes, touched_sessions, with_numbers=True)
+        interval_ends_m = np.concatenate(
+            [
+                t.ends_m
+                for session in touched_sessions
+                for t in session.touches
+                if t.ends_m is not None
+            ]
         )
-        middle = (ends.min(axis=0) + ends.max(axis=0)) / 2
-        half_width_m = 0.75 * max(float(np.ptp(ends, axis=0).max()), 0.005 * length_m)
-        detail_axes.set_xlim(middle[0] - half_width_m, middle[0] + half_width_m)
-        detail_axes.set_ylim(middle[1] - half_width_m, middle[1] + half_width_m)
+        map_centre_m = (interval_ends_m.min(axis=0) + interval_ends_m.max(axis=0)) / 2
+        half_width_m = 0.75 * max(float(np.ptp(interval_ends_m, axis=0).max()), 0.005 * length_m)
+        detail_axes.set_xlim(map_centre_m[0] - half_width_m, map_centre_m[0] + half_width_m)
+        detail_axes.set_ylim(map_centre_m[1] - half_width_m, map_centre_m[1] + half_width_m)
         detail_axes.set_aspect("equal", adjustable="box")
         detail_axes.set_title("Detail: points and 95 % intervals")
-        overview.indicate_inset_zoom(detail_axes, edgecolor=style.GREY)
+        overview_axes.indicate_inset_zoom(detail_axes, edgecolor=style.GREY)
     for axes in figure.axes:
         axes.set_xlabel("x (m)", labelpad=1)
-    overview.set_ylabel("y (m)")
-    if len(sessions) > 1:
-        overview.legend(loc="upper left", fontsize=7.5)
+    overview_axes.set_ylabel("y (m)")
+    if len(touched_sessions) > 1:
+        overview_axes.legend(loc="upper left", fontsize=7.5)
     return figure
 
 
 def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, with_numbers: bool) -> None:
     """Draw the contact points of sessions with their intervals, and the bent antenna."""
-    for number, session in enumerate(sessions):
-        color = _SESSION_COLORS[number % len(_SESSION_COLORS)]
-        name: str | None = session.path.stem
+    for session_number, session in enumerate(sessions):
+        session_color = _SESSION_COLORS[session_number % len(_SESSION_COLORS)]
+        session_label: str | None = session.path.stem
         for touch in session.touches:
             if touch.antenna_m is not None:
                 axes.plot(*touch.antenna_m.T, color=style.FAINT, linewidth=1.0, zorder=1)
             if touch.point_m is None or touch.ends_m is None:
                 continue
-            axes.plot(*touch.ends_m.T, color=color, linewidth=2.4, alpha=0.5, zorder=2)
+            axes.plot(*touch.ends_m.T, color=session_color, linewidth=2.4, alpha=0.5, zorder=2)
             kind_is_known = touch.estimate is not None and touch.estimate.kind != "unknown"
             axes.plot(
-                *touch.point_m, "o", color=color, markersize=4, zorder=3, label=name,
-                markerfacecolor=color if kind_is_known else "white",
+                *touch.point_m, "o", color=session_color, markersize=4, zorder=3,
+                label=session_label,
+                markerfacecolor=session_color if kind_is_known else "white",
             )  # fmt: skip
-            name = None
+            session_label = None
             if with_numbers:
                 axes.annotate(
                     str(touch.number), tuple(touch.point_m), xytext=(5, 4),
-                    textcoords="offset points", fontsize=7.5, color=color, clip_on=True,
+                    textcoords="offset points", fontsize=7.5, color=session_color, clip_on=True,
                 )  # fmt: skip

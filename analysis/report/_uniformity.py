@@ -37,107 +37,123 @@ _PERCENT: Final = 100.0
 """Factor from fractions to percent."""
 
 
-def _deviations(test: UniformBeamTest) -> NDArray[np.float64]:
+def _deviations(uniformity_test: UniformBeamTest) -> NDArray[np.float64]:
     """Return measured minus predicted constants, shape (modes, 4); phases within half a turn."""
-    deviations = (test.measured - test.predicted).reshape(-1, len(MODE_CONSTANT_NAMES))
-    phase = MODE_CONSTANT_NAMES.index("residue_phase_rad")
-    deviations[:, phase] -= 2 * np.pi * np.round(deviations[:, phase] / (2 * np.pi))
+    deviations = (uniformity_test.measured - uniformity_test.predicted).reshape(
+        -1, len(MODE_CONSTANT_NAMES)
+    )
+    phase_column = MODE_CONSTANT_NAMES.index("residue_phase_rad")
+    deviations[:, phase_column] -= 2 * np.pi * np.round(deviations[:, phase_column] / (2 * np.pi))
     return deviations
 
 
-def uniformity_figure(test: UniformBeamTest) -> Figure:
+def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     """Draw the deviations of the modal constants from those of a uniform beam, by mode.
 
     Parameters
     ----------
-    test : UniformBeamTest
+    uniformity_test : UniformBeamTest
         Result of the test, with at least one degree of freedom.
     """
-    deviations, std = _deviations(test), test.std.reshape(-1, len(MODE_CONSTANT_NAMES))
+    constant_deviations, std = (
+        _deviations(uniformity_test),
+        uniformity_test.std.reshape(-1, len(MODE_CONSTANT_NAMES)),
+    )
     figure = style.new_figure(9.0, 4.0)
     grid = figure.add_gridspec(
         2, len(MODE_CONSTANT_NAMES), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
         wspace=0.34,
     )  # fmt: skip
-    for column, name in enumerate(MODE_CONSTANT_NAMES):
-        std_axes, percent_axes = (figure.add_subplot(grid[row, column]) for row in range(2))
-        std_axes.set_title(_CONSTANT_TITLES[name], fontsize=8.5)
+    for panel_number, constant_name in enumerate(MODE_CONSTANT_NAMES):
+        std_axes, percent_axes = (figure.add_subplot(grid[row, panel_number]) for row in range(2))
+        std_axes.set_title(_CONSTANT_TITLES[constant_name], fontsize=8.5)
         std_axes.axhspan(
             -NORMAL_95, NORMAL_95, color=style.SHADE_COLOR, linewidth=0, zorder=0,
             label="95 % of uniform beams",
         )  # fmt: skip
-        values = deviations[:, column] / std[:, column]
-        std_axes.plot(test.modes, values, "o", color=style.BLUE, markersize=5.0)
-        _set_axes(std_axes, test.modes, float(np.abs(values).max()), least_limit=3.0)
-        half_width_percent = NORMAL_95 * _PERCENT * std[:, column]
-        percent = _PERCENT * deviations[:, column]
+        deviation_values = constant_deviations[:, panel_number] / std[:, panel_number]
+        std_axes.plot(
+            uniformity_test.modes, deviation_values, "o", color=style.BLUE, markersize=5.0
+        )
+        _set_axes(
+            std_axes, uniformity_test.modes, float(np.abs(deviation_values).max()), least_limit=3.0
+        )
+        half_width_percent = NORMAL_95 * _PERCENT * std[:, panel_number]
+        percent_values = _PERCENT * constant_deviations[:, panel_number]
         percent_axes.errorbar(
-            test.modes, percent, half_width_percent, fmt="o", color=style.INK, markersize=4.0,
+            uniformity_test.modes, percent_values, half_width_percent, fmt="o", color=style.INK,
+            markersize=4.0,
             capsize=3.0, elinewidth=1.0, label="measured, 95 %",
         )  # fmt: skip
-        _set_axes(percent_axes, test.modes, float((np.abs(percent) + half_width_percent).max()))
+        _set_axes(
+            percent_axes,
+            uniformity_test.modes,
+            float((np.abs(percent_values) + half_width_percent).max()),
+        )
         percent_axes.set_xlabel("Mode", labelpad=1)
         std_axes.tick_params(labelbottom=False)
-        if column == 0:
+        if panel_number == 0:
             std_axes.set_ylabel("Deviation (std)")
             percent_axes.set_ylabel("Deviation (%)")
-    handles = [
+    legend_handles = [
         handle_or_label
         for axes in (std_axes, percent_axes)
         for handle_or_label in axes.get_legend_handles_labels()[0]
     ]
-    labels = [
+    legend_labels = [
         handle_or_label
         for axes in (std_axes, percent_axes)
         for handle_or_label in axes.get_legend_handles_labels()[1]
     ]
     figure.align_ylabels()
     figure.legend(
-        handles, labels, loc="upper right", bbox_to_anchor=(0.985, 0.995), ncols=2,
+        legend_handles, legend_labels, loc="upper right", bbox_to_anchor=(0.985, 0.995), ncols=2,
         borderaxespad=0.0,
     )  # fmt: skip
     return figure
 
 
 def _set_axes(
-    axes: Axes, modes: tuple[int, ...], largest_value: float, *, least_limit: float = 0.0
+    axes: Axes, mode_numbers: tuple[int, ...], largest_value: float, *, least_limit: float = 0.0
 ) -> None:
     """Set symmetric limits about zero, and a tick at each mode."""
     axes.axhline(0.0, color="#9A9A9A", linewidth=0.7, zorder=1)
-    limit = max(1.2 * largest_value, least_limit)
-    axes.set_ylim(-limit, limit)
+    axis_limit = max(1.2 * largest_value, least_limit)
+    axes.set_ylim(-axis_limit, axis_limit)
     axes.yaxis.set_major_locator(MaxNLocator(5))
-    axes.set_xlim(modes[0] - 0.5, modes[-1] + 0.5)
-    axes.set_xticks(modes)
+    axes.set_xlim(mode_numbers[0] - 0.5, mode_numbers[-1] + 0.5)
+    axes.set_xticks(mode_numbers)
 
 
-def uniformity_description(test: UniformBeamTest) -> str:
+def uniformity_description(uniformity_test: UniformBeamTest) -> str:
     """Return the description of the test's figure, with the result of the test."""
     return (
         "Modal constants measured, less those of the uniform beam that fits them best, by mode: "
         "above in standard deviations of the measured value (shaded: where 95 of 100 values of a "
         "uniform beam are), below in per cent with the 95 % interval (phase: per cent of 1 rad). "
-        f"Chi-square {test.chi_square:.4g} for {test.degrees_of_freedom} degrees of freedom. "
-        f"{test.summary.sentence}"
+        f"Chi-square {uniformity_test.chi_square:.4g} for {uniformity_test.degrees_of_freedom} "
+        f"degrees of freedom. {uniformity_test.summary.sentence}"
     )
 
 
-def uniformity_table(test: UniformBeamTest) -> Table:
+def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
     """Return the table of measured and predicted modal constants with their deviations."""
-    rows: list[tuple[Entry, ...]] = []
-    deviations = _deviations(test).ravel()
-    for index, (measured_value, std, predicted_value, deviation) in enumerate(
+    table_rows: list[tuple[Entry, ...]] = []
+    constant_deviations = _deviations(uniformity_test).ravel()
+    for constant_index, (measured_value, std, predicted_value, deviation) in enumerate(
         zip(
-            test.measured.tolist(), test.std.tolist(), test.predicted.tolist(), deviations.tolist(),
+            uniformity_test.measured.tolist(), uniformity_test.std.tolist(),
+            uniformity_test.predicted.tolist(), constant_deviations.tolist(),
             strict=True,
         )
     ):  # fmt: skip
-        name = MODE_CONSTANT_NAMES[index % len(MODE_CONSTANT_NAMES)]
-        name_cell = Cell(name, name.removesuffix("_rad").replace("_", " "))
-        cells = estimate_cells((measured_value, std, predicted_value), std)
-        rows.append(
+        constant_name = MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)]
+        name_cell = Cell(constant_name, constant_name.removesuffix("_rad").replace("_", " "))
+        constant_cells = estimate_cells((measured_value, std, predicted_value), std)
+        table_rows.append(
             (
-                test.modes[index // len(MODE_CONSTANT_NAMES)], name_cell, *cells,
+                uniformity_test.modes[constant_index // len(MODE_CONSTANT_NAMES)], name_cell,
+                *constant_cells,
                 number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )
         )  # fmt: skip
@@ -153,11 +169,11 @@ def uniformity_table(test: UniformBeamTest) -> Table:
             Column("Deviation (std)", "deviation_std"),
             Column("Deviation (%)", "deviation"),
         ),
-        rows,
+        table_rows,
         (
             "ln of the frequency in Hz, of the damping ratio, and of the residue's magnitude in "
             "N·m/s; phase of the residue over j, in rad.",
-            test.summary.sentence,
+            uniformity_test.summary.sentence,
         ),
         grouped=True,
     )

@@ -51,10 +51,12 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     """
     if not whole_record.withheld:
         return excited_band_hz(whole_record.record, whole_record.analysis)
-    frequencies = [mode.frequency_hz.value for mode in whole_record.headline.modes if mode.shown]
-    if len(frequencies) < 2:
+    mode_frequencies_hz = [
+        mode.frequency_hz.value for mode in whole_record.headline.modes if mode.shown
+    ]
+    if len(mode_frequencies_hz) < 2:
         return None
-    return min(frequencies), max(frequencies)
+    return min(mode_frequencies_hz), max(mode_frequencies_hz)
 
 
 def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
@@ -72,17 +74,19 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     tuple of float or None
         Lowest and highest frequency in Hz; None if the torque nowhere exceeds the noise.
     """
-    torque = record.torque_nm - record.torque_nm.mean()
-    frequency_hz = np.fft.rfftfreq(torque.size, 1 / record.rate_hz)
-    in_band = (frequency_hz >= analysis.frequency_hz[0]) & (
+    torque_nm = record.torque_nm - record.torque_nm.mean()
+    frequency_hz = np.fft.rfftfreq(torque_nm.size, 1 / record.rate_hz)
+    is_in_band = (frequency_hz >= analysis.frequency_hz[0]) & (
         frequency_hz <= analysis.frequency_hz[-1]
     )
     # A narrow-band disturbance is not an excitation, and the compared bins contain none.
-    nearest_bins = np.searchsorted(analysis.frequency_hz, frequency_hz[in_band])
-    in_band[in_band] = analysis.compared[np.minimum(nearest_bins, analysis.compared.size - 1)]
-    power = np.abs(np.fft.rfft(torque)[in_band]) ** 2 * 2 / (torque.size * record.rate_hz)
-    power_over_noise = power / np.interp(
-        frequency_hz[in_band], analysis.frequency_hz, analysis.noise_nm2_per_hz
+    nearest_bins = np.searchsorted(analysis.frequency_hz, frequency_hz[is_in_band])
+    is_in_band[is_in_band] = analysis.compared[np.minimum(nearest_bins, analysis.compared.size - 1)]
+    power_nm2_per_hz = (
+        np.abs(np.fft.rfft(torque_nm)[is_in_band]) ** 2 * 2 / (torque_nm.size * record.rate_hz)
+    )
+    power_over_noise = power_nm2_per_hz / np.interp(
+        frequency_hz[is_in_band], analysis.frequency_hz, analysis.noise_nm2_per_hz
     )
     bins_in_full_blocks = power_over_noise.size - power_over_noise.size % _BLOCK_BINS
     excited_blocks = np.flatnonzero(
@@ -91,7 +95,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     )
     if excited_blocks.size == 0:
         return None
-    band_frequencies_hz = frequency_hz[in_band]
+    band_frequencies_hz = frequency_hz[is_in_band]
     return float(band_frequencies_hz[excited_blocks[0] * _BLOCK_BINS]), float(
         band_frequencies_hz[(excited_blocks[-1] + 1) * _BLOCK_BINS - 1]
     )
@@ -187,10 +191,12 @@ def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Re
     ndarray, shape (n,)
     """
     band_grid = np.geomspace(first_hz, last_hz, _GRID_POINTS)
-    offsets = np.geomspace(1e-4, 0.1, 40)
-    peak_grids = [peak * (1 + np.r_[-offsets, 0.0, offsets]) for peak in peaks_hz]
-    grid = np.unique(np.concatenate([band_grid, *peak_grids]))
-    return np.asarray(grid[(grid >= first_hz) & (grid <= last_hz)])
+    relative_offsets = np.geomspace(1e-4, 0.1, 40)
+    peak_grids = [
+        peak_hz * (1 + np.r_[-relative_offsets, 0.0, relative_offsets]) for peak_hz in peaks_hz
+    ]
+    all_frequencies = np.unique(np.concatenate([band_grid, *peak_grids]))
+    return np.asarray(all_frequencies[(all_frequencies >= first_hz) & (all_frequencies <= last_hz)])
 
 
 _QUARTER_TURN: Final = np.pi / 2
@@ -245,23 +251,34 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     variance of ln |H| is ``Re g C Re g'`` and that of the phase ``Im g C Im g'``. Parameters that
     are fixed, or that the data do not determine, count as known.
     """
-    plant: Plant = replace(fit.plant, delay_s=0.0)
+    delay_free_plant: Plant = replace(fit.plant, delay_s=0.0)
     # The delay changes the measured phase, but not that of beam and clamp.
-    indices = [i for i, name in enumerate(fit.determined) if name != "delay_s"]
-    parameter_names = [fit.determined[i] for i in indices]
+    parameter_indices = [
+        i for i, parameter_name in enumerate(fit.determined) if parameter_name != "delay_s"
+    ]
+    parameter_names = [fit.determined[i] for i in parameter_indices]
     response, *derivatives = ResponseGrid(2j * np.pi * frequency_hz).evaluate(
-        plant, [_GRADIENT_NAMES.get(name, name) for name in parameter_names]
+        delay_free_plant,
+        [_GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in parameter_names],
     )
-    gradient = np.empty((len(parameter_names), frequency_hz.size), dtype=np.complex128)
-    for gradient_row, name, derivative in zip(gradient, parameter_names, derivatives, strict=True):
-        scale_by_value = name in LOGARITHMIC_PARAMETERS and name not in _GRADIENT_NAMES
-        gradient_row[:] = derivative * (fit.parameters[name] if scale_by_value else 1.0) / response
-    covariance = fit.covariance[np.ix_(indices, indices)]
+    log_response_gradient = np.empty((len(parameter_names), frequency_hz.size), dtype=np.complex128)
+    for gradient_row, parameter_name, response_derivative in zip(
+        log_response_gradient, parameter_names, derivatives, strict=True
+    ):
+        scale_by_value = (
+            parameter_name in LOGARITHMIC_PARAMETERS and parameter_name not in _GRADIENT_NAMES
+        )
+        gradient_row[:] = (
+            response_derivative
+            * (fit.parameters[parameter_name] if scale_by_value else 1.0)
+            / response
+        )
+    covariance = fit.covariance[np.ix_(parameter_indices, parameter_indices)]
     return ResponseBand(
         frequency_hz=frequency_hz,
         response=response,
-        log_magnitude_std=_standard_deviations(gradient.real, covariance),
-        phase_std_rad=_standard_deviations(gradient.imag, covariance),
+        log_magnitude_std=_standard_deviations(log_response_gradient.real, covariance),
+        phase_std_rad=_standard_deviations(log_response_gradient.imag, covariance),
     )
 
 
@@ -280,27 +297,33 @@ def modal_response_band(fit: ModalFit, frequency_hz: Real, delay_s: float = 0.0)
     """
     s = 2j * np.pi * frequency_hz
     response = fit.model.response(s)
-    derivatives = []
-    for pole, residue in zip(fit.model.poles_rad_s, fit.model.residues, strict=True):
-        ratio = -pole.real / abs(pole)
+    response_derivatives = []
+    for mode_pole, mode_residue in zip(fit.model.poles_rad_s, fit.model.residues, strict=True):
+        residue_ratio = -mode_pole.real / abs(mode_pole)
         # By ln frequency and ln damping ratio. Those by the residue are residue and j residue.
-        pole_derivatives = (pole, -ratio * pole.imag / (1 - ratio * ratio) ** 1.5)
-        pole_term, conjugate_term = 1 / (s - pole), 1 / (s - pole.conjugate())
-        derivatives += [
-            residue * slope * pole_term**2 + (residue * slope).conjugate() * conjugate_term**2
-            for slope in pole_derivatives
+        pole_derivatives = (
+            mode_pole,
+            -residue_ratio * mode_pole.imag / (1 - residue_ratio * residue_ratio) ** 1.5,
+        )
+        pole_term, conjugate_term = 1 / (s - mode_pole), 1 / (s - mode_pole.conjugate())
+        response_derivatives += [
+            mode_residue * parameter_slope * pole_term**2
+            + (mode_residue * parameter_slope).conjugate() * conjugate_term**2
+            for parameter_slope in pole_derivatives
         ]
-        derivatives += [
-            slope * pole_term + slope.conjugate() * conjugate_term
-            for slope in (residue, 1j * residue)
+        response_derivatives += [
+            parameter_slope * pole_term + parameter_slope.conjugate() * conjugate_term
+            for parameter_slope in (mode_residue, 1j * mode_residue)
         ]
-    derivatives += [s**power for power in range(len(fit.model.background))]
-    gradient = np.array(derivatives) / response
+    response_derivatives += [
+        s**background_power for background_power in range(len(fit.model.background))
+    ]
+    log_response_gradient = np.array(response_derivatives) / response
     return ResponseBand(
         frequency_hz=frequency_hz,
         response=response * np.exp(s * delay_s),
-        log_magnitude_std=_standard_deviations(gradient.real, fit.joint_covariance),
-        phase_std_rad=_standard_deviations(gradient.imag, fit.joint_covariance),
+        log_magnitude_std=_standard_deviations(log_response_gradient.real, fit.joint_covariance),
+        phase_std_rad=_standard_deviations(log_response_gradient.imag, fit.joint_covariance),
     )
 
 
@@ -367,76 +390,100 @@ def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
 
     and at a resonance, where the real parts cancel, their sum is the loss factor of the mode.
     """
-    omega = 2 * np.pi * frequency_hz
-    values = fit.parameters
-    total_value = np.zeros(omega.size)
-    total_slopes = np.zeros((len(fit.determined), omega.size))
-    internal = external = None
+    omega_rad_s = 2 * np.pi * frequency_hz
+    parameter_values = fit.parameters
+    total_value = np.zeros(omega_rad_s.size)
+    total_slopes = np.zeros((len(fit.determined), omega_rad_s.size))
+    internal_loss = external_loss = None
     if fit.structure.internal:
-        loss_value, slope_pair = _loss_with_slopes(omega, values["zeta"], values["alpha"], 1.0)
-        gradient = _rows_by_parameter(
-            fit, {"zeta": slope_pair[0], "alpha": slope_pair[1]}, omega.size
-        )
-        internal = LossFactor(loss_value, _standard_deviations(gradient, fit.covariance))
-        total_value, total_slopes = total_value + loss_value, total_slopes + loss_value * gradient
-    if fit.structure.external:
-        inertia_term = values["density_over_stiffness"] * omega**2
         loss_value, slope_pair = _loss_with_slopes(
-            omega, values["gamma"] / inertia_term, values["lambda"], -1.0
+            omega_rad_s, parameter_values["zeta"], parameter_values["alpha"], 1.0
         )
-        gradient = _rows_by_parameter(
+        log_loss_gradient = _rows_by_parameter(
+            fit, {"zeta": slope_pair[0], "alpha": slope_pair[1]}, omega_rad_s.size
+        )
+        internal_loss = LossFactor(
+            loss_value, _standard_deviations(log_loss_gradient, fit.covariance)
+        )
+        total_value, total_slopes = (
+            total_value + loss_value,
+            total_slopes + loss_value * log_loss_gradient,
+        )
+    if fit.structure.external:
+        inertia_term = parameter_values["density_over_stiffness"] * omega_rad_s**2
+        loss_value, slope_pair = _loss_with_slopes(
+            omega_rad_s, parameter_values["gamma"] / inertia_term, parameter_values["lambda"], -1.0
+        )
+        log_loss_gradient = _rows_by_parameter(
             fit,
             {
                 "gamma": slope_pair[0],
                 "lambda": slope_pair[1],
                 "density_over_stiffness": -slope_pair[0],
             },
-            omega.size,
+            omega_rad_s.size,
         )
-        external = LossFactor(loss_value, _standard_deviations(gradient, fit.covariance))
-        total_value, total_slopes = total_value + loss_value, total_slopes + loss_value * gradient
+        external_loss = LossFactor(
+            loss_value, _standard_deviations(log_loss_gradient, fit.covariance)
+        )
+        total_value, total_slopes = (
+            total_value + loss_value,
+            total_slopes + loss_value * log_loss_gradient,
+        )
     with np.errstate(invalid="ignore", divide="ignore"):
         total_loss = LossFactor(
             total_value, _standard_deviations(total_slopes / total_value, fit.covariance)
         )
-    return LossFactors(frequency_hz, internal, external, total_loss)
+    return LossFactors(frequency_hz, internal_loss, external_loss, total_loss)
 
 
 def _loss_with_slopes(
-    omega: Real, coefficient: Real | float, order: float, sign: float
+    omega_rad_s: Real, damping_coefficient: Real | float, damping_order: float, term_sign: float
 ) -> tuple[Real, tuple[Real, Real]]:
     """Return a damping term's loss factor, and the slopes of its logarithm.
 
     The slopes are those by the coefficient's logarithm and by the order.
     """
-    log_omega, angle = np.log(omega), _QUARTER_TURN * order
-    magnitude = coefficient * omega**order
-    in_phase_part, quadrature_part = magnitude * np.cos(angle), magnitude * np.sin(angle)
-    real_part = 1 + sign * in_phase_part
+    log_omega, quarter_turn_angle = np.log(omega_rad_s), _QUARTER_TURN * damping_order
+    term_magnitude = damping_coefficient * omega_rad_s**damping_order
+    in_phase_part, quadrature_part = (
+        term_magnitude * np.cos(quarter_turn_angle),
+        term_magnitude * np.sin(quarter_turn_angle),
+    )
+    real_part = 1 + term_sign * in_phase_part
     real_part = np.where(real_part > 0, real_part, np.nan)
-    by_order = (
+    slope_by_order = (
         log_omega
-        + _QUARTER_TURN / np.tan(angle)
-        - sign * (in_phase_part * log_omega - _QUARTER_TURN * quadrature_part) / real_part
+        + _QUARTER_TURN / np.tan(quarter_turn_angle)
+        - term_sign * (in_phase_part * log_omega - _QUARTER_TURN * quadrature_part) / real_part
     )
-    return quadrature_part / real_part, (1 / real_part, by_order)
+    return quadrature_part / real_part, (1 / real_part, slope_by_order)
 
 
-def _rows_by_parameter(fit: Estimate, slopes: dict[str, Real], points: int) -> Real:
-    """Return slopes by parameter name as rows in the order of the fit's covariance, (k, n)."""
-    return np.array([slopes.get(name, np.zeros(points)) for name in fit.determined]).reshape(
-        len(fit.determined), points
-    )
+def _rows_by_parameter(fit: Estimate, slopes_by_name: dict[str, Real], point_count: int) -> Real:
+    """Return slopes as rows (k, n) in the order of the parameters in the fit's covariance.
+
+    A parameter without slopes has a row of zeros.
+    """
+    return np.array(
+        [
+            slopes_by_name.get(parameter_name, np.zeros(point_count))
+            for parameter_name in fit.determined
+        ]
+    ).reshape(len(fit.determined), point_count)
 
 
 def _standard_deviations(gradient: Real, covariance: Real) -> Real:
-    """Return standard deviations (n,) from slopes (k, n) and the parameters' covariance."""
-    variance = np.einsum("in,ij,jn->n", gradient, covariance, gradient, optimize=True)
-    return np.asarray(np.sqrt(np.maximum(variance, 0.0)))
+    """Return the standard deviations (n,) of a function of the parameters.
+
+    `gradient` contains its slopes (k, n), and `covariance` is that of the parameters, (k, k).
+    """
+    log_variance = np.einsum("in,ij,jn->n", gradient, covariance, gradient, optimize=True)
+    return np.asarray(np.sqrt(np.maximum(log_variance, 0.0)))
 
 
-def _logarithmic_limits(value: Real, log_std: Real) -> tuple[Real, Real]:
-    """Return the limits of a value's 95 % interval, which is symmetric in the logarithm."""
+def _logarithmic_limits(central_value: Real, log_std: Real) -> tuple[Real, Real]:
+    """Return the lower and upper limit of a 95 % interval that is symmetric in the logarithm."""
     # An undetermined value may overflow. Its band then includes everything.
-    factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
-    return value / factor, value * factor
+    limit_factor = np.exp(np.minimum(NORMAL_95 * log_std, 300.0))
+    return central_value / limit_factor, central_value * limit_factor

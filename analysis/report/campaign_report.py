@@ -47,8 +47,8 @@ def campaign_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     Without a verdict the sentences state whether the sessions are of one specimen, and why there is
     no verdict. The second sentence, or the only one, states the validity.
     """
-    sentences = _verdict_sentences(campaign)
-    return (*sentences[:1], campaign.validity.sentence, *sentences[1:])
+    verdict_sentences = _verdict_sentences(campaign)
+    return (*verdict_sentences[:1], campaign.validity.sentence, *verdict_sentences[1:])
 
 
 def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
@@ -78,24 +78,24 @@ def campaign_tables(
         Whether all tables are included. Otherwise only the verdict, the pooled modes and
         parameters, and with `with_paper` the tables of the paper.
     """
-    parts: list[RenderableType] = []
-    sentences = campaign_sentences(campaign)
-    if sentences:
-        first_sentence, *further_sentences = sentences
-        parts += [Text(first_sentence, style="bold"), *map(Text, further_sentences)]
+    text_parts: list[RenderableType] = []
+    all_sentences = campaign_sentences(campaign)
+    if all_sentences:
+        first_sentence, *further_sentences = all_sentences
+        text_parts += [Text(first_sentence, style="bold"), *map(Text, further_sentences)]
         if campaign.verdict is not None and campaign.verdict.experiments:
-            parts.append(Text("Further experiments:"))
-            parts += [Text(f"  {advice}") for advice in campaign.verdict.experiments]
-        parts.append("")
-    parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
+            text_parts.append(Text("Further experiments:"))
+            text_parts += [Text(f"  {advice_text}") for advice_text in campaign.verdict.experiments]
+        text_parts.append("")
+    text_parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
     if verbose or with_paper or campaign.headline is None:
-        parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
-    parts += [
-        Text(f"Warning: {session.name}: {warning}", style="yellow")
+        text_parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
+    text_parts += [
+        Text(f"Warning: {session.name}: {warning_text}", style="yellow")
         for session in campaign.sessions
-        for warning in session.warnings
+        for warning_text in session.warnings
     ]
-    return Group(*parts)
+    return Group(*text_parts)
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
@@ -142,14 +142,15 @@ def campaign_page(
     """
     from analysis.report._page import page, versions
 
-    paths = [session.path for session in campaign.sessions]
-    sentences = campaign_sentences(campaign)
+    session_paths = [session.path for session in campaign.sessions]
+    all_sentences = campaign_sentences(campaign)
     return page(
         "campaign.html",
-        title=f"Campaign of {len(paths)} sessions",
-        files=f"{paths[0].name} to {paths[-1].name}, in {paths[0].absolute().parent}",
-        first=sentences[:1],
-        sentences=sentences[1:],
+        title=f"Campaign of {len(session_paths)} sessions",
+        files=f"{session_paths[0].name} to {session_paths[-1].name}, "
+        f"in {session_paths[0].absolute().parent}",
+        first=all_sentences[:1],
+        sentences=all_sentences[1:],
         experiments=campaign.verdict.experiments if campaign.verdict else (),
         warnings=_warning_texts(campaign),
         pictures=[picture for picture in pictures if picture.name in _WHOLE_RECORD_FIGURES],
@@ -167,28 +168,28 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
     return [
         *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
-            f"Not predicted from the others: {trial.path}: {trial.reason}"
-            for trial in campaign.lost_trials
+            f"Not predicted from the others: {lost_trial.path}: {lost_trial.reason}"
+            for lost_trial in campaign.lost_trials
         ),
         *(
-            f"{session.name}: {warning}"
+            f"{session.name}: {warning_text}"
             for session in campaign.sessions
-            for warning in session.warnings
+            for warning_text in session.warnings
         ),
     ]
 
 
 def _collect_facts(campaign: CampaignResult) -> list[Facts]:
-    """Return the facts on specimen and estimators."""
+    """Return tables of (name, text) on specimen and estimators, for the HTML page."""
     settings, (first_hz, last_hz) = campaign.settings, campaign.record_band_hz
-    beam = campaign.sessions[0].beam
-    parts = [
+    stated_beam = campaign.sessions[0].beam
+    fact_groups = [
         (
             "Specimen, as the files state it",
             [
-                ("beam length", f"{beam.length_m:g} m"),
-                ("beam density", f"{beam.density_kg_per_m:g} kg/m"),
-                ("bending stiffness", f"{beam.bending_stiffness_n_m2:g} N·m²"),
+                ("beam length", f"{stated_beam.length_m:g} m"),
+                ("beam density", f"{stated_beam.density_kg_per_m:g} kg/m"),
+                ("bending stiffness", f"{stated_beam.bending_stiffness_n_m2:g} N·m²"),
             ],
         ),
         (
@@ -224,14 +225,14 @@ def _collect_facts(campaign: CampaignResult) -> list[Facts]:
         ),
     ]
     if not campaign.nominal:
-        del parts[2]
+        del fact_groups[2]
     if not campaign.sessions[0].record_estimates:
-        del parts[1]
-    return parts
+        del fact_groups[1]
+    return fact_groups
 
 
 def _geometry_facts(campaign: CampaignResult) -> list[tuple[str, str]]:
-    """Return the fact on the model of modes and parameters, if a geometry tolerance is stated."""
+    """Return (name, text) on the tolerance of the beam's geometry; nothing if none is stated."""
     if campaign.modal is None or not campaign.modal.leads:
         return []
     return [
@@ -281,21 +282,23 @@ def write_campaign(
     from analysis.report import _style as style
 
     pictures = []
-    for name, (draw_figure, description) in _figures_with_data(campaign).items():
+    for table_name, (draw_figure, figure_description) in _figures_with_data(campaign).items():
         with style.figure_style():
             figure = draw_figure()
             pictures.append(
-                style.save_picture(figure, folder / "figures" / name, description, formats)
+                style.save_picture(
+                    figure, folder / "figures" / table_name, figure_description, formats
+                )
             )
-        on_step(f"figure {name}")
-    for name, table in all_tables(campaign, with_paper=with_paper).items():
-        write_new(folder / "tables" / f"{name}.csv", csv_text(table))
-    text = document_text(campaign_document(campaign, with_paper=with_paper))
-    write_new(folder / "campaign.json", text)
+        on_step(f"figure {table_name}")
+    for table_name, report_table in all_tables(campaign, with_paper=with_paper).items():
+        write_new(folder / "tables" / f"{table_name}.csv", csv_text(report_table))
+    document_json = document_text(campaign_document(campaign, with_paper=with_paper))
+    write_new(folder / "campaign.json", document_json)
     write_new(folder / "tables.txt", campaign_text(campaign, with_paper=with_paper))
     made_at = datetime.now().astimezone()
-    html = campaign_page(campaign, pictures, made_at, with_paper=with_paper)
-    write_new(folder / "report.html", html)
+    page_html = campaign_page(campaign, pictures, made_at, with_paper=with_paper)
+    write_new(folder / "report.html", page_html)
 
 
 def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[], Figure], str]]:

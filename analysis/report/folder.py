@@ -40,15 +40,15 @@ class OutputError(Exception):
 
 
 def report_folders(
-    files: Sequence[Path], report: Path | None, *, overwrite: bool = False
+    session_files: Sequence[Path], report_path: Path | None, *, overwrite: bool = False
 ) -> list[Path]:
     """Return the folder for each file's report, and raise if it must not be written.
 
     Parameters
     ----------
-    files : sequence of Path
+    session_files : sequence of Path
         Session files that are analysed.
-    report : Path, optional
+    report_path : Path, optional
         Requested folder. With one file it is that file's report; with several files it contains one
         folder per file, named like the file. Default: ``NAME.report`` next to each file, or if that
         exists ``NAME.report-2`` and so on.
@@ -60,21 +60,27 @@ def report_folders(
     OutputExistsError
         If the folder exists, is not empty and contains no earlier report to replace.
     """
-    if report is None:
+    if report_path is None:
         # A folder given for a file may have no name of its own ("." or "/").
-        requested_folders = [file.parent / f"{file.stem}.report" for file in files]
-    elif overwrite or _is_free(report):
-        requested_folders = [report] if len(files) == 1 else [report / file.stem for file in files]
+        requested_folders = [
+            session_file.parent / f"{session_file.stem}.report" for session_file in session_files
+        ]
+    elif overwrite or _is_free(report_path):
+        requested_folders = (
+            [report_path]
+            if len(session_files) == 1
+            else [report_path / session_file.stem for session_file in session_files]
+        )
     else:
         raise OutputExistsError(
-            f"--report {report} exists and is not an empty folder; choose another name, or replace "
-            "an earlier report with --overwrite. Nothing is overwritten without it."
+            f"--report {report_path} exists and is not an empty folder; choose another name, or "
+            "replace an earlier report with --overwrite. Nothing is overwritten without it."
         )
     reserved_folders: set[Path] = set()
     if not overwrite:
         return (
             requested_folders
-            if requested_folders == [report]
+            if requested_folders == [report_path]
             else [
                 _unused_folder(requested_folder, reserved_folders)
                 for requested_folder in requested_folders
@@ -116,18 +122,20 @@ def check_new_file(path: Path, message_subject: str, *, overwrite: bool = False)
 
 
 def _is_free(folder: Path) -> bool:
-    """Return whether a path does not exist, or is an empty folder."""
+    """Return True if a path does not exist or is an empty folder, so that a report fits there."""
     return not os.path.lexists(folder) or (folder.is_dir() and not any(folder.iterdir()))
 
 
 def _unused_folder(folder: Path, reserved_folders: set[Path], *, overwrite: bool = False) -> Path:
     """Return the folder, or the first numbered folder name like it that is not in use."""
-    number, candidate = 1, folder
-    while candidate in reserved_folders or (os.path.lexists(candidate) and not overwrite):
-        number += 1
-        candidate = folder.with_name(f"{folder.name}-{number}")
-    reserved_folders.add(candidate)
-    return candidate
+    folder_number, candidate_folder = 1, folder
+    while candidate_folder in reserved_folders or (
+        os.path.lexists(candidate_folder) and not overwrite
+    ):
+        folder_number += 1
+        candidate_folder = folder.with_name(f"{folder.name}-{folder_number}")
+    reserved_folders.add(candidate_folder)
+    return candidate_folder
 
 
 def _contains_results(path: Path) -> bool:
@@ -135,10 +143,10 @@ def _contains_results(path: Path) -> bool:
     if path.is_symlink() or not path.is_file():
         return False
     try:
-        content = read_json(path)
+        json_content = read_json(path)
     except DocumentError:
         return False
-    return isinstance(content, dict) and content.keys() >= _RESULT_KEYS
+    return isinstance(json_content, dict) and json_content.keys() >= _RESULT_KEYS
 
 
 # Writing
@@ -195,14 +203,14 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
         shutil.rmtree(temporary_folder, ignore_errors=True)
 
 
-def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> None:
+def write_new(path: Path, file_content: str | bytes, *, overwrite: bool = False) -> None:
     """Write a new file, and create its folders. Text is encoded as UTF-8.
 
     Parameters
     ----------
     path : Path
         File to be written.
-    content : str or bytes
+    file_content : str or bytes
         Content of the file.
     overwrite : bool
         Whether the file replaces earlier results of an analysis.
@@ -213,25 +221,25 @@ def write_new(path: Path, content: str | bytes, *, overwrite: bool = False) -> N
         If the file exists or cannot be written.
     """
     check_new_file(path, "The file", overwrite=overwrite)
-    if isinstance(content, str):
+    if isinstance(file_content, str):
         # File names may hold bytes that are not text; as escapes they are text, and valid JSON.
-        content = content.encode("utf-8", "backslashreplace")
+        file_content = file_content.encode("utf-8", "backslashreplace")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
         if os.path.lexists(path):
-            _replace_file(path, content)
+            _replace_file(path, file_content)
         else:
-            with path.open("xb") as stream:
-                stream.write(content)
+            with path.open("xb") as file_stream:
+                file_stream.write(file_content)
     except OSError as error:
         raise OutputError(f"{path} cannot be written: {error.strerror or error}.") from error
 
 
-def _replace_file(path: Path, content: bytes) -> None:
+def _replace_file(path: Path, file_bytes: bytes) -> None:
     """Replace a file atomically, so that the old file remains if the disk is full."""
     temporary_path = path.with_name(f".{path.name}.part-{os.getpid()}")
     try:
-        temporary_path.write_bytes(content)
+        temporary_path.write_bytes(file_bytes)
         temporary_path.replace(path)
     finally:
         temporary_path.unlink(missing_ok=True)
@@ -255,30 +263,31 @@ def _replace_report(
 ) -> None:
     """Move a new report's files into an earlier report's folder, and remove the earlier files."""
     earlier_checksums = _read_list(folder)
-    for name in checksums:
-        if os.path.lexists(folder / name) and not _is_unchanged_report_file(
-            folder, name, earlier_checksums
+    for file_name in checksums:
+        if os.path.lexists(folder / file_name) and not _is_unchanged_report_file(
+            folder, file_name, earlier_checksums
         ):
             raise OutputExistsError(
-                f"The report {folder} is unchanged: {name} in it was modified, or not written by "
-                "an analysis, and --overwrite does not replace such files; move it away, or choose "
+                f"The report {folder} is unchanged: {file_name} in it was modified, or not "
+                "written by an analysis, and --overwrite does not replace such files; move it "
+                "away, or choose "
                 "another folder with --report."
             )
     try:
         # If this is interrupted, the list still contains all files.
         all_checksums = {
-            name: earlier_checksums.get(name, set()) | checksums.get(name, set())
-            for name in {*earlier_checksums, *checksums}
+            file_name: earlier_checksums.get(file_name, set()) | checksums.get(file_name, set())
+            for file_name in {*earlier_checksums, *checksums}
         }
         _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(all_checksums).encode())
-        for name in checksums:
-            (folder / name).parent.mkdir(parents=True, exist_ok=True)
-            (temporary_folder / name).replace(folder / name)
-        for name in earlier_checksums.keys() - checksums.keys():
-            if _is_unchanged_report_file(folder, name, earlier_checksums):
-                (folder / name).unlink()
+        for file_name in checksums:
+            (folder / file_name).parent.mkdir(parents=True, exist_ok=True)
+            (temporary_folder / file_name).replace(folder / file_name)
+        for file_name in earlier_checksums.keys() - checksums.keys():
+            if _is_unchanged_report_file(folder, file_name, earlier_checksums):
+                (folder / file_name).unlink()
                 with suppress(OSError):  # folders that are not empty stay
-                    (folder / name).parent.rmdir()
+                    (folder / file_name).parent.rmdir()
         _replace_file(folder / CHECKSUM_LIST_NAME, _list_text(checksums).encode())
     except OSError as error:
         raise OutputError(
@@ -287,24 +296,28 @@ def _replace_report(
 
 
 def _is_unchanged_report_file(
-    folder: Path, name: str, listed_checksums: Mapping[str, set[str]]
+    folder: Path, file_name: str, listed_checksums: Mapping[str, set[str]]
 ) -> bool:
     """Return whether a file of a report's folder is in the folder's list and unchanged."""
-    path = folder / name
-    is_inside = path.resolve().is_relative_to(folder.resolve()) and not path.is_symlink()
-    return is_inside and path.is_file() and _sha256(path) in listed_checksums.get(name, ())
+    file_path = folder / file_name
+    is_inside = file_path.resolve().is_relative_to(folder.resolve()) and not file_path.is_symlink()
+    return (
+        is_inside
+        and file_path.is_file()
+        and _sha256(file_path) in listed_checksums.get(file_name, ())
+    )
 
 
 def _read_list(folder: Path) -> dict[str, set[str]]:
-    """Return the listed SHA-256 checksums of a report's files, by name.
+    """Return the SHA-256 checksums that the list in a report's folder states, by file name.
 
     A file that was being replaced at an interruption has two checksums.
     """
     checksums: dict[str, set[str]] = {}
     try:
-        for line in read_text(folder / CHECKSUM_LIST_NAME, _LARGEST_LIST_BYTES).splitlines():
-            checksum, _, name = line.partition("  ")
-            checksums.setdefault(name, set()).add(checksum)
+        for list_line in read_text(folder / CHECKSUM_LIST_NAME, _LARGEST_LIST_BYTES).splitlines():
+            checksum, _, file_name = list_line.partition("  ")
+            checksums.setdefault(file_name, set()).add(checksum)
     except DocumentError as error:
         raise OutputError(f"{folder / CHECKSUM_LIST_NAME} {error}.") from error
     return checksums
@@ -313,13 +326,13 @@ def _read_list(folder: Path) -> dict[str, set[str]]:
 def _list_text(checksums: Mapping[str, set[str]]) -> str:
     """Return the text of a report's list of files and checksums."""
     return "".join(
-        f"{checksum}  {name}\n"
-        for name in sorted(checksums)
-        for checksum in sorted(checksums[name])
+        f"{checksum}  {file_name}\n"
+        for file_name in sorted(checksums)
+        for checksum in sorted(checksums[file_name])
     )
 
 
 def _sha256(path: Path) -> str:
     """Return the SHA-256 checksum of a file, in hexadecimal."""
-    with path.open("rb") as stream:
-        return hashlib.file_digest(stream, "sha256").hexdigest()
+    with path.open("rb") as file_stream:
+        return hashlib.file_digest(file_stream, "sha256").hexdigest()

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 def record_page(
     result: RecordResult,
     pictures: Sequence[Picture],
-    modes: Table,
+    mode_table: Table,
     record_tables: Sequence[Table],
     made_at: datetime,
     paper_pictures: Sequence[Picture] = (),
@@ -47,7 +47,7 @@ def record_page(
         Results of the record, with whole-record fits.
     pictures : sequence of Picture
         Figures of the whole-record fits. The table of modes follows the first figure.
-    modes : Table
+    mode_table : Table
         Table of the modes.
     record_tables : sequence of Table
         Tables of the whole-record fits.
@@ -67,8 +67,8 @@ def record_page(
 
     whole_record = result.whole
     assert whole_record is not None
-    figures = [picture for picture in pictures if picture.name != UNIFORMITY]
-    test = whole_record.headline.uniform_beam
+    other_pictures = [picture for picture in pictures if picture.name != UNIFORMITY]
+    uniformity_test = whole_record.headline.uniform_beam
     return page(
         "record.html",
         title=result.name,
@@ -78,18 +78,18 @@ def record_page(
         sentences=whole_record.verdict.sentences,
         experiments=whole_record.verdict.experiments,
         warnings=result.warnings,
-        pictures=figures,
+        pictures=other_pictures,
         uniformity=None
-        if test is None
+        if uniformity_test is None
         else {
-            "sentence": test.summary.sentence,
+            "sentence": uniformity_test.summary.sentence,
             "pictures": [picture for picture in pictures if picture.name == UNIFORMITY],
             "tables": uniformity_tables(whole_record),
         },
         equations=[mathml(picture_or_formula) for picture_or_formula in equations(whole_record)],
         definitions=definitions(whole_record),
         types=types_table(whole_record),
-        modes=modes,
+        modes=mode_table,
         tables=record_tables,
         paper_pictures=paper_pictures,
         paper_tables=paper_tables,
@@ -99,19 +99,23 @@ def record_page(
 
 def _session_lines(record: Record) -> list[str]:
     """Return start, outcome, specimen and operator of the session, as the file states them."""
-    metadata = record.metadata
-    lines = [f"{key}: {metadata[key]}" for key in ("specimen", "operator") if metadata.get(key)]
-    return [*_start_lines(metadata), f"outcome {record.outcome}", *lines]
+    record_metadata = record.metadata
+    fact_lines = [
+        f"{key}: {record_metadata[key]}"
+        for key in ("specimen", "operator")
+        if record_metadata.get(key)
+    ]
+    return [*_start_lines(record_metadata), f"outcome {record.outcome}", *fact_lines]
 
 
 def _start_lines(metadata: Mapping[str, str]) -> list[str]:
     """Return the start time of the session as a list of one text; empty if the file states none."""
     try:
-        seconds = int(metadata["start_utc_ns"]) / 1e9
-        start = datetime.fromtimestamp(seconds, UTC)
+        start_utc_s = int(metadata["start_utc_ns"]) / 1e9
+        start_time = datetime.fromtimestamp(start_utc_s, UTC)
     except (KeyError, ValueError, OverflowError, OSError):
         return []
-    return [f"recorded {start:%Y-%m-%d %H:%M:%S} UTC"]
+    return [f"recorded {start_time:%Y-%m-%d %H:%M:%S} UTC"]
 
 
 _METADATA_SHOWN_ELSEWHERE = frozenset(
@@ -124,7 +128,7 @@ _METADATA_SHOWN_ELSEWHERE = frozenset(
 
 
 def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Facts]:
-    """Return the facts on file, record, session and settings."""
+    """Return tables of (name, text) on file, record, session and settings, for the HTML page."""
     record, welch_analysis = result.record, result.welch
     return [
         ("File", _file_facts(record.path)),
@@ -149,51 +153,60 @@ def _collect_facts(result: RecordResult, whole_record: WholeRecord) -> list[Fact
 def sha256(path: Path) -> str | None:
     """Return the SHA-256 checksum of a file in hexadecimal; None if the file cannot be read."""
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        with path.open("rb") as file_stream:
+            return hashlib.file_digest(file_stream, "sha256").hexdigest()
     except OSError:
         return None
 
 
 def _file_facts(path: Path) -> list[tuple[str, str]]:
-    """Return path, size and checksum of a file, as facts."""
+    """Return (name, text) of a file's path, size and checksum."""
     checksum = sha256(path)
-    facts = [("path", str(path))]
+    file_facts = [("path", str(path))]
     if checksum is not None:
-        facts += [("size", f"{path.stat().st_size} bytes"), ("SHA-256", checksum)]
-    return facts
+        file_facts += [("size", f"{path.stat().st_size} bytes"), ("SHA-256", checksum)]
+    return file_facts
 
 
 def _record_facts(record: Record) -> list[tuple[str, str]]:
-    """Return outcome, samples, beam, latencies and gaps of a record, as facts."""
-    beam, gaps = record.beam, record.gaps
-    samples = len(record.time_s)
-    flags = ", ".join(f"{count} × {meaning}" for meaning, count in record.flags.items())
+    """Return (name, text) of a record's outcome, samples, beam, latencies and gaps."""
+    stated_beam, sample_gaps = record.beam, record.gaps
+    sample_count = len(record.time_s)
+    flag_counts_text = ", ".join(
+        f"{flag_count} × {flag_meaning}" for flag_meaning, flag_count in record.flags.items()
+    )
     return [
         ("outcome", record.outcome),
-        ("samples", f"{samples} at {record.rate_hz:g} Hz, {samples / record.rate_hz:.6g} s"),
+        (
+            "samples",
+            f"{sample_count} at {record.rate_hz:g} Hz, {sample_count / record.rate_hz:.6g} s",
+        ),
         ("sweep", f"samples {record.sweep.start} to {record.sweep.stop - 1}"),
-        ("beam length", f"{beam.length_m:g} m"),
-        ("beam density", f"{beam.density_kg_per_m:g} kg/m"),
-        ("bending stiffness", f"{beam.bending_stiffness_n_m2:g} N·m²"),
+        ("beam length", f"{stated_beam.length_m:g} m"),
+        ("beam density", f"{stated_beam.density_kg_per_m:g} kg/m"),
+        ("bending stiffness", f"{stated_beam.bending_stiffness_n_m2:g} N·m²"),
         ("tool inertia", f"{record.tool_inertia_kg_m2:g} kg·m²"),
         ("measurement latency of the angle", f"{1e3 * record.angle_delay_s:g} ms"),
         ("measurement latency of the torque", f"{1e3 * record.torque_delay_s:g} ms"),
-        ("missing ticks", f"{gaps.missing_ticks}, {gaps.sweep_missing_ticks} of them in the sweep"),
+        (
+            "missing ticks",
+            f"{sample_gaps.missing_ticks}, {sample_gaps.sweep_missing_ticks} of them in the sweep",
+        ),
         (
             "stale values in the sweep",
-            f"{gaps.sweep_stale_angles} of the angle, {gaps.sweep_stale_torques} of the torque",
+            f"{sample_gaps.sweep_stale_angles} of the angle, {sample_gaps.sweep_stale_torques} of "
+            "the torque",
         ),
-        ("flags in the sweep", flags or "none"),
+        ("flags in the sweep", flag_counts_text or "none"),
     ]
 
 
 def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
-    """Return estimator, band, types and fixed parameters of the whole-record fits, as facts."""
+    """Return (name, text) of the whole-record fits' estimator, band, types and fixed values."""
     first_hz, last_hz = whole_record.band_hz
-    lines = [
-        f"{line.frequency_hz:.5g} Hz, {1e3 * line.amplitude_nm:.3g} mN·m"
-        for line in whole_record.analysis.lines
+    hum_texts = [
+        f"{hum_line.frequency_hz:.5g} Hz, {1e3 * hum_line.amplitude_nm:.3g} mN·m"
+        for hum_line in whole_record.analysis.lines
     ]
     return [
         (
@@ -205,7 +218,7 @@ def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {whole_record.analysis.frequency_hz.size} bins"),
         ("types", ", ".join(whole_record.fits)),
         ("fixed at the file's values", ", ".join(whole_record.fixed) or "none"),
-        ("narrow-band disturbances removed", "; ".join(lines) or "none found"),
+        ("narrow-band disturbances removed", "; ".join(hum_texts) or "none found"),
         (
             "intervals and bands",
             "95 %, from the covariance of the parameters at the minimum; curves by linearisation",
@@ -214,26 +227,26 @@ def _record_fit_facts(whole_record: WholeRecord) -> list[tuple[str, str]]:
 
 
 def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
-    """Return estimator, band, types and segments of the Welch fits, as facts."""
+    """Return (name, text) of the Welch fits' estimator, band, types and segments."""
     settings, segmentation, response = analysis.settings, analysis.segmentation, analysis.response
     first_hz, last_hz = settings.band_hz
-    facts = [
+    welch_facts = [
         ("estimator", ESTIMATOR_NAMES[settings.estimator]),
         ("band", f"{first_hz:g} to {last_hz:g} Hz, {len(response.frequency_hz)} bins"),
         ("types", ", ".join(settings.types)),
         ("weights", ", ".join(settings.weightings)),
     ]
     if settings.estimator == "iv":
-        facts.append(("instrument", "the reference"))
+        welch_facts.append(("instrument", "the reference"))
     if settings.estimator != "fft":
-        facts.append(
+        welch_facts.append(
             (
                 "segments",
                 f"{response.segments} of {segmentation.segment_length} samples (Hamming), overlap "
                 f"{segmentation.overlap}, nfft {segmentation.nfft}",
             )
         )
-    return facts
+    return welch_facts
 
 
 # Folder
@@ -257,53 +270,60 @@ def _write_page(
     formats: Sequence[FigureFormat] = DEFAULT_FORMATS,
     paper_pictures: Sequence[Picture] = (),
 ) -> None:
-    """Write ``report.html`` and the files in ``figures/`` and ``tables/``."""
+    """Write a record's report: ``report.html``, and the files in ``figures/`` and ``tables/``."""
     from analysis.report import _style as style
     from analysis.report._record_figures import illustrations
 
     pictures = []
     with style.figure_style():
         for illustration in illustrations(whole_record):
-            stem = folder / "figures" / illustration.name
+            figure_stem = folder / "figures" / illustration.name
             pictures.append(
-                style.save_picture(illustration.figure, stem, illustration.description, formats)
+                style.save_picture(
+                    illustration.figure, figure_stem, illustration.description, formats
+                )
             )
             on_step(f"figure {illustration.name}")
-    modes, record_tables, paper_tables = report_tables(result)
-    for report_table in (modes, *uniformity_tables(whole_record), *record_tables, *paper_tables):
-        table = with_validity(report_table, result.validity)
-        write_new(folder / "tables" / f"{table.name}.csv", csv_text(table))
-        if table.name in _LATEX_TABLES:
-            write_new(folder / "tables" / f"{table.name}.tex", latex_table(table))
+    mode_table, record_tables, paper_tables = report_tables(result)
+    for report_table in (
+        mode_table,
+        *uniformity_tables(whole_record),
+        *record_tables,
+        *paper_tables,
+    ):
+        result_table = with_validity(report_table, result.validity)
+        write_new(folder / "tables" / f"{result_table.name}.csv", csv_text(result_table))
+        if result_table.name in _LATEX_TABLES:
+            write_new(folder / "tables" / f"{result_table.name}.tex", latex_table(result_table))
     write_new(folder / "tables" / "model.tex", latex(equations(whole_record)))
     made_at = datetime.now().astimezone()
-    text = record_page(
-        result, pictures, modes, record_tables, made_at, paper_pictures, paper_tables
+    page_html = record_page(
+        result, pictures, mode_table, record_tables, made_at, paper_pictures, paper_tables
     )
-    write_new(folder / "report.html", text)
+    write_new(folder / "report.html", page_html)
 
 
 def uniformity_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
     """Return the tables of the test of the beam's uniformity; nothing without the test."""
-    test = whole_record.headline.uniform_beam
-    if test is None or test.p_value is None:
+    uniformity_test = whole_record.headline.uniform_beam
+    if uniformity_test is None or uniformity_test.p_value is None:
         return ()
-    modes = tables.exact_modes_table(whole_record)
-    return (uniformity_table(test), *(() if modes is None else (modes,)))
+    exact_modes = tables.exact_modes_table(whole_record)
+    return (uniformity_table(uniformity_test), *(() if exact_modes is None else (exact_modes,)))
 
 
 def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple[Table, ...]]:
     """Return the table of modes, those of whole-record fits, and those of the Welch method."""
     whole_record, welch_analysis = result.whole, result.welch
     assert whole_record is not None
-    conditions = (
+    condition_tables = (
         tables.exact_geometry_table(whole_record),
         tables.simpler_structure_table(whole_record),
     )
     record_tables = (
         tables.loss_factors_table(whole_record),
         tables.parameters_table(whole_record),
-        *(table for table in conditions if table is not None),
+        *(table for table in condition_tables if table is not None),
         tables.correlations_table(whole_record),
         *tables.amplitude_tables(whole_record),
         fit_tables.structures_table(whole_record),
@@ -358,32 +378,36 @@ def write_report(
     whole_record = result.whole
     pictures: list[Picture] = []
     if result.welch is not None:
-        names = welch_figure_names(paper=True, whole_record=whole_record is not None)
-        pictures = _write_welch_figures(result.welch, names, folder / "figures", on_step, formats)
+        figure_names = welch_figure_names(
+            with_paper_figures=True, has_whole_record=whole_record is not None
+        )
+        pictures = _write_welch_figures(
+            result.welch, figure_names, folder / "figures", on_step, formats
+        )
     write_new(folder / "tables.txt", tables_text(result))
     if whole_record is not None:
         _write_page(result, whole_record, folder, on_step, formats, pictures)
     write_new(folder / "analysis.json", document_text(document([result])))
 
 
-def welch_figure_names(*, paper: bool, whole_record: bool) -> tuple[str, ...]:
+def welch_figure_names(*, with_paper_figures: bool, has_whole_record: bool) -> tuple[str, ...]:
     """Return the names of the Welch fits' figures in a report.
 
     Parameters
     ----------
-    paper : bool
+    with_paper_figures : bool
         Whether the Welch fits were run.
-    whole_record : bool
+    has_whole_record : bool
         Whether the whole-record fits were run.
     """
-    if not paper:
+    if not with_paper_figures:
         return ()
-    return _WELCH_FIGURES_WITH_RECORD if whole_record else _WELCH_FIGURES
+    return _WELCH_FIGURES_WITH_RECORD if has_whole_record else _WELCH_FIGURES
 
 
 def _write_welch_figures(
     analysis: WelchAnalysis,
-    names: Sequence[str],
+    figure_names: Sequence[str],
     folder: Path,
     on_step: Callable[[str], None],
     formats: Sequence[FigureFormat],
@@ -397,9 +421,11 @@ def _write_welch_figures(
         zip(_WELCH_FIGURES, (paper_signals_figure, frf_figure, torque_figure), strict=True)
     )
     pictures = []
-    for name in names:
+    for figure_name in figure_names:
         with style.figure_style():
-            figure = drawing_functions[name](analysis)
-            pictures.append(style.save_picture(figure, folder / name, _WELCH_DESCRIPTION, formats))
-        on_step(f"figure {name}")
+            figure = drawing_functions[figure_name](analysis)
+            pictures.append(
+                style.save_picture(figure, folder / figure_name, _WELCH_DESCRIPTION, formats)
+            )
+        on_step(f"figure {figure_name}")
     return pictures

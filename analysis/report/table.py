@@ -35,7 +35,7 @@ Value = str | float | bool | None
 
 @dataclass(frozen=True, slots=True)
 class Cell:
-    """Cell of a table whose displayed text differs from the standard format of its value.
+    """Cell of a table with a displayed text of its own, instead of the column's number format.
 
     Attributes
     ----------
@@ -98,7 +98,7 @@ class Column:
         return self.number_format != TEXT_FORMAT
 
     def shown(self, entry: Entry) -> Cell:
-        """Return the cell that people see for an entry of this column."""
+        """Return the cell with the text that is displayed for an entry of this column."""
         if isinstance(entry, Cell):
             return entry
         if isinstance(entry, bool):
@@ -174,8 +174,8 @@ class Table:
         grouped : bool
             Whether a line is drawn between rows whose first entries differ.
         """
-        keys = [column.key for column in columns]
-        keyed_rows = tuple(dict(zip(keys, row, strict=True)) for row in rows)
+        column_keys = [column.key for column in columns]
+        keyed_rows = tuple(dict(zip(column_keys, row, strict=True)) for row in rows)
         return cls(name, caption, tuple(columns), keyed_rows, tuple(notes), selected, grouped)
 
     @property
@@ -221,8 +221,8 @@ def with_validity(table: Table, validity: Validity) -> Table:
         "predicted_peak_tip_slope_rad": validity.predicted_peak_tip_slope_rad,
         "linear_model_error": validity.linear_model_error,
     }
-    rows = tuple({**row, **validity_entries} for row in table.rows)
-    return replace(table, rows=rows, notes=(*table.notes, validity.sentence))
+    rows_with_validity = tuple({**row, **validity_entries} for row in table.rows)
+    return replace(table, rows=rows_with_validity, notes=(*table.notes, validity.sentence))
 
 
 def csv_text(table: Table) -> str:
@@ -230,11 +230,11 @@ def csv_text(table: Table) -> str:
 
     Unknown values are empty fields.
     """
-    buffer = io.StringIO()
-    writer = csv.DictWriter(buffer, table.keys, lineterminator="\n")
-    writer.writeheader()
-    writer.writerows(json_rows(table))
-    return buffer.getvalue()
+    text_buffer = io.StringIO()
+    csv_writer = csv.DictWriter(text_buffer, table.keys, lineterminator="\n")
+    csv_writer.writeheader()
+    csv_writer.writerows(json_rows(table))
+    return text_buffer.getvalue()
 
 
 def json_rows(table: Table) -> list[dict[str, Value]]:
@@ -244,8 +244,10 @@ def json_rows(table: Table) -> list[dict[str, Value]]:
 
 def _program_value(entry: Entry) -> Value:
     """Return an entry's value as programs read it; None if it is not finite."""
-    value = entry.value if isinstance(entry, Cell) else entry
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+    entry_value = entry.value if isinstance(entry, Cell) else entry
+    return (
+        None if isinstance(entry_value, float) and not math.isfinite(entry_value) else entry_value
+    )
 
 
 def terminal_table(table: Table) -> rich.table.Table:
@@ -266,18 +268,21 @@ def terminal_table(table: Table) -> rich.table.Table:
             rich_table.add_column(
                 Text(column.heading), justify="right" if column.numeric else "left"
             )
-    rows = table.shown_rows
-    for index, row in enumerate(rows):
-        cells: list[Text] = []
+    cell_rows = table.shown_rows
+    for row_index, row in enumerate(cell_rows):
+        row_cells: list[Text] = []
         for cell, is_std in zip(row, std_columns, strict=True):
             if not is_std:
-                cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
+                row_cells.append(Text(cell.text, style="dim italic" if cell.doubtful else ""))
             elif cell.value:
                 # No space follows the ±, so that a narrow terminal breaks the line before it.
-                cells[-1].append(f" ±{cell.text}")
-        ends_group = table.grouped and row[0].text != rows[min(index + 1, len(rows) - 1)][0].text
+                row_cells[-1].append(f" ±{cell.text}")
+        ends_group = (
+            table.grouped
+            and row[0].text != cell_rows[min(row_index + 1, len(cell_rows) - 1)][0].text
+        )
         rich_table.add_row(
-            *cells, end_section=ends_group, style="bold" if index == table.selected else ""
+            *row_cells, end_section=ends_group, style="bold" if row_index == table.selected else ""
         )
     return rich_table
 
@@ -315,30 +320,32 @@ def latex_text(text: str) -> str:
     >>> print(latex_text("1e-5 s^α"), latex_text("ρ/EI"), latex_text("−7.2 %"))
     $10^{-5}$ s$^{\alpha}$ $\rho$/$EI$ $-$7.2 \%
     """
-    latex = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
-    return latex.replace("$$", "")
+    latex_source = "".join(map(_latex_token, _LATEX_TOKENS.finditer(text)))
+    return latex_source.replace("$$", "")
 
 
 def _latex_token(token: re.Match[str]) -> str:
     """Return the LaTeX of one match of `_LATEX_TOKENS`."""
-    groups = token.groupdict()
-    if groups["power"]:
-        digits = "" if groups["digits"] == "1" else rf"{groups['digits']} \cdot "
-        return f"${digits}10^{{{int(groups['power'])}}}$"
-    if groups["up"]:
-        exponent = "".join(
-            f"\\{_LATEX_SYMBOLS[character]} " if character in _LATEX_SYMBOLS else character
-            for character in groups["up"]
+    token_groups = token.groupdict()
+    if token_groups["power"]:
+        factor_text = "" if token_groups["digits"] == "1" else rf"{token_groups['digits']} \cdot "
+        return f"${factor_text}10^{{{int(token_groups['power'])}}}$"
+    if token_groups["up"]:
+        exponent_text = "".join(
+            f"\\{_LATEX_SYMBOLS[exponent_character]} "
+            if exponent_character in _LATEX_SYMBOLS
+            else exponent_character
+            for exponent_character in token_groups["up"]
         )
-        return f"$^{{{exponent.rstrip()}}}$"
-    if groups["raised"]:
-        return f"$^{{{groups['raised'].translate(_SUPERSCRIPT_DIGITS)}}}$"
-    if groups["letter"]:
-        index = f"_{{{groups['index']}}}" if groups["index"] else ""
-        return rf"$\{_LATEX_SYMBOLS[groups['letter']]}{index}$"
-    if groups["minus"] or groups["stiffness"]:
-        return "$-$" if groups["minus"] else "$EI$"
-    return _LATEX_ESCAPES.get(groups["other"], groups["other"])
+        return f"$^{{{exponent_text.rstrip()}}}$"
+    if token_groups["raised"]:
+        return f"$^{{{token_groups['raised'].translate(_SUPERSCRIPT_DIGITS)}}}$"
+    if token_groups["letter"]:
+        subscript_text = f"_{{{token_groups['index']}}}" if token_groups["index"] else ""
+        return rf"$\{_LATEX_SYMBOLS[token_groups['letter']]}{subscript_text}$"
+    if token_groups["minus"] or token_groups["stiffness"]:
+        return "$-$" if token_groups["minus"] else "$EI$"
+    return _LATEX_ESCAPES.get(token_groups["other"], token_groups["other"])
 
 
 def latex_table(table: Table) -> str:
@@ -347,13 +354,13 @@ def latex_table(table: Table) -> str:
     The notes follow below the table.
     """
     columns = table.shown_columns
-    alignment = "".join("r" if column.numeric else "l" for column in columns)
-    lines = [
+    column_alignment = "".join("r" if column.numeric else "l" for column in columns)
+    latex_lines = [
         r"\begin{table}",
         r"  \centering",
         rf"  \caption{{{latex_text(table.caption)}}}",
         rf"  \label{{tab:{table.name}}}",
-        rf"  \begin{{tabular}}{{@{{}}{alignment}@{{}}}}",
+        rf"  \begin{{tabular}}{{@{{}}{column_alignment}@{{}}}}",
         r"    \toprule",
         f"    {' & '.join(latex_text(column.heading) for column in columns)} \\\\",
         r"    \midrule",
@@ -366,50 +373,55 @@ def latex_table(table: Table) -> str:
         *(rf"  \par\footnotesize {latex_text(note)}" for note in table.notes),
         r"\end{table}",
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(latex_lines) + "\n"
 
 
-def number_cell(value: float | None, number_format: str = ".4g", factor: float = 1.0) -> Cell:
+def number_cell(
+    number: float | None, number_format: str = ".4g", display_factor: float = 1.0
+) -> Cell:
     """Return a cell that shows a number; a dash if the number is unknown or not finite.
 
     Parameters
     ----------
-    value : float or None
+    number : float or None
         The number, in SI units.
     number_format : str
         Format of the number, as for the function `format`.
-    factor : float
+    display_factor : float
         Factor from SI units to the displayed unit.
     """
-    if value is None or not math.isfinite(value):
+    if number is None or not math.isfinite(number):
         return Cell(None, ABSENT_TEXT)
-    return Cell(float(value), f"{factor * value:{number_format}}".replace("-", "−"))
+    return Cell(float(number), f"{display_factor * number:{number_format}}".replace("-", "−"))
 
 
-def count_cell(value: int) -> Cell:
+def count_cell(whole_number: int) -> Cell:
     """Return a cell that shows a whole number."""
-    return Cell(value, str(value))
+    return Cell(whole_number, str(whole_number))
 
 
 def estimate_cells(
-    values: Sequence[float | None], std: float | None, factor: float = 1.0
+    estimate_values: Sequence[float | None], std: float | None, display_factor: float = 1.0
 ) -> tuple[Cell, ...]:
     """Return cells that show numbers rounded to the second digit of their standard deviation.
 
     Parameters
     ----------
-    values : sequence of float or None
+    estimate_values : sequence of float or None
         The numbers, in SI units.
     std : float or None
         Common standard deviation of all numbers, in SI units.
-    factor : float
+    display_factor : float
         Factor from SI units to the displayed unit.
     """
     return tuple(
-        number_cell(value, factor=factor)
-        if value is None or not math.isfinite(value)
-        else Cell(value, to_uncertainty((value,), std or 0.0, factor)[0].replace("-", "−"))
-        for value in values
+        number_cell(estimate_value, display_factor=display_factor)
+        if estimate_value is None or not math.isfinite(estimate_value)
+        else Cell(
+            estimate_value,
+            to_uncertainty((estimate_value,), std or 0.0, display_factor)[0].replace("-", "−"),
+        )
+        for estimate_value in estimate_values
     )
 
 
@@ -439,31 +451,33 @@ def unreported_parameters(
         coefficient is valid for one order only, as its unit shows.
     """
     return frozenset(
-        name
-        for order in unsupported_orders
-        for name in (order, COEFFICIENT_OF[order])
-        if structure.has(name)
+        parameter_name
+        for order_name in unsupported_orders
+        for parameter_name in (order_name, COEFFICIENT_OF[order_name])
+        if structure.has(parameter_name)
     )
 
 
 def mark_cell(cell: Cell) -> Cell:
-    """Return a cell in grey with the mark of numbers that are not reported; dashes get no mark."""
+    """Return a cell in grey with the symbol † for "not reported"; a dash gets no symbol."""
     return grey_cell(
         cell if cell.value is None else replace(cell, text=cell.text + NOT_REPORTED_MARK)
     )
 
 
 def grey_cell(cell: Cell) -> Cell:
-    """Return a cell in grey, such as a number that belongs to a marked number."""
+    """Return a cell in grey, such as the standard deviation of a number that is not reported."""
     return replace(cell, doubtful=cell.value is not None)
 
 
 def footnotes(unsupported_orders: Collection[str]) -> tuple[str, ...]:
-    """Return the note that explains the mark, if an order is not reported; else nothing."""
+    """Return the note on the symbol † if fractional orders are not reported, else nothing."""
     if not unsupported_orders:
         return ()
-    orders = " or ".join(_ORDER_SYMBOLS[order] for order in sorted(unsupported_orders))
+    order_symbols = " or ".join(
+        _ORDER_SYMBOLS[order_name] for order_name in sorted(unsupported_orders)
+    )
     return (
-        f"{NOT_REPORTED_MARK} not reported: the data support no order {orders}. The number belongs "
-        "to its curve, not to the antenna.",
+        f"{NOT_REPORTED_MARK} not reported: the data support no order {order_symbols}. The number "
+        "belongs to its curve, not to the antenna.",
     )

@@ -33,16 +33,16 @@ _KIND_DESCRIPTIONS = {
 """Descriptions of the kinds of contact, by key."""
 
 
-def touches_table(sessions: Sequence[TouchedSession]) -> Table:
+def touches_table(touched_sessions: Sequence[TouchedSession]) -> Table:
     """Return the table of the touches of all sessions.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with their touches.
     """
-    has_several_sessions = len(sessions) > 1
-    columns = (
+    has_several_sessions = len(touched_sessions) > 1
+    table_columns = (
         Column("Session" if has_several_sessions else "", "session", TEXT_FORMAT),
         Column("Touch", "number"),
         Column("Time (s)", "time_s"),
@@ -52,13 +52,17 @@ def touches_table(sessions: Sequence[TouchedSession]) -> Table:
         Column("Stiffness (N/m)", "stiffness_n_per_m"),
         Column("Kind", "kind", TEXT_FORMAT),
     )
-    rows = [_touch_row(session, touch) for session in sessions for touch in session.touches]
+    table_rows = [
+        _touch_row(session, touch) for session in touched_sessions for touch in session.touches
+    ]
     return Table(
         "touches",
         "Touches",
-        columns,
-        tuple(rows),
-        ("± or to: 95 % interval; the angle is that of the motor at the touch.",) if rows else (),
+        table_columns,
+        tuple(table_rows),
+        ("± or to: 95 % interval; the angle is that of the motor at the touch.",)
+        if table_rows
+        else (),
         grouped=has_several_sessions,
     )
 
@@ -74,31 +78,42 @@ def _touch_row(session: TouchedSession, touch: Touch) -> dict[str, Entry]:
         if estimate is None
         else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
     }
-    estimates: dict[str, tuple[Estimated | None, float]] = {}
+    estimate_offsets: dict[str, tuple[Estimated | None, float]] = {}
     if estimate is not None:
-        estimates = {
+        estimate_offsets = {
             "time_s": (estimate.time_s, touch.start_s),
             "x_m": (estimate.x_m, 0.0),
             "force_n": (estimate.force_n, 0.0),
             "stiffness_n_per_m": (estimate.stiffness_n_per_m, 0.0),
         }
     for key in ("time_s", "x_m", "force_n", "stiffness_n_per_m"):
-        quantity, offset = estimates.get(key, (None, 0.0))
-        row[key] = _estimate_cell(quantity, offset)
-        row[f"{key}_std"] = None if quantity is None else quantity.std
+        estimated_quantity, display_offset = estimate_offsets.get(key, (None, 0.0))
+        row[key] = _estimate_cell(estimated_quantity, display_offset)
+        row[f"{key}_std"] = None if estimated_quantity is None else estimated_quantity.std
     return row
 
 
-def _estimate_cell(quantity: Estimated | None, offset: float) -> Cell:
+def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) -> Cell:
     """Return the cell of an estimate with its 95 % interval; a dash without an estimate."""
-    if quantity is None:
+    if estimated_quantity is None:
         return number_cell(None)
-    value = quantity.value + offset
-    low, high = (limit + offset for limit in quantity.interval_95)
-    if abs(value - (low + high) / 2) > _MOST_INTERVAL_ASYMMETRY * (high - low):
-        digits = decimals((high - low) / 2)
-        return Cell(value, f"{low:.{digits}f} to {high:.{digits}f}".replace("-", "−"))
-    return Cell(value, with_half_width(value, (low, high)).replace("-", "−"))
+    shown_value = estimated_quantity.value + display_offset
+    lower_limit, upper_limit = (
+        interval_limit + display_offset for interval_limit in estimated_quantity.interval_95
+    )
+    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MOST_INTERVAL_ASYMMETRY * (
+        upper_limit - lower_limit
+    ):
+        decimal_digits = decimals((upper_limit - lower_limit) / 2)
+        return Cell(
+            shown_value,
+            f"{lower_limit:.{decimal_digits}f} to {upper_limit:.{decimal_digits}f}".replace(
+                "-", "−"
+            ),
+        )
+    return Cell(
+        shown_value, with_half_width(shown_value, (lower_limit, upper_limit)).replace("-", "−")
+    )
 
 
 def session_lines(session: TouchedSession) -> list[str]:
@@ -109,34 +124,40 @@ def session_lines(session: TouchedSession) -> list[str]:
     session : TouchedSession
         Session with its touches.
     """
-    count = len(session.touches)
-    touch_count_text = "no touch" if count == 0 else "1 touch" if count == 1 else f"{count} touches"
-    by = "during the session" if session.found == "loop" else "in the record"
-    detection_text = f", detected {by}" if count else ""
-    validity = f" {session.validity.sentence}" if count else ""
+    touch_count = len(session.touches)
+    touch_count_text = (
+        "no touch"
+        if touch_count == 0
+        else "1 touch"
+        if touch_count == 1
+        else f"{touch_count} touches"
+    )
+    detection_phrase = "during the session" if session.found == "loop" else "in the record"
+    detection_text = f", detected {detection_phrase}" if touch_count else ""
+    validity_text = f" {session.validity.sentence}" if touch_count else ""
     return [
         f"{session.path.name}: {touch_count_text}{detection_text}. "
-        f"Model: {model_words(session)}.{validity}",
+        f"Model: {model_words(session)}.{validity_text}",
         *(f"Warning: {sentence}" for sentence in session.warnings),
     ]
 
 
 def model_words(session: TouchedSession) -> str:
-    """Return the source of the beam model as text."""
-    source = session.model.source
-    return "the nominal beam of the attached profile" if source == "profile" else source
+    """Return as text from where the parameters of a session's beam model are."""
+    model_source = session.model.source
+    return "the nominal beam of the attached profile" if model_source == "profile" else model_source
 
 
 def touches_document(
-    sessions: Sequence[TouchedSession], errors: Mapping[str, str]
+    touched_sessions: Sequence[TouchedSession], error_messages: Mapping[str, str]
 ) -> dict[str, Any]:
     """Return the touches of all sessions as one JSON document.
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         Sessions with their touches.
-    errors : mapping of str to str
+    error_messages : mapping of str to str
         Message for each file that could not be analysed.
 
     Returns
@@ -144,7 +165,7 @@ def touches_document(
     dict
         ``versions``, ``touches`` and ``errors``: lists of objects that name their file.
     """
-    content: dict[str, Any] = finite(
+    document_content: dict[str, Any] = finite(
         {
             "versions": versions(),
             "touches": [
@@ -154,21 +175,24 @@ def touches_document(
                     "validity": session.validity.as_json(),
                     **touch.as_dict(),
                 }
-                for session in sessions
+                for session in touched_sessions
                 for touch in session.touches
             ],
-            "errors": [{"file": file, "message": message} for file, message in errors.items()],
+            "errors": [
+                {"file": file_path, "message": message}
+                for file_path, message in error_messages.items()
+            ],
         }
     )
-    return content
+    return document_content
 
 
 # Folder
 
 
 def write_touch_report(
-    sessions: Sequence[TouchedSession],
-    errors: Mapping[str, str],
+    touched_sessions: Sequence[TouchedSession],
+    error_messages: Mapping[str, str],
     folder: Path,
 ) -> None:
     """Write the report of touches into a folder.
@@ -177,9 +201,9 @@ def write_touch_report(
 
     Parameters
     ----------
-    sessions : sequence of TouchedSession
+    touched_sessions : sequence of TouchedSession
         At least one session.
-    errors : mapping of str to str
+    error_messages : mapping of str to str
         Message for each file that could not be analysed.
     folder : Path
         Existing folder that contains none of these files.
@@ -195,41 +219,45 @@ def write_touch_report(
 
     pictures = []
     with style.figure_style():
-        for illustration in touch_illustrations(sessions):
-            stem = folder / "figures" / illustration.name
+        for illustration in touch_illustrations(touched_sessions):
+            figure_stem = folder / "figures" / illustration.name
             picture = style.save_picture(
-                illustration.figure, stem, illustration.description, DEFAULT_FORMATS
+                illustration.figure, figure_stem, illustration.description, DEFAULT_FORMATS
             )
             pictures.append(picture)
-    table = touches_table(sessions)
-    write_new(folder / "tables" / "touches.csv", csv_text(table))
-    write_new(folder / "touches.json", document_text(touches_document(sessions, errors)))
-    text = pages.page(
+    touch_table = touches_table(touched_sessions)
+    write_new(folder / "tables" / "touches.csv", csv_text(touch_table))
+    write_new(
+        folder / "touches.json", document_text(touches_document(touched_sessions, error_messages))
+    )
+    page_html = pages.page(
         "touch.html",
-        title=sessions[0].path.stem if len(sessions) == 1 else f"{len(sessions)} sessions",
-        files=", ".join(session.path.name for session in sessions),
+        title=touched_sessions[0].path.stem
+        if len(touched_sessions) == 1
+        else f"{len(touched_sessions)} sessions",
+        files=", ".join(session.path.name for session in touched_sessions),
         first=(),
-        sentences=[line for session in sessions for line in session_lines(session)[:1]],
+        sentences=[line for session in touched_sessions for line in session_lines(session)[:1]],
         experiments=(),
         warnings=[
             *(
                 f"{session.path.name}: {sentence}"
-                for session in sessions
+                for session in touched_sessions
                 for sentence in session.warnings
             ),
-            *(f"Left out: {message}" for message in errors.values()),
+            *(f"Left out: {message}" for message in error_messages.values()),
         ],
         pictures=pictures,
-        tables=(table,) if table.rows else (),
+        tables=(touch_table,) if touch_table.rows else (),
         paper_pictures=(),
         paper_tables=(),
-        how=[*_collect_facts(sessions), pages.versions(datetime.now().astimezone())],
+        how=[*_collect_facts(touched_sessions), pages.versions(datetime.now().astimezone())],
     )
-    write_new(folder / "report.html", text)
+    write_new(folder / "report.html", page_html)
 
 
-def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
-    """Return the facts on sessions, model and estimator."""
+def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
+    """Return tables of (name, text) on sessions, model and estimator, for the HTML page."""
     return [
         (
             "Sessions",
@@ -239,10 +267,13 @@ def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
                     f"{session.rate_hz:g} Hz, "
                     + ("torque and base shear" if session.has_shear else "torque alone"),
                 )
-                for session in sessions
+                for session in touched_sessions
             ],
         ),
-        ("Model", sorted({(model_words(session), _beam_text(session)) for session in sessions})),
+        (
+            "Model",
+            sorted({(model_words(session), _beam_text(session)) for session in touched_sessions}),
+        ),
         (
             "Estimate",
             [
@@ -265,8 +296,8 @@ def _collect_facts(sessions: Sequence[TouchedSession]) -> list[Facts]:
 
 def _beam_text(session: TouchedSession) -> str:
     """Return length, density and bending stiffness of a session's beam model as text."""
-    beam = session.model.beam
+    model_beam = session.model.beam
     return (
-        f"length {beam.length_m:g} m, density {beam.density_kg_per_m:.5g} kg/m, bending stiffness "
-        f"{beam.bending_stiffness_n_m2:.5g} N·m²"
+        f"length {model_beam.length_m:g} m, density {model_beam.density_kg_per_m:.5g} kg/m, "
+        f"bending stiffness {model_beam.bending_stiffness_n_m2:.5g} N·m²"
     )

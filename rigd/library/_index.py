@@ -75,7 +75,7 @@ StampedRow = tuple[str, SessionRow]
 
 
 class Index:
-    """Index of the sessions in one folder.
+    """Index file with the data of the sessions in one folder (SQLite).
 
     Parameters
     ----------
@@ -88,33 +88,38 @@ class Index:
         self._path = folder / INDEX_NAME
 
     def read(self) -> dict[str, StampedRow]:
-        """Return the index's rows with their stamps, by file name; empty without a valid index."""
+        """Return the index's rows by file name, each with the size and time (stamp) of its files.
+
+        The dictionary is empty without a valid index.
+        """
         if not self._is_own_index():
             return {}
-        rows: dict[str, StampedRow] = {}
+        indexed_rows: dict[str, StampedRow] = {}
         try:
             with self._connection("ro") as database:
                 if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
                     return {}
-                columns = ", ".join(("file", "stamp", *_COLUMNS_TO_READ))
-                for file, stamp, *values in database.execute(f"SELECT {columns} FROM sessions"):
+                column_list = ", ".join(("file", "stamp", *_COLUMNS_TO_READ))
+                for file_name, stamp, *column_values in database.execute(
+                    f"SELECT {column_list} FROM sessions"
+                ):
                     with contextlib.suppress(ValueError, TypeError):  # the row is rebuilt
-                        rows[file] = (
+                        indexed_rows[file_name] = (
                             stamp,
                             self._row_from_values(
-                                file, dict(zip(_COLUMNS_TO_READ, values, strict=True))
+                                file_name, dict(zip(_COLUMNS_TO_READ, column_values, strict=True))
                             ),
                         )
         except sqlite3.Error:  # locked for long, or damaged
             return {}
-        return rows
+        return indexed_rows
 
-    def write(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
+    def write(self, new_rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
         """Store new rows in the index and remove rows of missing files, if the index is writable.
 
         Parameters
         ----------
-        rows
+        new_rows
             New and changed rows by file name.
         missing_files
             Names of files that no longer exist.
@@ -122,48 +127,52 @@ class Index:
         if self._path.exists() and not self._is_own_index():
             return  # the file is not an index of this program
         try:
-            self._store(rows, missing_files)
+            self._store(new_rows, missing_files)
         except sqlite3.Error as error:
             if error.sqlite_errorcode & 0xFF not in _DAMAGE_ERROR_CODES:
                 return  # a folder that cannot be written to, a full disk, a lock held for long
             with contextlib.suppress(OSError, sqlite3.Error):  # the session files contain all data
                 self._path.unlink()
-                self._store(rows, missing_files)
+                self._store(new_rows, missing_files)
 
-    def _store(self, rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
+    def _store(self, new_rows: Mapping[str, StampedRow], missing_files: Collection[str]) -> None:
         """Store and remove rows in one transaction, and create the table if necessary."""
         with self._connection("rwc") as database:
             database.execute("BEGIN IMMEDIATE")
             if database.execute("PRAGMA user_version").fetchone() != (_INDEX_VERSION,):
-                columns = ", ".join(f"{name} {kind}" for name, kind in _SQL_TYPES.items())
+                column_definitions = ", ".join(
+                    f"{column_name} {sql_type}" for column_name, sql_type in _SQL_TYPES.items()
+                )
                 database.execute("DROP TABLE IF EXISTS sessions")
                 database.execute(
-                    f"CREATE TABLE sessions (file TEXT PRIMARY KEY, {columns}, stamp TEXT)"
+                    f"CREATE TABLE sessions (file TEXT PRIMARY KEY, {column_definitions}, stamp "
+                    "TEXT)"
                 )
                 database.execute(f"PRAGMA application_id = {_APPLICATION_ID}")
                 database.execute(f"PRAGMA user_version = {_INDEX_VERSION}")
             database.executemany(
                 "DELETE FROM sessions WHERE file = ?",
-                [(file,) for file in missing_files if _is_storable_name(file)],
+                [(file_name,) for file_name in missing_files if _is_storable_name(file_name)],
             )
-            names = ("file", "stamp", *_SQL_TYPES)
-            placeholders = ", ".join("?" * len(names))
+            column_names = ("file", "stamp", *_SQL_TYPES)
+            placeholders = ", ".join("?" * len(column_names))
             database.executemany(
-                f"INSERT OR REPLACE INTO sessions ({', '.join(names)}) VALUES ({placeholders})",
+                f"INSERT OR REPLACE INTO sessions ({', '.join(column_names)}) VALUES "
+                f"({placeholders})",
                 [
-                    (file, stamp, *_column_values(row))
-                    for file, (stamp, row) in rows.items()
-                    if _is_storable_name(file)
+                    (file_name, stamp, *_column_values(row))
+                    for file_name, (stamp, row) in new_rows.items()
+                    if _is_storable_name(file_name)
                 ],
             )
             database.execute("COMMIT")
 
     @contextmanager
-    def _connection(self, mode: str) -> Iterator[sqlite3.Connection]:
+    def _connection(self, open_mode: str) -> Iterator[sqlite3.Connection]:
         """Provide a connection to the index, without implicit transactions."""
         # Explicit transactions: the implicit ones would commit before a table is created.
         database = sqlite3.connect(
-            f"{self._path.absolute().as_uri()}?mode={mode}",
+            f"{self._path.absolute().as_uri()}?mode={open_mode}",
             uri=True,
             timeout=_MOST_LOCK_WAIT_S,
             isolation_level=None,
@@ -174,10 +183,10 @@ class Index:
             database.close()
 
     def _is_own_index(self) -> bool:
-        """Return whether the file is an index of this program, or empty."""
+        """Return True if the index file was written by this program or is empty."""
         try:
-            with self._path.open("rb") as file:
-                first_bytes = file.read(_APPLICATION_ID_POSITION.stop)
+            with self._path.open("rb") as index_file:
+                first_bytes = index_file.read(_APPLICATION_ID_POSITION.stop)
         except OSError:
             return False
         application_id = _APPLICATION_ID.to_bytes(4, "big")
@@ -186,47 +195,53 @@ class Index:
             and first_bytes[_APPLICATION_ID_POSITION] == application_id
         )
 
-    def _row_from_values(self, file: str, values: dict[str, object]) -> SessionRow:
+    def _row_from_values(self, file_name: str, column_values: dict[str, object]) -> SessionRow:
         """Return the session row with the given column values.
 
         It raises ValueError or TypeError if a value is invalid.
         """
-        report = values["report"]
-        for name, value in values.items():
-            if name != "report" and not isinstance(value, _PYTHON_TYPES[_SQL_TYPES[name]]):
-                raise TypeError(name)
-        values["modes"] = usable_modes(json.loads(str(values["modes"])))
-        validity = json.loads(str(values["validity"]))
-        values["validity"] = None if validity is None else Validity.of_document(validity).as_json()
-        values["meta"] = dict(json.loads(str(values["meta"])))
-        values["report"] = None if report is None else self._folder / str(report)
-        return SessionRow(path=self._folder / file, **values)  # type: ignore[arg-type]
+        report_name = column_values["report"]
+        for column_name, column_value in column_values.items():
+            if column_name != "report" and not isinstance(
+                column_value, _PYTHON_TYPES[_SQL_TYPES[column_name]]
+            ):
+                raise TypeError(column_name)
+        column_values["modes"] = usable_modes(json.loads(str(column_values["modes"])))
+        validity_document = json.loads(str(column_values["validity"]))
+        column_values["validity"] = (
+            None if validity_document is None else Validity.of_document(validity_document).as_json()
+        )
+        column_values["meta"] = dict(json.loads(str(column_values["meta"])))
+        column_values["report"] = None if report_name is None else self._folder / str(report_name)
+        return SessionRow(path=self._folder / file_name, **column_values)  # type: ignore[arg-type]
 
 
 def _column_values(row: SessionRow) -> list[object]:
     """Return a row's values in the order of the index's columns."""
-    values: dict[str, object] = {field.name: getattr(row, field.name) for field in fields(row)}
-    values["start_utc"] = None if row.start_utc_ns is None else _iso_time(row.start_utc_ns)
-    values["modes"] = json.dumps(row.modes)
-    values["validity"] = json.dumps(row.validity)
-    values["meta"] = json.dumps(row.meta)
-    values["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
-    return [values[name] for name in _SQL_TYPES]
+    values_by_name: dict[str, object] = {
+        row_field.name: getattr(row, row_field.name) for row_field in fields(row)
+    }
+    values_by_name["start_utc"] = None if row.start_utc_ns is None else _iso_time(row.start_utc_ns)
+    values_by_name["modes"] = json.dumps(row.modes)
+    values_by_name["validity"] = json.dumps(row.validity)
+    values_by_name["meta"] = json.dumps(row.meta)
+    values_by_name["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))
+    return [values_by_name[name] for name in _SQL_TYPES]
 
 
 def _iso_time(utc_ns: int) -> str | None:
     """Return a time in ns since 1970 as UTC in ISO 8601; None if it is beyond the calendar."""
     try:
-        time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
+        utc_time = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(microseconds=utc_ns // 1000)
     except OverflowError:
         return None
-    return time.isoformat(timespec="milliseconds")
+    return utc_time.isoformat(timespec="milliseconds")
 
 
-def _is_storable_name(file: str) -> bool:
+def _is_storable_name(file_name: str) -> bool:
     """Return whether a file name is valid text. Files with other names are read each time."""
     try:
-        file.encode()
+        file_name.encode()
     except UnicodeEncodeError:
         return False
     return True

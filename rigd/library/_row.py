@@ -41,7 +41,7 @@ Document = dict[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class SessionRow:
-    """Session of a folder with the data from its files.
+    """Data of one session in a folder, from the session file and the files of its results.
 
     Unknown values are empty texts or None. Texts are printable and cut to 1000 characters.
     """
@@ -99,13 +99,17 @@ class SessionRow:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as a dictionary for JSON."""
-        document = {field.name: getattr(self, field.name) for field in fields(self)}
-        report = None if self.report is None else str(self.report)
-        return document | {"path": str(self.path), "report": report, "modes": list(self.modes)}
+        document = {row_field.name: getattr(self, row_field.name) for row_field in fields(self)}
+        report_path = None if self.report is None else str(self.report)
+        return document | {"path": str(self.path), "report": report_path, "modes": list(self.modes)}
 
 
-def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[SessionRow, bool]:
-    """Return the row of a session. Files that cannot be read are reported in the row.
+def read_row(
+    path: Path, quick_look: Path | None, report_folder: Path | None
+) -> tuple[SessionRow, bool]:
+    """Return the data of a session, and whether they can be stored in the index.
+
+    A file that cannot be read is reported in the row.
 
     Parameters
     ----------
@@ -113,7 +117,7 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
         Path of the session file.
     quick_look
         File with the session's quick look; None if there is none.
-    report
+    report_folder
         Folder of the session's last report; None if there is none.
 
     Returns
@@ -131,59 +135,61 @@ def read_row(path: Path, quick_look: Path | None, report: Path | None) -> tuple[
     from rigd.session import SessionAccessError, SessionError, read_summary
     from rigd.session.user_metadata import added_metadata
 
-    size = path.stat().st_size
-    name = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
-    results_of_analysis: dict[str, Any] = _modes_of_results(quick_look, report)
-    if report is not None and (report / REPORT_PAGE).is_file():
-        results_of_analysis["report"] = report / REPORT_PAGE
+    file_bytes = path.stat().st_size
+    session_id = path.name.removesuffix(INCOMPLETE_SUFFIX).removesuffix(SESSION_SUFFIX)
+    results_of_analysis: dict[str, Any] = _modes_of_results(quick_look, report_folder)
+    if report_folder is not None and (report_folder / REPORT_PAGE).is_file():
+        results_of_analysis["report"] = report_folder / REPORT_PAGE
     try:
-        summary = read_summary(path)
+        file_summary = read_summary(path)
     except SessionError as error:
         path.stat()  # raises if the file no longer exists
         row = SessionRow(
-            name,
+            session_id,
             path,
-            size,
+            file_bytes,
             outcome="unreadable",
             problem=printable(str(error)),
             **results_of_analysis,
         )
         return row, not isinstance(error, SessionAccessError)
-    metadata, outcome = summary.metadata, summary.outcome or {}
-    outcome_text = _text_of_key(outcome, "outcome") or "unknown"
-    if summary.recording:
+    file_metadata, outcome_document = file_summary.metadata, file_summary.outcome or {}
+    outcome_text = _text_of_key(outcome_document, "outcome") or "unknown"
+    if file_summary.recording:
         outcome_text = "recording"
-    elif summary.problem:
+    elif file_summary.problem:
         outcome_text = "incomplete"
-    scheduled_ticks = _count_of_key(outcome, "scheduled")
-    tick_count = summary.samples if scheduled_ticks is None else scheduled_ticks
-    rate_hz = _number_of_key(metadata, "rate_hz") or 0.0
-    user_metadata = list(added_metadata(metadata).items())[:_MOST_META_ENTRIES]
+    scheduled_ticks = _count_of_key(outcome_document, "scheduled")
+    tick_count = file_summary.samples if scheduled_ticks is None else scheduled_ticks
+    rate_hz = _number_of_key(file_metadata, "rate_hz") or 0.0
+    user_metadata = list(added_metadata(file_metadata).items())[:_MOST_META_ENTRIES]
     row = SessionRow(
-        id=name,
+        id=session_id,
         path=path,
-        size_bytes=size,
-        start_utc_ns=_count_of_key(metadata, "start_utc_ns"),
-        profile=_text_of_key(metadata, "profile"),
-        specimen=_text_of_key(metadata, "specimen"),
-        operator=_text_of_key(metadata, "operator"),
-        excitation=_text_of_key(metadata, "excitation"),
-        note=_text_of_key(metadata, "note"),
+        size_bytes=file_bytes,
+        start_utc_ns=_count_of_key(file_metadata, "start_utc_ns"),
+        profile=_text_of_key(file_metadata, "profile"),
+        specimen=_text_of_key(file_metadata, "specimen"),
+        operator=_text_of_key(file_metadata, "operator"),
+        excitation=_text_of_key(file_metadata, "excitation"),
+        note=_text_of_key(file_metadata, "note"),
         outcome=outcome_text,
-        reason=_text_of_key(outcome, "reason"),
+        reason=_text_of_key(outcome_document, "reason"),
         duration_s=_finite_or_none(tick_count / rate_hz)
         if tick_count is not None and rate_hz > 0
         else None,
         scheduled=scheduled_ticks,
-        recorded=summary.samples,
-        missed=_count_of_key(outcome, "missed"),
-        late=_count_of_key(outcome, "late"),
-        lost=_count_of_key(outcome, "lost"),
+        recorded=file_summary.samples,
+        missed=_count_of_key(outcome_document, "missed"),
+        late=_count_of_key(outcome_document, "late"),
+        lost=_count_of_key(outcome_document, "lost"),
         meta={
-            _cut_text(name): _cut_text(value) if isinstance(value, str) else value
-            for name, value in user_metadata
+            _cut_text(entry_name): _cut_text(entry_value)
+            if isinstance(entry_value, str)
+            else entry_value
+            for entry_name, entry_value in user_metadata
         },
-        problem=summary.problem,
+        problem=file_summary.problem,
         **results_of_analysis,
     )
     return row, True
@@ -194,23 +200,25 @@ def _cut_text(text: str) -> str:
     return printable(text, _MOST_TEXT_CHARACTERS)
 
 
-def _text_of_key(values: Mapping[str, str], key: str) -> str:
+def _text_of_key(key_texts: Mapping[str, str], key: str) -> str:
     """Return the text of a key, cut to 1000 characters; empty if there is none."""
-    return _cut_text(values.get(key, "").strip())
+    return _cut_text(key_texts.get(key, "").strip())
 
 
-def _count_of_key(values: Mapping[str, str], key: str) -> int | None:
+def _count_of_key(key_texts: Mapping[str, str], key: str) -> int | None:
     """Return the non-negative integer that a key states; None if there is none below 2**63."""
-    text = values.get(key, "")
+    count_text = key_texts.get(key, "")
     # More digits are not a count and exceed 64 bits.
-    is_count = text.isascii() and text.isdigit() and len(text) <= _MOST_COUNT_DIGITS + 1
-    return int(text) if is_count and int(text) < 2**63 else None
+    is_count = (
+        count_text.isascii() and count_text.isdigit() and len(count_text) <= _MOST_COUNT_DIGITS + 1
+    )
+    return int(count_text) if is_count and int(count_text) < 2**63 else None
 
 
-def _number_of_key(values: Mapping[str, str], key: str) -> float | None:
+def _number_of_key(key_texts: Mapping[str, str], key: str) -> float | None:
     """Return the number that a key states; None if it is not a finite number."""
     try:
-        number = float(values.get(key, "")[:400])
+        number = float(key_texts.get(key, "")[:400])
     except ValueError:
         return None
     return number if isfinite(number) else None
@@ -219,12 +227,17 @@ def _number_of_key(values: Mapping[str, str], key: str) -> float | None:
 # Modes
 
 
-def _modes_of_results(quick_look: Path | None, report: Path | None) -> Document:
-    """Return modes and validity from the report, else from the quick look, else nothing."""
-    if report is not None:
-        for headline in _list_in_document(_read_json(report / RESULTS_FILE), "headlines"):
-            if modes := usable_modes(_list_in_document(headline, "modes")):
-                return _with_validity(modes, headline)
+def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Document:
+    """Return the modes and the validity of the linear model from a session's results.
+
+    The report has priority over the quick look. Without results the dictionary is empty.
+    """
+    if report_folder is not None:
+        for headline_document in _list_in_document(
+            _read_json(report_folder / RESULTS_FILE), "headlines"
+        ):
+            if modes := usable_modes(_list_in_document(headline_document, "modes")):
+                return _with_validity(modes, headline_document)
     quick_look_document = None if quick_look is None else read_quick_look(quick_look)
     return (
         {}
@@ -251,19 +264,22 @@ def _read_json(path: Path) -> object:
 
 def _list_in_document(document: object, key: str) -> list[object]:
     """Return the list that a key of a document has; empty if there is none."""
-    value = document.get(key) if isinstance(document, dict) else None
-    return value if isinstance(value, list) else []
+    listed_value = document.get(key) if isinstance(document, dict) else None
+    return listed_value if isinstance(listed_value, list) else []
 
 
-def usable_modes(modes: object) -> tuple[Mode, ...]:
+def usable_modes(mode_list: object) -> tuple[Mode, ...]:
     """Return the modes of a list that are visible in the record and have finite numbers."""
     return tuple(
-        {name: mode[name] for name in ("frequency_hz", "damping_ratio", "participation", "source")}
-        for mode in modes_of(modes)
-        if mode["shown"]
+        {
+            quantity_key: mode_document[quantity_key]
+            for quantity_key in ("frequency_hz", "damping_ratio", "participation", "source")
+        }
+        for mode_document in modes_of(mode_list)
+        if mode_document["shown"]
     )
 
 
-def _finite_or_none(value: float) -> float | None:
+def _finite_or_none(number: float) -> float | None:
     """Return a number, or None if it is not finite."""
-    return value if isfinite(value) else None
+    return number if isfinite(number) else None

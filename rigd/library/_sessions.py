@@ -88,11 +88,16 @@ def list_sessions(
         "outcome": outcome,
     }
     required_values = {
-        name: value.strip().casefold() for name, value in requested_values.items() if value
+        field_name: required_value.strip().casefold()
+        for field_name, required_value in requested_values.items()
+        if required_value
     }
 
     def fits(row: SessionRow) -> bool:
-        if any(getattr(row, name).casefold() != value for name, value in required_values.items()):
+        if any(
+            getattr(row, field_name).casefold() != required_value
+            for field_name, required_value in required_values.items()
+        ):
             return False
         if first_ns is not None and (row.start_utc_ns is None or row.start_utc_ns < first_ns):
             return False
@@ -100,34 +105,38 @@ def list_sessions(
             return False
         return not text or text.casefold() in _searchable_text(row)
 
-    rows = [row for row in _read_rows(Path(folder), on_progress) if fits(row)]
-    return sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id), reverse=True)
+    matching_rows = [row for row in _read_rows(Path(folder), on_progress) if fits(row)]
+    return sorted(matching_rows, key=lambda row: (row.start_utc_ns or 0, row.id), reverse=True)
 
 
 def _searchable_text(row: SessionRow) -> str:
     """Return all texts of a row in which `list_sessions` searches, in case-folded form."""
-    texts = (row.id, row.specimen, row.operator, row.excitation, row.note, row.reason)
-    user_metadata = (f"{name}={value}" for name, value in row.meta.items())
-    return "\n".join((*texts, *user_metadata)).casefold()
+    row_texts = (row.id, row.specimen, row.operator, row.excitation, row.note, row.reason)
+    user_metadata = (f"{entry_name}={entry_value}" for entry_name, entry_value in row.meta.items())
+    return "\n".join((*row_texts, *user_metadata)).casefold()
 
 
-def _time_ns(given_time: str | datetime | None, name: str) -> int | None:
+def _time_ns(given_time: str | datetime | None, argument_name: str) -> int | None:
     """Return a time in ns since 1970; for a date without time, the start or end of its day."""
     if given_time is None or given_time == "":
         return None
     try:
-        moment = (
+        parsed_time = (
             given_time
             if isinstance(given_time, datetime)
             else datetime.fromisoformat(given_time.strip())
         )
-        if name == "until" and not isinstance(given_time, datetime) and _is_date_only(given_time):
-            moment = datetime.combine(moment, time()) + timedelta(days=1, microseconds=-1)
+        if (
+            argument_name == "until"
+            and not isinstance(given_time, datetime)
+            and _is_date_only(given_time)
+        ):
+            parsed_time = datetime.combine(parsed_time, time()) + timedelta(days=1, microseconds=-1)
         # Without an offset it is local time.
-        return int(moment.timestamp()) * _NS_PER_S + moment.microsecond * 1000
+        return int(parsed_time.timestamp()) * _NS_PER_S + parsed_time.microsecond * 1000
     except (ValueError, OverflowError, OSError):
         raise LibraryError(
-            f"{name} = {str(given_time)[:40]!r} is not a date; write 2026-11-20 or "
+            f"{argument_name} = {str(given_time)[:40]!r} is not a date; write 2026-11-20 or "
             "2026-11-20T14:30."
         ) from None
 
@@ -143,54 +152,66 @@ def _is_date_only(text: str) -> bool:
 class _SessionFiles:
     """Session file in a folder, with its quick look and its last report."""
 
-    def __init__(self, entry: os.DirEntry[str]) -> None:
-        self.path = Path(entry.path)
-        self.stamp = _stamp_of(entry.path)
+    def __init__(self, folder_entry: os.DirEntry[str]) -> None:
+        self.path = Path(folder_entry.path)
+        self.stamp = _stamp_of(folder_entry.path)
         self.quick_look: Path | None = None
         self.report: Path | None = None
 
-    def add_results(self, quick_look: Path | None, report: Path | None) -> None:
-        """Add quick look and report, and append their stamps to the stamp of the session file."""
-        self.quick_look, self.report = quick_look, report
+    def add_results(self, quick_look: Path | None, report_folder: Path | None) -> None:
+        """Add the paths of quick look and report.
+
+        Their sizes and times are appended to those of the session file.
+        """
+        self.quick_look, self.report = quick_look, report_folder
         if quick_look is not None:
             self.stamp += f" look {_stamp_of(quick_look)}"
-        if report is not None:
+        if report_folder is not None:
             self.stamp += (
-                f" {report.name} {_stamp_of(report / RESULTS_FILE)}"
-                f" {_stamp_of(report / REPORT_PAGE)}"
+                f" {report_folder.name} {_stamp_of(report_folder / RESULTS_FILE)}"
+                f" {_stamp_of(report_folder / REPORT_PAGE)}"
             )
 
 
 def _read_rows(folder: Path, on_progress: Callable[[float], None] | None) -> list[SessionRow]:
-    """Return the rows of a folder's sessions from the index or from the files; update the index."""
+    """Return the data of a folder's sessions, from its index or from new or changed files.
+
+    The index is updated.
+    """
     session_files = _find_session_files(folder)
-    index = Index(folder)
-    indexed_rows = index.read()
-    rows: list[SessionRow] = []
+    folder_index = Index(folder)
+    indexed_rows = folder_index.read()
+    all_rows: list[SessionRow] = []
     new_rows: dict[str, StampedRow] = {}
     files_to_read = []
-    for name, file in session_files.items():
-        stamp, row = indexed_rows.get(name, ("", None))
+    for file_name, files_of_session in session_files.items():
+        file_stamp, row = indexed_rows.get(file_name, ("", None))
         # The stamp does not show whether an incomplete file is being recorded.
-        if row is not None and stamp == file.stamp and not name.endswith(INCOMPLETE_SUFFIX):
-            rows.append(row)
+        if (
+            row is not None
+            and file_stamp == files_of_session.stamp
+            and not file_name.endswith(INCOMPLETE_SUFFIX)
+        ):
+            all_rows.append(row)
         else:
-            files_to_read.append(name)
-    for number, name in enumerate(files_to_read, start=1):
-        file = session_files[name]
+            files_to_read.append(file_name)
+    for file_number, file_name in enumerate(files_to_read, start=1):
+        files_of_session = session_files[file_name]
         try:
-            row, is_storable = read_row(file.path, file.quick_look, file.report)
+            row, is_storable = read_row(
+                files_of_session.path, files_of_session.quick_look, files_of_session.report
+            )
         except OSError:  # the file was removed or received its final name
             continue
-        rows.append(row)
-        if is_storable and not name.endswith(INCOMPLETE_SUFFIX):
-            new_rows[name] = file.stamp, row
+        all_rows.append(row)
+        if is_storable and not file_name.endswith(INCOMPLETE_SUFFIX):
+            new_rows[file_name] = files_of_session.stamp, row
         if on_progress is not None:
-            on_progress(number / len(files_to_read))
+            on_progress(file_number / len(files_to_read))
     missing_files = indexed_rows.keys() - session_files.keys()
     if new_rows or missing_files:
-        index.write(new_rows, missing_files)
-    return rows
+        folder_index.write(new_rows, missing_files)
+    return all_rows
 
 
 def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
@@ -202,33 +223,35 @@ def _find_session_files(folder: Path) -> dict[str, _SessionFiles]:
     quick_looks: dict[str, Path] = {}
     reports: dict[str, tuple[int, Path]] = {}
     try:
-        with os.scandir(folder) as entries:
-            for entry in entries:
-                name = entry.name
-                if name.endswith((SESSION_SUFFIX, INCOMPLETE_SUFFIX)):
-                    session_files[name] = _SessionFiles(entry)
-                elif name.endswith(QUICK_LOOK_SUFFIX):
-                    quick_looks[name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(entry.path)
-                elif match := REPORT_FOLDER.fullmatch(name):
-                    number = int((match[2] or "1")[:9])
-                    if number >= reports.get(match[1], (0, None))[0]:
-                        reports[match[1]] = number, Path(entry.path)
+        with os.scandir(folder) as folder_entries:
+            for folder_entry in folder_entries:
+                file_name = folder_entry.name
+                if file_name.endswith((SESSION_SUFFIX, INCOMPLETE_SUFFIX)):
+                    session_files[file_name] = _SessionFiles(folder_entry)
+                elif file_name.endswith(QUICK_LOOK_SUFFIX):
+                    quick_looks[file_name.removesuffix(QUICK_LOOK_SUFFIX)] = Path(folder_entry.path)
+                elif match := REPORT_FOLDER.fullmatch(file_name):
+                    report_number = int((match[2] or "1")[:9])
+                    if report_number >= reports.get(match[1], (0, None))[0]:
+                        reports[match[1]] = report_number, Path(folder_entry.path)
     except OSError as error:
         raise LibraryError(
             f"{folder}: the folder cannot be listed ({error.strerror}); give a folder of session "
             "files."
         ) from None
-    for name, file in session_files.items():
-        if name.endswith(SESSION_SUFFIX):
-            session_name = name.removesuffix(SESSION_SUFFIX)
-            file.add_results(quick_looks.get(session_name), reports.get(session_name, (0, None))[1])
+    for file_name, files_of_session in session_files.items():
+        if file_name.endswith(SESSION_SUFFIX):
+            session_name = file_name.removesuffix(SESSION_SUFFIX)
+            files_of_session.add_results(
+                quick_looks.get(session_name), reports.get(session_name, (0, None))[1]
+            )
     return session_files
 
 
 def _stamp_of(path: str | os.PathLike[str]) -> str:
     """Return size and modification time of a file as text; empty if they cannot be read."""
     try:
-        status = Path(path).stat()
+        file_status = Path(path).stat()
     except OSError:
         return ""
-    return f"{status.st_size} {status.st_mtime_ns}"
+    return f"{file_status.st_size} {file_status.st_mtime_ns}"

@@ -21,7 +21,7 @@ Quantity = Mapping[str, Any]
 
 @dataclass(frozen=True, slots=True)
 class ModeChange:
-    """Change of a mode's frequency or damping ratio between two sessions."""
+    """Change of a mode's frequency or damping ratio between two sessions, and if significant."""
 
     difference: float
     """Value in the later session minus value in the earlier one, in the unit of the quantity."""
@@ -73,12 +73,12 @@ class ModeTrend:
         }
 
 
-def change_between(before: Quantity, after: Quantity) -> ModeChange:
+def change_between(earlier_quantity: Quantity, later_quantity: Quantity) -> ModeChange:
     """Return the change of a frequency or damping ratio between two sessions.
 
     Parameters
     ----------
-    before, after
+    earlier_quantity, later_quantity
         Quantity in the earlier and in the later session.
 
     Returns
@@ -99,24 +99,30 @@ def change_between(before: Quantity, after: Quantity) -> ModeChange:
     >>> change_between(before, {"value": 2.63, "interval_95": [2.62, 2.64]}).significant
     True
     """
-    difference = after["value"] - before["value"]
+    difference = later_quantity["value"] - earlier_quantity["value"]
     if any(
-        quantity.get("interval_95") is None or quantity.get("flag") for quantity in (before, after)
+        quantity.get("interval_95") is None or quantity.get("flag")
+        for quantity in (earlier_quantity, later_quantity)
     ):
         return ModeChange(difference, None)
-    lower, higher = (before, after) if difference >= 0 else (after, before)
+    lower_quantity, higher_quantity = (
+        (earlier_quantity, later_quantity)
+        if difference >= 0
+        else (later_quantity, earlier_quantity)
+    )
     half_width_95 = hypot(
-        lower["interval_95"][1] - lower["value"], higher["value"] - higher["interval_95"][0]
+        lower_quantity["interval_95"][1] - lower_quantity["value"],
+        higher_quantity["value"] - higher_quantity["interval_95"][0],
     )
     return ModeChange(difference, abs(difference) > _SIGNIFICANCE_HALF_WIDTHS * half_width_95 > 0.0)
 
 
-def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
+def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
     """Return the trends of the modes of one specimen over its sessions.
 
     Parameters
     ----------
-    rows
+    session_rows
         Sessions of the specimen in any order. Sessions without modes are ignored.
 
     Returns
@@ -127,14 +133,16 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
         session.
     """
     trends: list[list[TrendPoint]] = []
-    for row in sorted(rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
+    for row in sorted(session_rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
         assigned: set[int] = set()
         for mode in row.modes:
-            frequency, damping = mode["frequency_hz"], mode["damping_ratio"]
+            frequency_estimate, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
             distances = {
-                number: abs(log(frequency["value"] / points[-1].frequency_hz["value"]))
-                for number, points in enumerate(trends)
-                if number not in assigned
+                trend_index: abs(
+                    log(frequency_estimate["value"] / points[-1].frequency_hz["value"])
+                )
+                for trend_index, points in enumerate(trends)
+                if trend_index not in assigned
             }
             nearest_trend = min(distances, key=distances.__getitem__, default=None)
             if nearest_trend is None or distances[nearest_trend] > _MOST_LOG_FREQUENCY_RATIO:
@@ -144,12 +152,12 @@ def mode_trends(rows: Iterable[SessionRow]) -> list[ModeTrend]:
             points = trends[nearest_trend]
             changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
             if points:
-                first = points[0]
+                first_point = points[0]
                 changes = (
-                    change_between(first.frequency_hz, frequency),
-                    change_between(first.damping_ratio, damping),
+                    change_between(first_point.frequency_hz, frequency_estimate),
+                    change_between(first_point.damping_ratio, damping_estimate),
                 )
-            points.append(TrendPoint(row, frequency, damping, *changes))
+            points.append(TrendPoint(row, frequency_estimate, damping_estimate, *changes))
     trends.sort(key=lambda points: float(points[0].frequency_hz["value"]))
     return [ModeTrend(tuple(points)) for points in trends]
 

@@ -71,7 +71,7 @@ class SessionRecordReader:
         seen: int = 0,
         last: LastResponse | None = None,
     ) -> None:
-        self.scene = Scene(session.subject, last=last)
+        self.scene = Scene(session.subject, last_response=last)
         self.t_ns = 0
         self.read_duration_s = 0.0
         self._rate_hz = session.subject.rate_hz

@@ -114,7 +114,7 @@ class FrequencyResponse:
 def checked_records(
     input_: ArrayLike, output: ArrayLike, rate_hz: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return input and output as float arrays after a check; raise if they are not valid.
+    """Return the records of input and output as arrays of floats; raise SpectralError if invalid.
 
     They must have one dimension, equal length and finite values, and the input must not be zero.
 
@@ -132,12 +132,12 @@ def checked_records(
             "Input and output must be two records of one dimension and equal length; "
             f"their shapes are {x.shape} and {y.shape}."
         )
-    for name, record in (("input", x), ("output", y)):
+    for record_name, record in (("input", x), ("output", y)):
         if not np.isfinite(record).all():
             invalid_count = int(np.count_nonzero(~np.isfinite(record)))
             raise SpectralError(
-                f"{invalid_count} of {record.size} samples of the {name} are NaN or infinite; "
-                "fill or cut them before estimating a frequency response."
+                f"{invalid_count} of {record.size} samples of the {record_name} are NaN or "
+                "infinite; fill or cut them before estimating a frequency response."
             )
     if not x.any():
         raise SpectralError(
@@ -175,7 +175,7 @@ class Segmentation:
     """Number of samples of the zero-padded transform, at least those of a segment."""
 
 
-def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
+def segmentation_of(sample_count: int, rate_hz: float) -> Segmentation:
     """Return the default segmentation for a record of known length.
 
     Segments have the duration and transform of the reference paper's. If the record is shorter than
@@ -184,27 +184,34 @@ def segmentation_of(samples: int, rate_hz: float) -> Segmentation:
 
     Parameters
     ----------
-    samples
+    sample_count
         Number of samples in the record.
     rate_hz
         Sampling rate.
     """
-    scale = rate_hz / PAPER_RATE_HZ
-    length, overlap = round(PAPER_SEGMENT_LENGTH * scale), round(PAPER_OVERLAP * scale)
-    if length < 2 or segment_count(samples, length, overlap) == 0:
+    rate_ratio = rate_hz / PAPER_RATE_HZ
+    segment_length, overlap = (
+        round(PAPER_SEGMENT_LENGTH * rate_ratio),
+        round(PAPER_OVERLAP * rate_ratio),
+    )
+    if segment_length < 2 or segment_count(sample_count, segment_length, overlap) == 0:
         try:
-            length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
+            segment_length, overlap = segment_lengths(
+                sample_count, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
+            )
         except SpectralError:
-            length, overlap = max(samples, 2), 0
-    return Segmentation(length, overlap, max(round(PAPER_NFFT * scale), length))
+            segment_length, overlap = max(sample_count, 2), 0
+    return Segmentation(
+        segment_length, overlap, max(round(PAPER_NFFT * rate_ratio), segment_length)
+    )
 
 
-def segment_count(samples: int, segment_length: int, overlap: int) -> int:
+def segment_count(sample_count: int, segment_length: int, overlap: int) -> int:
     """Return the number of whole segments in a record. The samples after them are not used.
 
     Parameters
     ----------
-    samples
+    sample_count
         Number of samples in the record.
     segment_length, overlap
         Number of samples in a segment, and in the overlap of adjacent segments.
@@ -215,10 +222,12 @@ def segment_count(samples: int, segment_length: int, overlap: int) -> int:
     >>> segment_count(120_000, 17266, 2590)
     8
     """
-    return max(0, (samples - overlap) // (segment_length - overlap))
+    return max(0, (sample_count - overlap) // (segment_length - overlap))
 
 
-def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tuple[int, int]:
+def segment_lengths(
+    sample_count: int, segment_total: int, overlap_fraction: float
+) -> tuple[int, int]:
     """Return the largest segment length and overlap for a given number of segments.
 
     The overlap is rounded to the nearest sample. If it is rounded down, as is usual, eight segments
@@ -228,9 +237,9 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
 
     Parameters
     ----------
-    samples
+    sample_count
         Number of samples in the record.
-    segments
+    segment_total
         Number of segments.
     overlap_fraction
         Overlap as a fraction of the segment, from 0 to below 1.
@@ -252,26 +261,34 @@ def segment_lengths(samples: int, segments: int, overlap_fraction: float) -> tup
     >>> segment_lengths(120_000, 8, 0.15)
     (17266, 2590)
     """
-    if segments < 1 or not 0 <= overlap_fraction < 1:
+    if segment_total < 1 or not 0 <= overlap_fraction < 1:
         raise SpectralError(
             "Welch needs at least one segment and an overlap from 0 to below 1 (a fraction of the "
-            f"segment), not {segments} segments with an overlap of {overlap_fraction:g}."
+            f"segment), not {segment_total} segments with an overlap of {overlap_fraction:g}."
         )
 
-    def end_of_last_segment(length: int) -> int:
-        return length + (segments - 1) * (length - round(overlap_fraction * length))
+    def end_of_last_segment(segment_length: int) -> int:
+        return segment_length + (segment_total - 1) * (
+            segment_length - round(overlap_fraction * segment_length)
+        )
 
     # The end grows with the length except for rounding, so start above and decrease.
-    length = int(samples / (1 + (segments - 1) * (1 - overlap_fraction))) + segments + 1
-    while length > 1 and end_of_last_segment(length) > samples:
-        length -= 1
-    overlap = round(overlap_fraction * length)
-    if length < 2 or overlap >= length or end_of_last_segment(length) > samples:
+    segment_length = (
+        int(sample_count / (1 + (segment_total - 1) * (1 - overlap_fraction))) + segment_total + 1
+    )
+    while segment_length > 1 and end_of_last_segment(segment_length) > sample_count:
+        segment_length -= 1
+    overlap = round(overlap_fraction * segment_length)
+    if (
+        segment_length < 2
+        or overlap >= segment_length
+        or end_of_last_segment(segment_length) > sample_count
+    ):
         raise SpectralError(
-            f"A record of {samples} samples is too short for {segments} segments "
+            f"A record of {sample_count} samples is too short for {segment_total} segments "
             f"with an overlap of {overlap_fraction:.0%}; ask for fewer segments."
         )
-    return length, overlap
+    return segment_length, overlap
 
 
 def check_segmentation(segment_length: int, overlap: int, nfft: int) -> None:
@@ -320,9 +337,11 @@ class CrossSpectra:
     segments: int = 0
 
     @classmethod
-    def of_zero_segments(cls, bins: int) -> "CrossSpectra":
-        """Return spectra that are zero in each bin, to which segments can be added."""
-        return cls(np.zeros(bins), np.zeros(bins), np.zeros(bins, dtype=np.complex128))
+    def of_zero_segments(cls, bin_count: int) -> "CrossSpectra":
+        """Return sums of spectra without any segment: zero in each frequency bin."""
+        return cls(
+            np.zeros(bin_count), np.zeros(bin_count), np.zeros(bin_count, dtype=np.complex128)
+        )
 
     def copy(self) -> "CrossSpectra":
         """Return an independent copy of the summed spectra."""
@@ -351,7 +370,7 @@ class CrossSpectra:
         )
 
     def _ratio(self, estimator: Literal["h1", "h2", "hv"]) -> NDArray[np.complex128]:
-        """Return the estimated ratio of output to input in each bin."""
+        """Return the estimated ratio of output to input in each frequency bin."""
         with np.errstate(divide="ignore", invalid="ignore"):
             if estimator == "h1":
                 return self.sxy / self.sxx
@@ -363,13 +382,13 @@ class CrossSpectra:
     def _coherence(self) -> NDArray[np.float64]:
         """Return the ordinary coherence in each bin; 0 where input or output has no power."""
         power_product = self.sxx * self.syy
-        coherence = np.divide(
+        bin_coherence = np.divide(
             power(self.sxy),
             power_product,
             out=np.zeros_like(power_product),
             where=power_product > 0,
         )
-        return np.minimum(coherence, 1.0)  # Cauchy-Schwarz, up to rounding
+        return np.minimum(bin_coherence, 1.0)  # Cauchy-Schwarz, up to rounding
 
 
 def power(transform: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -440,25 +459,27 @@ def welch_response(
     check_segmentation(segment_length, overlap, nfft)
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
-    window = np.hamming(segment_length)
-    count = segment_count(x.size, segment_length, overlap)
-    if count == 0:
+    hamming_window = np.hamming(segment_length)
+    segment_number = segment_count(x.size, segment_length, overlap)
+    if segment_number == 0:
         raise SpectralError(
             f"The record has {x.size} samples ({x.size / rate_hz:g} s), fewer than one Welch "
             f"segment of {segment_length} ({segment_length / rate_hz:g} s); "
             "record for longer or ask for shorter segments."
         )
-    bins = nfft // 2 + 1
-    sums = CrossSpectra.of_zero_segments(bins)
+    bin_count = nfft // 2 + 1
+    summed_spectra = CrossSpectra.of_zero_segments(bin_count)
     # Allocated once, because allocating this much memory again is slow.
-    fx, fy = np.empty((2, bins), dtype=np.complex128)
+    fx, fy = np.empty((2, bin_count), dtype=np.complex128)
     # One segment at a time stays in the cache, unlike a whole batch.
-    for k in range(count):
-        segment = slice(start := k * (segment_length - overlap), start + segment_length)
-        np.fft.rfft(x[segment] * window, nfft, out=fx)
-        np.fft.rfft(y[segment] * window, nfft, out=fy)
-        sums.add(fx, fy)
-    return sums.response(np.arange(bins) * rate_hz / nfft, estimator)
+    for k in range(segment_number):
+        segment = slice(
+            segment_start := k * (segment_length - overlap), segment_start + segment_length
+        )
+        np.fft.rfft(x[segment] * hamming_window, nfft, out=fx)
+        np.fft.rfft(y[segment] * hamming_window, nfft, out=fy)
+        summed_spectra.add(fx, fy)
+    return summed_spectra.response(np.arange(bin_count) * rate_hz / nfft, estimator)
 
 
 def fft_response(
@@ -503,19 +524,19 @@ def fft_response(
     [3.+0.j 3.+0.j 3.+0.j]
     """
     x, y = checked_records(input_, output, rate_hz)
-    length = x.size if nfft is None else nfft
-    if length < x.size:
+    transform_length = x.size if nfft is None else nfft
+    if transform_length < x.size:
         raise SpectralError(
-            f"nfft = {length} samples is shorter than the record of {x.size}: "
+            f"nfft = {transform_length} samples is shorter than the record of {x.size}: "
             "the whole record is transformed, never cut; choose it at least as long."
         )
-    fx = np.fft.rfft(x, length)
-    fy = np.fft.rfft(y, length)
+    fx = np.fft.rfft(x, transform_length)
+    fy = np.fft.rfft(y, transform_length)
     with np.errstate(divide="ignore", invalid="ignore"):
-        response = fy / fx
+        spectra_ratio = fy / fx
     return FrequencyResponse(
-        frequency_hz=np.arange(fx.size) * rate_hz / length,
-        response=response,
+        frequency_hz=np.arange(fx.size) * rate_hz / transform_length,
+        response=spectra_ratio,
         coherence=None,
         segments=1,
         estimator="fft",
@@ -534,7 +555,8 @@ def instrumental_response(
 ) -> FrequencyResponse:
     """Return the response ``Hiv = Sry / Srx`` from input to output of a control loop.
 
-    The loop's reference is the instrument, with which noise in the input is averaged out.
+    S are cross-spectra of reference r, input x and output y. With the reference as the instrument,
+    noise in the input is averaged out.
 
     Parameters
     ----------
@@ -579,9 +601,14 @@ def instrumental_response(
         )
     reference_to_input, reference_to_output = (
         welch_response(
-            reference, values, rate_hz, segment_length=segment_length, overlap=overlap, nfft=nfft
+            reference,
+            channel_values,
+            rate_hz,
+            segment_length=segment_length,
+            overlap=overlap,
+            nfft=nfft,
         )
-        for values in (input_, output)
+        for channel_values in (input_, output)
     )
     with np.errstate(divide="ignore", invalid="ignore"):
         response = reference_to_output.response / reference_to_input.response

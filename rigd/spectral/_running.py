@@ -70,7 +70,7 @@ class RunningResponse:
     ----------
     rate_hz : float
         Sampling rate.
-    samples : int
+    record_length : int
         Number of samples in the complete record.
     last_hz : float
         Highest frequency of the response.
@@ -86,26 +86,26 @@ class RunningResponse:
     def __init__(
         self,
         rate_hz: float,
-        samples: int,
+        record_length: int,
         *,
         last_hz: float,
         segmentation: Segmentation | None = None,
     ) -> None:
-        lengths = segmentation or segmentation_of(samples, rate_hz)
-        self._length, self._nfft = lengths.segment_length, lengths.nfft
-        check_segmentation(self._length, lengths.overlap, self._nfft)
-        bins = bins_up_to(last_hz, self._nfft, rate_hz)
-        self._frequency_hz = np.arange(bins) * rate_hz / self._nfft
-        self._transform = LowBins(self._length, self._nfft, bins)
+        used_segmentation = segmentation or segmentation_of(record_length, rate_hz)
+        self._length, self._nfft = used_segmentation.segment_length, used_segmentation.nfft
+        check_segmentation(self._length, used_segmentation.overlap, self._nfft)
+        bin_count = bins_up_to(last_hz, self._nfft, rate_hz)
+        self._frequency_hz = np.arange(bin_count) * rate_hz / self._nfft
+        self._transform = LowBins(self._length, self._nfft, bin_count)
         self._segments = Segments(
             3,
             self._length,
-            self._length - lengths.overlap,
-            longest_gap=round(LONGEST_GAP_S * rate_hz),
-            end=samples,
+            self._length - used_segmentation.overlap,
+            longest_gap_ticks=round(LONGEST_GAP_S * rate_hz),
+            end_tick=record_length,
         )
-        self._sums = CrossSpectra.of_zero_segments(bins)
-        self._reference_power = np.zeros(bins)
+        self._sums = CrossSpectra.of_zero_segments(bin_count)
+        self._reference_power = np.zeros(bin_count)
         self._summed_up_to = 0
 
     def feed(
@@ -125,23 +125,25 @@ class RunningResponse:
             is removed. The input should be relative to its value at rest, since an offset leaks
             into the lowest bins.
         """
-        for first, segment in self._segments.feed(ticks, np.stack((reference, input_, output))):
+        for first_tick, segment in self._segments.feed(
+            ticks, np.stack((reference, input_, output))
+        ):
             self._add(segment, self._sums, self._reference_power)
-            self._summed_up_to = first + self._length
+            self._summed_up_to = first_tick + self._length
 
     def estimate(self) -> RunningEstimate | None:
         """Return the response estimated so far; None while there are too few samples."""
         is_final = self._segments.over
-        sums, reference_power = self._sums, self._reference_power
+        summed_spectra, reference_power = self._sums, self._reference_power
         newest_samples = self._segments.newest(self._length)
         shortest_segment = self._length
         if self._newest_count_as_segment(newest_samples.shape[1], is_final):
-            sums, reference_power = sums.copy(), reference_power.copy()
-            self._add(newest_samples, sums, reference_power)
+            summed_spectra, reference_power = summed_spectra.copy(), reference_power.copy()
+            self._add(newest_samples, summed_spectra, reference_power)
             shortest_segment = newest_samples.shape[1]
-        if sums.segments == 0:
+        if summed_spectra.segments == 0:
             return None
-        response = sums.response(self._frequency_hz, "h1")
+        response = summed_spectra.response(self._frequency_hz, "h1")
         if self._sums.segments < 2:
             # The newest samples overlap the one segment: averaged with itself, all is coherent.
             response = replace(response, coherence=None)
@@ -160,16 +162,18 @@ class RunningResponse:
     def _add(
         self,
         segment: NDArray[np.float64],
-        sums: CrossSpectra,
+        summed_spectra: CrossSpectra,
         reference_power: NDArray[np.float64],
     ) -> None:
         """Add a segment (3, n) of reference, input and output to the sums."""
-        window = np.hamming(segment.shape[1])
+        hamming_window = np.hamming(segment.shape[1])
         reference, input_, output = segment
         # The mean angle excites nothing, but its power would exceed that of the motion.
-        reference_motion = reference - np.average(reference, weights=window)
-        reference_power += power(self._transform(reference_motion * window))
-        sums.add(self._transform(input_ * window), self._transform(output * window))
+        reference_deviation = reference - np.average(reference, weights=hamming_window)
+        reference_power += power(self._transform(reference_deviation * hamming_window))
+        summed_spectra.add(
+            self._transform(input_ * hamming_window), self._transform(output * hamming_window)
+        )
 
 
 # Segments of a growing record
@@ -185,13 +189,13 @@ class Segments:
 
     Parameters
     ----------
-    channels : int
+    channel_count : int
         Number of values per tick.
-    length, hop : int
+    segment_length, hop_ticks : int
         Number of ticks in a segment, and from its start to the start of the next one.
-    longest_gap : int
+    longest_gap_ticks : int
         Largest number of successive missing ticks that are interpolated.
-    end : int, optional
+    end_tick : int, optional
         First tick after the record. Samples outside the record, before tick 0 or from this tick on,
         are only used to close gaps at the ends of the record.
 
@@ -204,21 +208,27 @@ class Segments:
     """
 
     def __init__(
-        self, channels: int, length: int, hop: int, *, longest_gap: int, end: int | None = None
+        self,
+        channel_count: int,
+        segment_length: int,
+        hop_ticks: int,
+        *,
+        longest_gap_ticks: int,
+        end_tick: int | None = None,
     ) -> None:
         self.end = 0
         self.over = False
-        self._length, self._hop = length, hop
-        self._limit = end
-        self._gaps = _GapFiller(longest_gap)
+        self._length, self._hop = segment_length, hop_ticks
+        self._limit = end_tick
+        self._gaps = _GapFiller(longest_gap_ticks)
         # The newest samples are the columns from `_used - available` to `_used`; when the array is
         # full, those that may still be needed move to the front.
-        self._buffer = np.empty((channels, 3 * length))
+        self._buffer = np.empty((channel_count, 3 * segment_length))
         self._used = 0
         self._available = 0
         self._next = 0
 
-    def feed(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
+    def feed(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, Real]]:
         """Add samples and yield each segment that they complete.
 
         A segment must be used before the next one is requested, which overwrites it. The iteration
@@ -228,7 +238,7 @@ class Segments:
         ----------
         ticks : array_like of int, shape (n,)
             Increasing numbers of the samples, also from call to call.
-        values : array_like, shape (channels, n)
+        channel_values : array_like, shape (channels, n)
             Values of each tick. A tick with a value that is not finite counts as missing.
 
         Yields
@@ -238,49 +248,52 @@ class Segments:
         segment : ndarray of float, shape (channels, length)
             Values of the segment, as a view of the internal array.
         """
-        for first_tick, block in self._gaps.fill(ticks, values):
-            start, end_tick = max(first_tick, 0), first_tick + block.shape[1]
+        for first_tick, sample_block in self._gaps.fill(ticks, channel_values):
+            block_start, end_tick = max(first_tick, 0), first_tick + sample_block.shape[1]
             if self._limit is not None:
                 self.over = end_tick >= self._limit
                 end_tick = min(end_tick, self._limit)
-            if start < end_tick:
+            if block_start < end_tick:
                 yield from self._add_block(
-                    start, block[:, start - first_tick : end_tick - first_tick]
+                    block_start, sample_block[:, block_start - first_tick : end_tick - first_tick]
                 )
 
-    def newest(self, most: int) -> Real:
-        """Return at most `most` of the newest samples without a gap, (channels, n), as a view."""
-        return self._buffer[:, self._used - min(most, self._available) : self._used]
+    def newest(self, most_samples: int) -> Real:
+        """Return the newest samples without a gap, shape (channels, n), at most `most_samples`.
 
-    def _add_block(self, first: int, block: Real) -> Iterator[tuple[int, Real]]:
-        """Add a block without gaps and yield each segment that it completes."""
-        if first != self.end:
-            self.end = first
+        The array is a view of the internal array.
+        """
+        return self._buffer[:, self._used - min(most_samples, self._available) : self._used]
+
+    def _add_block(self, first_tick: int, sample_block: Real) -> Iterator[tuple[int, Real]]:
+        """Add samples without gaps; yield the first tick and the data of each complete segment."""
+        if first_tick != self.end:
+            self.end = first_tick
             self._available = 0
-            self._next = -(-first // self._hop) * self._hop
+            self._next = -(-first_tick // self._hop) * self._hop
         added_count = 0
-        while added_count < block.shape[1]:
+        while added_count < sample_block.shape[1]:
             segment_end = self._next + self._length
-            samples = block[
+            block_part = sample_block[
                 :, added_count : added_count + min(segment_end - self.end, self._length)
             ]
-            added_count += samples.shape[1]
-            self._append(samples)
+            added_count += block_part.shape[1]
+            self._append(block_part)
             if self.end == segment_end:
                 yield self._next, self.newest(self._length)
                 self._next += self._hop
 
-    def _append(self, samples: Real) -> None:
+    def _append(self, new_samples: Real) -> None:
         """Append samples to the internal array, which stores at least the newest segment."""
-        count = samples.shape[1]
-        if self._used + count > self._buffer.shape[1]:
+        new_count = new_samples.shape[1]
+        if self._used + new_count > self._buffer.shape[1]:
             newest_samples = self.newest(self._length)
             self._buffer[:, : newest_samples.shape[1]] = newest_samples
             self._used = newest_samples.shape[1]
-        self._buffer[:, self._used : self._used + count] = samples
-        self._used += count
-        self._available = min(self._available + count, self._length)
-        self.end += count
+        self._buffer[:, self._used : self._used + new_count] = new_samples
+        self._used += new_count
+        self._available = min(self._available + new_count, self._length)
+        self.end += new_count
 
 
 class _GapFiller:
@@ -290,10 +303,10 @@ class _GapFiller:
         self._longest = longest_gap
         self._last: tuple[NDArray[np.int64], Real] | None = None
 
-    def fill(self, ticks: ArrayLike, values: ArrayLike) -> Iterator[tuple[int, Real]]:
+    def fill(self, ticks: ArrayLike, channel_values: ArrayLike) -> Iterator[tuple[int, Real]]:
         """Yield blocks without gaps: their first tick and their values (channels, n)."""
         known_ticks = np.asarray(ticks, dtype=np.int64)
-        known_values = np.asarray(values, dtype=np.float64)
+        known_values = np.asarray(channel_values, dtype=np.float64)
         is_known = np.isfinite(known_values).all(axis=0)
         if not is_known.all():
             known_ticks, known_values = known_ticks[is_known], known_values[:, is_known]
@@ -309,23 +322,25 @@ class _GapFiller:
             known_values = np.concatenate((last_sample[1], known_values), axis=1)
         self._last = known_ticks[-1:].copy(), known_values[:, -1:].copy()
         block_starts = 1 + np.flatnonzero(np.diff(known_ticks) > self._longest + 1)
-        for start, stop in pairwise([0, *block_starts, known_ticks.size]):
-            first, block = _interpolate_to_ticks(
-                known_ticks[start:stop], known_values[:, start:stop]
+        for block_start, block_end in pairwise([0, *block_starts, known_ticks.size]):
+            first_tick, sample_block = _interpolate_to_ticks(
+                known_ticks[block_start:block_end], known_values[:, block_start:block_end]
             )
-            if start == 0 and last_sample is not None:  # yielded with the previous block
-                first, block = first + 1, block[:, 1:]
-            if block.shape[1]:
-                yield first, block
+            if block_start == 0 and last_sample is not None:  # yielded with the previous block
+                first_tick, sample_block = first_tick + 1, sample_block[:, 1:]
+            if sample_block.shape[1]:
+                yield first_tick, sample_block
 
 
-def _interpolate_to_ticks(ticks: NDArray[np.int64], values: Real) -> tuple[int, Real]:
+def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) -> tuple[int, Real]:
     """Return the first tick and the values of every tick up to the last one, interpolated."""
-    first, last = int(ticks[0]), int(ticks[-1])
-    if last - first + 1 == ticks.size:
-        return first, values
-    all_ticks = np.arange(first, last + 1)
-    return first, np.stack([np.interp(all_ticks, ticks, channel) for channel in values])
+    first_tick, last_tick = int(known_ticks[0]), int(known_ticks[-1])
+    if last_tick - first_tick + 1 == known_ticks.size:
+        return first_tick, known_values
+    all_ticks = np.arange(first_tick, last_tick + 1)
+    return first_tick, np.stack(
+        [np.interp(all_ticks, known_ticks, channel_values) for channel_values in known_values]
+    )
 
 
 # Excited bins
@@ -338,12 +353,14 @@ where the record ends in mid-chirp). It is below the power of a chirp where two 
 paper's segments join (−15 dB)."""
 
 
-def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
-    """Return in which bins the reference has power that has not leaked from other bins.
+def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
+    """Return True for bins in which the reference angle has power of its own.
+
+    Power that leaks from other bins does not count.
 
     Parameters
     ----------
-    power : ndarray of float, shape (n,)
+    reference_power : ndarray of float, shape (n,)
         Power of the reference in the bins from frequency 0 on.
     resolution_bins : int
         Number of bins per inverse length of the shortest window. A dip that is at most twice as
@@ -354,30 +371,34 @@ def excited_bins(power: NDArray[np.float64], resolution_bins: int) -> NDArray[np
     -------
     ndarray of bool, shape (n,)
     """
-    largest_power = power.max(initial=0.0)
+    largest_power = reference_power.max(initial=0.0)
     if not largest_power > 0.0:
-        return np.zeros(power.shape, dtype=np.bool_)
-    without_dips = _is_near_marked(power > LEAST_RELATIVE_POWER * largest_power, resolution_bins)
+        return np.zeros(reference_power.shape, dtype=np.bool_)
+    without_dips = _is_near_marked(
+        reference_power > LEAST_RELATIVE_POWER * largest_power, resolution_bins
+    )
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
 
-def _is_near_marked(is_marked: NDArray[np.bool_], distance: int) -> NDArray[np.bool_]:
-    """Return whether each bin is within `distance` bins of a marked one.
+def _is_near_marked(is_marked: NDArray[np.bool_], distance_bins: int) -> NDArray[np.bool_]:
+    """Return True for each bin within `distance_bins` bins of a bin where `is_marked` is True.
 
-    Beyond the ends, the marks of the end bins continue.
+    Bins beyond either end count like the end bin.
     """
-    counts = np.cumsum(np.pad(is_marked, (distance + 1, distance), mode="edge"))
-    is_near: NDArray[np.bool_] = counts[2 * distance + 1 :] > counts[: -2 * distance - 1]
+    marked_counts = np.cumsum(np.pad(is_marked, (distance_bins + 1, distance_bins), mode="edge"))
+    is_near: NDArray[np.bool_] = (
+        marked_counts[2 * distance_bins + 1 :] > marked_counts[: -2 * distance_bins - 1]
+    )
     return is_near
 
 
 # Lowest bins of a transform
 
 
-def bins_up_to(last_hz: float, nfft: int, rate_hz: float) -> int:
+def bins_up_to(last_hz: float, transform_length: int, rate_hz: float) -> int:
     """Return the number of bins of a transform from 0 to `last_hz`, both included."""
     # Rounding errors of the caller must not lose the last bin.
-    return 1 + min(nfft // 2, int(last_hz * nfft / rate_hz * (1 + 1e-9)))
+    return 1 + min(transform_length // 2, int(last_hz * transform_length / rate_hz * (1 + 1e-9)))
 
 
 class LowBins:
@@ -390,31 +411,35 @@ class LowBins:
 
     Parameters
     ----------
-    length : int
+    sample_count : int
         Largest number of samples to transform.
     nfft : int
-        Number of samples of the padded transform, at least `length`.
-    bins : int
+        Number of samples of the padded transform, at least `sample_count`.
+    bin_count : int
         Number of bins, from frequency 0 on; at most ``nfft // 2 + 1``.
     """
 
-    def __init__(self, length: int, nfft: int, bins: int) -> None:
-        self._bins, self._nfft = bins, nfft
-        size = _fast_length(length + bins - 1)
+    def __init__(self, sample_count: int, nfft: int, bin_count: int) -> None:
+        self._bins, self._nfft = bin_count, nfft
+        convolution_length = _fast_length(sample_count + bin_count - 1)
         # A real transform takes half the time of a complex one, and two of these would be needed.
-        self._all = np.empty(nfft // 2 + 1, dtype=np.complex128) if nfft < 4 * size else None
+        self._all = (
+            np.empty(nfft // 2 + 1, dtype=np.complex128) if nfft < 4 * convolution_length else None
+        )
         if self._all is not None:
             return
-        n = np.arange(max(length, bins))
+        n = np.arange(max(sample_count, bin_count))
         # The phase is reduced as a whole number, which is exact.
         self._chirp = np.exp(-1j * np.pi * (n * n % (2 * nfft)) / nfft)
-        kernel = np.zeros(size, dtype=np.complex128)
-        kernel[:bins] = self._chirp[:bins].conj()
-        kernel[size - length + 1 :] = self._chirp[length - 1 : 0 : -1].conj()
-        self._kernel = np.fft.fft(kernel)
+        chirp_kernel = np.zeros(convolution_length, dtype=np.complex128)
+        chirp_kernel[:bin_count] = self._chirp[:bin_count].conj()
+        chirp_kernel[convolution_length - sample_count + 1 :] = self._chirp[
+            sample_count - 1 : 0 : -1
+        ].conj()
+        self._kernel = np.fft.fft(chirp_kernel)
         # Allocated once, because allocating this much memory again is slow.
-        self._work = np.empty(size, dtype=np.complex128)
-        self._transform = np.empty(size, dtype=np.complex128)
+        self._work = np.empty(convolution_length, dtype=np.complex128)
+        self._transform = np.empty(convolution_length, dtype=np.complex128)
 
     def __call__(self, x: NDArray[np.float64]) -> NDArray[np.complex128]:
         """Return the lowest bins (bins,) of the transform of samples (n,), as a new array."""
@@ -429,14 +454,16 @@ class LowBins:
         return low
 
 
-def _fast_length(least: int) -> int:
-    """Return the smallest transform length of at least `least` without a prime factor above 5."""
-    best_length = 1 << (least - 1).bit_length()
+def _fast_length(least_length: int) -> int:
+    """Return the smallest length from `least_length` on without a prime factor above 5."""
+    best_length = 1 << (least_length - 1).bit_length()
     power_of_five = 1
     while power_of_five < best_length:
         odd_factor = power_of_five
         while odd_factor < best_length:
-            best_length = min(best_length, odd_factor << (-(-least // odd_factor) - 1).bit_length())
+            best_length = min(
+                best_length, odd_factor << (-(-least_length // odd_factor) - 1).bit_length()
+            )
             odd_factor *= 3
         power_of_five *= 5
     return best_length

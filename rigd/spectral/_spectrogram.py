@@ -17,7 +17,7 @@ With this ratio the level of a sine between two bins is low by at most 0.1 dB.""
 
 
 class RunningSpectrogram:
-    """Spectrogram of a signal that arrives in blocks, with a column of levels in every step.
+    """Spectrogram of a signal that arrives in blocks, with one column of levels per time step.
 
     The window is Hann's. A sine of amplitude A has the level 20 log10 A at its frequency, in dB re
     1 of the signal's unit. A constant A has this level at frequency 0.
@@ -45,30 +45,32 @@ class RunningSpectrogram:
         step_s: float = 0.25,
         last_hz: float = 60.0,
     ) -> None:
-        length = max(4, round(window_s * rate_hz))
+        window_length = max(4, round(window_s * rate_hz))
         self._rate_hz = rate_hz
-        self._nfft = _TRANSFORM_TO_WINDOW_LENGTH * length
-        bins = bins_up_to(last_hz, self._nfft, rate_hz)
-        self.frequency_hz = np.arange(bins) * rate_hz / self._nfft
-        window = np.hanning(length)
+        self._nfft = _TRANSFORM_TO_WINDOW_LENGTH * window_length
+        bin_count = bins_up_to(last_hz, self._nfft, rate_hz)
+        self.frequency_hz = np.arange(bin_count) * rate_hz / self._nfft
+        hann_window = np.hanning(window_length)
         # One-sided spectrum: half of each amplitude is at the negative frequency.
-        self._window = window * (2.0 / window.sum())
+        self._window = hann_window * (2.0 / hann_window.sum())
         self._segments = Segments(
             1,
-            length,
+            window_length,
             max(1, round(step_s * rate_hz)),
-            longest_gap=round(LONGEST_GAP_S * rate_hz),
+            longest_gap_ticks=round(LONGEST_GAP_S * rate_hz),
         )
 
-    def feed(self, ticks: ArrayLike, values: ArrayLike) -> list[tuple[float, NDArray[np.float64]]]:
-        """Add samples and return the columns that they complete.
+    def feed(
+        self, ticks: ArrayLike, signal_values: ArrayLike
+    ) -> list[tuple[float, NDArray[np.float64]]]:
+        """Add samples and return the columns (time in s, levels in dB) that they complete.
 
         Parameters
         ----------
         ticks : array_like of int, shape (n,)
             Increasing numbers of the samples, from 0 on. Gaps of up to `LONGEST_GAP_S` are
             interpolated. Columns whose window contains a longer gap are omitted.
-        values : array_like, shape (n,)
+        signal_values : array_like, shape (n,)
             Samples of the signal. A value that is not finite counts as missing.
 
         Returns
@@ -78,16 +80,18 @@ class RunningSpectrogram:
             `LEAST_LEVEL_DB`.
         """
         return [
-            ((first + (segment.shape[1] - 1) / 2) / self._rate_hz, self._levels_db(segment[0]))
-            for first, segment in self._segments.feed(ticks, np.asarray(values)[np.newaxis])
+            ((first_tick + (segment.shape[1] - 1) / 2) / self._rate_hz, self._levels_db(segment[0]))
+            for first_tick, segment in self._segments.feed(
+                ticks, np.asarray(signal_values)[np.newaxis]
+            )
         ]
 
     def _levels_db(self, segment: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the levels (m,) of a segment in dB."""
-        amplitude = np.abs(
+        """Return a segment's levels in the frequency bins (m,), in dB re 1 of the signal's unit."""
+        bin_amplitudes = np.abs(
             np.fft.rfft(segment * self._window, self._nfft)[: self.frequency_hz.size]
         )
-        amplitude[0] /= 2.0  # a constant has no negative frequency
+        bin_amplitudes[0] /= 2.0  # a constant has no negative frequency
         least_amplitude = 10.0 ** (LEAST_LEVEL_DB / 20.0)
-        level_db: NDArray[np.float64] = 20.0 * np.log10(np.maximum(amplitude, least_amplitude))
+        level_db: NDArray[np.float64] = 20.0 * np.log10(np.maximum(bin_amplitudes, least_amplitude))
         return level_db

@@ -14,25 +14,25 @@ _MOST_ROUNDING_FRACTION = 0.1
 """Largest relative deviation of a sent torque, by which a drive may round the command."""
 
 
-def _require(condition: bool, message: str) -> None:
+def _require(is_satisfied: bool, message: str) -> None:
     """Raise AssertionError with a message unless a condition is true."""
-    if not condition:
+    if not is_satisfied:
         raise AssertionError(message)
 
 
 def _run_ticks(
-    devices: Devices, first: int, ticks: int, torque_nm: float | None = None
+    devices: Devices, first_tick: int, tick_count: int, torque_nm: float | None = None
 ) -> tuple[list[float], list[Wrench]]:
-    """Run some ticks of the loop and return the motor angles and wrenches that were read."""
-    angles, wrenches = [], []
-    for tick in range(first, first + ticks):
+    """Run ticks of the control loop and return the motor angles (rad) and wrenches read."""
+    angles_rad, wrenches = [], []
+    for tick in range(first_tick, first_tick + tick_count):
         devices.drive.latch(tick * _PERIOD_NS)
         devices.sensor.request(tick * _PERIOD_NS)
-        angles.append(devices.drive.read_angle())
+        angles_rad.append(devices.drive.read_angle())
         wrenches.append(devices.sensor.read_wrench())
         if torque_nm is not None:
             devices.drive.command(torque_nm)
-    return angles, wrenches
+    return angles_rad, wrenches
 
 
 def _connect(devices: Devices) -> None:
@@ -45,42 +45,48 @@ def _check_disabled_rig_stays_at_rest(devices: Devices) -> None:
     """Check that before enabling the readings are valid and a commanded torque causes no motion."""
     _connect(devices)
     _require(bool(json.loads(json.dumps(devices.sensor.calibration()))), "there is no calibration")
-    angles, wrenches = _run_ticks(devices, 0, 300, torque_nm=_TORQUE_NM)
-    _require(all(map(isfinite, angles)), "an angle is not finite")
+    angles_rad, wrenches = _run_ticks(devices, 0, 300, torque_nm=_TORQUE_NM)
+    _require(all(map(isfinite, angles_rad)), "an angle is not finite")
     _require(all(len(wrench) == 6 for wrench in wrenches), "a wrench has not six axes")
     _require(
-        all(isfinite(value) for wrench in wrenches for value in wrench), "nor is a wrench finite"
+        all(isfinite(wrench_component) for wrench in wrenches for wrench_component in wrench),
+        "nor is a wrench finite",
     )
     _require(not devices.drive.angle_stale, "the angle is stale")
     _require(not devices.sensor.wrench_stale, "the wrench is stale")
     _require(not devices.sensor.wrench_saturated, "the sensor is saturated")
-    _require(max(angles) - min(angles) < 1e-3, "it moves before it is enabled")
+    _require(max(angles_rad) - min(angles_rad) < 1e-3, "it moves before it is enabled")
 
 
 def _check_torque_only_while_enabled(devices: Devices) -> None:
     """Check that the torque follows the command while, and only while, the drive is enabled."""
     _connect(devices)
     devices.drive.enable()
-    angles, _ = _run_ticks(devices, 0, 300)
-    _require(max(angles) - min(angles) < 1e-3, "it moves without a command")
-    angles, _ = _run_ticks(devices, 300, 60, torque_nm=_TORQUE_NM)
-    _require(angles[-1] > angles[0] + 1e-3, "a positive torque does not turn it towards positive")
+    angles_rad, _ = _run_ticks(devices, 0, 300)
+    _require(max(angles_rad) - min(angles_rad) < 1e-3, "it moves without a command")
+    angles_rad, _ = _run_ticks(devices, 300, 60, torque_nm=_TORQUE_NM)
+    _require(
+        angles_rad[-1] > angles_rad[0] + 1e-3, "a positive torque does not turn it towards positive"
+    )
     devices.drive.disable()
     devices.drive.disable()
-    speeds = []
-    last_angle = _run_ticks(devices, 360, 1, torque_nm=_TORQUE_NM)[0][0]
-    for block in range(20):
-        angles, _ = _run_ticks(devices, 361 + 100 * block, 100, torque_nm=_TORQUE_NM)
-        speeds.append(abs(angles[-1] - last_angle))
-        last_angle = angles[-1]
-    _require(speeds[-1] < 0.2 * max(speeds), "it does not coast to a stop once it is disabled")
+    angle_changes_rad = []
+    last_angle_rad = _run_ticks(devices, 360, 1, torque_nm=_TORQUE_NM)[0][0]
+    for block_number in range(20):
+        angles_rad, _ = _run_ticks(devices, 361 + 100 * block_number, 100, torque_nm=_TORQUE_NM)
+        angle_changes_rad.append(abs(angles_rad[-1] - last_angle_rad))
+        last_angle_rad = angles_rad[-1]
+    _require(
+        angle_changes_rad[-1] < 0.2 * max(angle_changes_rad),
+        "it does not coast to a stop once it is disabled",
+    )
 
 
 def _check_sent_torque_is_reported(devices: Devices) -> None:
     """Check that a drive reports the torque that it sends, which is zero while it is disabled."""
 
-    def reported_nm(first: int) -> float:
-        _run_ticks(devices, first, 10)
+    def reported_nm(first_tick: int) -> float:
+        _run_ticks(devices, first_tick, 10)
         return devices.drive.command(_TORQUE_NM)
 
     _connect(devices)

@@ -15,7 +15,7 @@ _LINE_PATTERN = re.compile(r'(\w+)( *= *)(\{ value = )?(.*?)(, source = "\w+" \}
 
 
 def write_profile(
-    folder: Path, values: Mapping[str, Value] | None = None, *, base: str = "sim"
+    folder: Path, new_values: Mapping[str, Value] | None = None, *, base_profile: str = "sim"
 ) -> Path:
     """Write a profile that differs from another one in some values, and return its path.
 
@@ -23,10 +23,10 @@ def write_profile(
     ----------
     folder : Path
         Folder for the file, which gets the name of the profile.
-    values : mapping of str to value, optional
+    new_values : mapping of str to value, optional
         Different values by ``section.key``, in the unit of the key; ``name`` is the profile's name.
         A key that the base does not have is added to its section.
-    base : str
+    base_profile : str
         Name or path of the profile whose other values are used.
 
     Returns
@@ -37,7 +37,7 @@ def write_profile(
     Raises
     ------
     ValueError
-        If the base does not have a section of `values`.
+        If the base does not have a section of `new_values`.
 
     Examples
     --------
@@ -51,46 +51,50 @@ def write_profile(
     >>> profile.name, profile.control.pole_rad_s
     ('stiff', 60.0)
     """
-    remaining_values = dict(values or {})
-    name = str(remaining_values.get("name", load_profile(base).name))
-    lines: list[str] = []
+    remaining_values = dict(new_values or {})
+    profile_name = str(remaining_values.get("name", load_profile(base_profile).name))
+    profile_lines: list[str] = []
     section = ""
-    for line in load_profile(base).text.splitlines():
-        if line.startswith("["):
-            lines += _added_lines(section, remaining_values)
-            section = line.strip("[] ") + "."
-        match = _LINE_PATTERN.fullmatch(line)
+    for profile_line in load_profile(base_profile).text.splitlines():
+        if profile_line.startswith("["):
+            profile_lines += _added_lines(section, remaining_values)
+            section = profile_line.strip("[] ") + "."
+        match = _LINE_PATTERN.fullmatch(profile_line)
         if match and (key := section + match[1]) in remaining_values:
-            text = json.dumps(remaining_values.pop(key), ensure_ascii=False)
-            lines.append("".join((match[1], match[2], match[3] or "", text, match[5] or "")))
+            value_text = json.dumps(remaining_values.pop(key), ensure_ascii=False)
+            profile_lines.append(
+                "".join((match[1], match[2], match[3] or "", value_text, match[5] or ""))
+            )
         else:
-            lines.append(line)
-    lines += _added_lines(section, remaining_values)
+            profile_lines.append(profile_line)
+    profile_lines += _added_lines(section, remaining_values)
     if remaining_values:
-        raise ValueError(f"{base} has no section for {', '.join(remaining_values)}")
-    path = folder / f"{name}.toml"
-    path.write_text("\n".join(lines) + "\n", encoding="utf-8")
-    return path
+        raise ValueError(f"{base_profile} has no section for {', '.join(remaining_values)}")
+    profile_path = folder / f"{profile_name}.toml"
+    profile_path.write_text("\n".join(profile_lines) + "\n", encoding="utf-8")
+    return profile_path
 
 
-def _added_lines(section: str, remaining_values: dict[str, Value]) -> list[str]:
+def _added_lines(section_name: str, remaining_values: dict[str, Value]) -> list[str]:
     """Return lines for a section's keys that the base lacks.
 
     The keys are removed from `remaining_values`.
     """
     new_keys = [
-        key for key in remaining_values if section and key.rpartition(".")[0] + "." == section
+        key
+        for key in remaining_values
+        if section_name and key.rpartition(".")[0] + "." == section_name
     ]
     return [
-        f"{key.removeprefix(section)} = {_value_text(remaining_values.pop(key))}"
+        f"{key.removeprefix(section_name)} = {_value_text(remaining_values.pop(key))}"
         for key in new_keys
     ]
 
 
-def _value_text(value: Value) -> str:
+def _value_text(profile_value: Value) -> str:
     """Return a value as it is written in a profile."""
-    text = json.dumps(value, ensure_ascii=False)
-    items = value if isinstance(value, Sequence) else (value,)
-    if any(isinstance(item, bool | str) for item in items):
-        return text
-    return f'{{ value = {text}, source = "assumed" }}'
+    value_json = json.dumps(profile_value, ensure_ascii=False)
+    value_items = profile_value if isinstance(profile_value, Sequence) else (profile_value,)
+    if any(isinstance(value_item, bool | str) for value_item in value_items):
+        return value_json
+    return f'{{ value = {value_json}, source = "assumed" }}'

@@ -45,13 +45,13 @@ class Signals:
     rate_hz: float = 1000.0
     metadata: dict[str, str] = field(default_factory=dict)
 
-    def part(self, selected: slice | NDArray[np.generic]) -> "Signals":
+    def part(self, sample_selection: slice | NDArray[np.generic]) -> "Signals":
         """Return selected samples, by NumPy's indexing; segments and rate are unchanged."""
         return replace(
             self,
-            reference_rad=self.reference_rad[selected],
-            angle_rad=self.angle_rad[selected],
-            torque_nm=self.torque_nm[selected],
+            reference_rad=self.reference_rad[sample_selection],
+            angle_rad=self.angle_rad[sample_selection],
+            torque_nm=self.torque_nm[sample_selection],
         )
 
 
@@ -64,7 +64,7 @@ def beam_torque(
     tool_inertia_kg_m2: float = 0.0,
     delay_s: float = 0.0,
 ) -> NDArray[np.float64]:
-    """Return the coupling torque that the exact model gives for a motion of the motor.
+    """Return the coupling torque in N·m that the exact beam model gives for a motor motion.
 
     Parameters
     ----------
@@ -164,9 +164,11 @@ def chirp_signals(
         round(duration_s * rate_hz) for duration_s in (rest_s, sweep_s, ring_down_s)
     )
     t = np.arange(sweep_samples) / rate_hz
-    phase = 2 * np.pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2 * sweep_s))
-    reference = np.zeros(rest_samples + sweep_samples + ring_down_samples)
-    reference[rest_samples : rest_samples + sweep_samples] = amplitude_rad * np.sin(phase)
+    chirp_phase_rad = 2 * np.pi * (start_hz * t + (stop_hz - start_hz) * t**2 / (2 * sweep_s))
+    chirp_reference_rad = np.zeros(rest_samples + sweep_samples + ring_down_samples)
+    chirp_reference_rad[rest_samples : rest_samples + sweep_samples] = amplitude_rad * np.sin(
+        chirp_phase_rad
+    )
 
     def motor(s: NDArray[np.complex128]) -> NDArray[np.complex128]:
         return 1 / (1 + s / _MOTOR_LOOP_POLE_RAD_S) ** 2
@@ -175,18 +177,24 @@ def chirp_signals(
         beam_response = transfer(s, beam, damping) + tool_inertia_kg_m2 * s**2
         return np.asarray(beam_response * motor(s) * np.exp(-s * torque_delay_s))
 
-    angle = _causal_response(reference, rate_hz, lambda s: motor(s) * np.exp(-s * angle_delay_s))
+    measured_angle_rad = _causal_response(
+        chirp_reference_rad, rate_hz, lambda s: motor(s) * np.exp(-s * angle_delay_s)
+    )
     if quantum_rad:
-        angle = quantum_rad * np.round(angle / quantum_rad)
-    noise = noise_nm * np.random.default_rng(seed).standard_normal(reference.size)
+        measured_angle_rad = quantum_rad * np.round(measured_angle_rad / quantum_rad)
+    torque_noise_nm = noise_nm * np.random.default_rng(seed).standard_normal(
+        chirp_reference_rad.size
+    )
     segments = {
         "rest": (0, rest_samples),
         "sweep": (rest_samples, rest_samples + sweep_samples),
-        "ring_down": (rest_samples + sweep_samples, reference.size),
+        "ring_down": (rest_samples + sweep_samples, chirp_reference_rad.size),
     }
-    torque = _causal_response(reference, rate_hz, torque_of) + noise
+    coupling_torque_nm = _causal_response(chirp_reference_rad, rate_hz, torque_of) + torque_noise_nm
     metadata = {"excitation": "chirp", "start_hz": repr(start_hz), "stop_hz": repr(stop_hz)}
-    return Signals(reference, angle, torque, segments, rate_hz, metadata)
+    return Signals(
+        chirp_reference_rad, measured_angle_rad, coupling_torque_nm, segments, rate_hz, metadata
+    )
 
 
 def write_session(
@@ -242,10 +250,10 @@ def write_session(
     >>> len(session.samples), session.number("beam_length_m")
     (13000, 0.98)
     """
-    at = np.arange(len(signals.angle_rad)) if ticks is None else np.asarray(ticks)
-    samples = {
-        "tick": at,
-        "t_ns": np.rint(at * (1e9 / signals.rate_hz)) if t_ns is None else t_ns,
+    sample_ticks = np.arange(len(signals.angle_rad)) if ticks is None else np.asarray(ticks)
+    sample_columns = {
+        "tick": sample_ticks,
+        "t_ns": np.rint(sample_ticks * (1e9 / signals.rate_hz)) if t_ns is None else t_ns,
         "angle_reference_rad": signals.reference_rad,
         "angle_rad": signals.angle_rad,
         "coupling_torque_nm": signals.torque_nm,
@@ -257,19 +265,19 @@ def write_session(
         "beam_density_kg_per_m": repr(beam.density_kg_per_m),
         "beam_bending_stiffness_n_m2": repr(beam.bending_stiffness_n_m2),
     }
-    writer = SessionWriter(path)
-    writer.begin(
+    session_writer = SessionWriter(path)
+    session_writer.begin(
         _START_UTC_NS,
         default_metadata | signals.metadata | dict(metadata or {}),
         dict(signals.segments if segments is None else segments),
         {},
     )
-    writer.write_samples(encode_samples(samples))
-    return writer.close({"outcome": outcome})
+    session_writer.write_samples(encode_samples(sample_columns))
+    return session_writer.close({"outcome": outcome})
 
 
 def _causal_response(
-    values: NDArray[np.float64],
+    input_values: NDArray[np.float64],
     rate_hz: float,
     transfer_of_s: Callable[[NDArray[np.complex128]], NDArray[np.complex128]],
 ) -> NDArray[np.float64]:
@@ -277,10 +285,14 @@ def _causal_response(
 
     The transform is evaluated on ``s = sigma + j omega``, for the values followed by zeros.
     """
-    n = len(values)
+    n = len(input_values)
     padded_length = 1 << (4 * n).bit_length()
-    sigma = rate_hz / n
-    decay = np.exp(-sigma * np.arange(n) / rate_hz)
-    s = np.asarray(sigma + 2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128)
-    spectrum = np.multiply(np.fft.rfft(values * decay, padded_length), transfer_of_s(s))
-    return np.asarray(np.fft.irfft(spectrum, padded_length)[:n] / decay)
+    sigma_per_s = rate_hz / n
+    decay_factors = np.exp(-sigma_per_s * np.arange(n) / rate_hz)
+    s = np.asarray(
+        sigma_per_s + 2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128
+    )
+    output_spectrum = np.multiply(
+        np.fft.rfft(input_values * decay_factors, padded_length), transfer_of_s(s)
+    )
+    return np.asarray(np.fft.irfft(output_spectrum, padded_length)[:n] / decay_factors)

@@ -61,16 +61,19 @@ def number_of(cell: str, decimal_sign: str) -> float:
     ValueError
         If the cell is not a number with that decimal sign.
     """
-    text = cell.strip()
-    if not text:
+    cell_text = cell.strip()
+    if not cell_text:
         return float("nan")
-    if not is_number(text, decimal_sign):
-        raise ValueError(text)
-    return float(text.replace(COMMA, POINT))
+    if not is_number(cell_text, decimal_sign):
+        raise ValueError(cell_text)
+    return float(cell_text.replace(COMMA, POINT))
 
 
 def fast_number_converter(decimal_sign: str) -> Callable[[str], float]:
-    """Return a fast function from a cell to its number; it raises ValueError if in doubt."""
+    """Return a fast function that converts a cell to its number.
+
+    The function raises ValueError for a cell that may not be a number.
+    """
     return float if decimal_sign == POINT else _number_with_comma
 
 
@@ -98,15 +101,15 @@ class ThousandsCheck:
         self.grouped_line = 0
         self.plain = False
 
-    def proves_decimal_sign(self, cell: str, line: int) -> bool:
-        """Add a cell and return whether it proves that the sign is a decimal sign."""
-        text = cell.strip()
-        if self._decimal_sign not in text:
-            self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(text) is not None
+    def proves_decimal_sign(self, cell: str, line_number: int) -> bool:
+        """Check a cell; return True if it proves that the sign is not a thousands separator."""
+        cell_text = cell.strip()
+        if self._decimal_sign not in cell_text:
+            self.plain = self.plain or _SHORT_INTEGER_PATTERN.fullmatch(cell_text) is not None
             return False
-        if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(text):
+        if not _GROUPED_PATTERNS[self._decimal_sign].fullmatch(cell_text):
             return True
-        self.grouped_line = self.grouped_line or line
+        self.grouped_line = self.grouped_line or line_number
         return False
 
 
@@ -139,16 +142,18 @@ def without_comment_mark(cell: str) -> str:
 
 def is_comment(row: Sequence[str]) -> bool:
     """Return whether a line is a comment or a horizontal rule, such as dashes below the titles."""
-    text = "".join(row).strip()
-    return _COMMENT_PATTERN.match(text) is not None or set(text) <= set("-=_+|*: ")
+    line_text = "".join(row).strip()
+    return _COMMENT_PATTERN.match(line_text) is not None or set(line_text) <= set("-=_+|*: ")
 
 
-def is_row_of_units(row: Sequence[str], columns: Sequence[int]) -> bool:
+def is_row_of_units(row: Sequence[str], column_indices: Sequence[int]) -> bool:
     """Return whether a line below the titles is a row of units.
 
     It is if it contains no number, and a known unit in at least one of the columns.
     """
-    cells = [cell.strip() for cell in row]
-    if any(is_any_number(cell) for cell in cells if cell and cell != "1"):
+    stripped_cells = [cell.strip() for cell in row]
+    if any(is_any_number(cell) for cell in stripped_cells if cell and cell != "1"):
         return False
-    return any(is_unit(row[column]) for column in columns if column < len(row))
+    return any(
+        is_unit(row[column_index]) for column_index in column_indices if column_index < len(row)
+    )

@@ -21,9 +21,9 @@ def encodings(first_bytes: bytes) -> tuple[str, ...]:
     Most programs without UTF-8 write Windows-1252. Numbers have the same bytes in both encodings;
     only titles and units can differ.
     """
-    encoding = _encoding_of_mark(first_bytes)
-    if encoding is not None:
-        return (encoding,)
+    stated_encoding = _encoding_of_mark(first_bytes)
+    if stated_encoding is not None:
+        return (stated_encoding,)
     if len(first_bytes) > 1 and not first_bytes[1] and first_bytes[0]:
         return ("utf-16-le",)
     if len(first_bytes) > 1 and not first_bytes[0] and first_bytes[1]:
@@ -31,14 +31,14 @@ def encodings(first_bytes: bytes) -> tuple[str, ...]:
     return ("utf-8", "cp1252")
 
 
-def decode_text(data: bytes) -> str:
+def decode_text(text_bytes: bytes) -> str:
     r"""Return text that is encoded in UTF-8, or in UTF-16 or UTF-32 with a byte order mark.
 
     The byte order mark is omitted.
 
     Parameters
     ----------
-    data : bytes
+    text_bytes : bytes
         Content of a file.
 
     Raises
@@ -52,9 +52,16 @@ def decode_text(data: bytes) -> str:
     >>> decode_text(b"\xef\xbb\xbfname = 1")
     'name = 1'
     """
-    return data.decode(_encoding_of_mark(data[:_MOST_MARK_BYTES]) or "utf-8")
+    return text_bytes.decode(_encoding_of_mark(text_bytes[:_MOST_MARK_BYTES]) or "utf-8")
 
 
 def _encoding_of_mark(first_bytes: bytes) -> str | None:
     """Return the encoding that a byte order mark states; None without a mark."""
-    return next((name for mark, name in _BYTE_ORDER_MARKS if first_bytes.startswith(mark)), None)
+    return next(
+        (
+            encoding_name
+            for byte_order_mark, encoding_name in _BYTE_ORDER_MARKS
+            if first_bytes.startswith(byte_order_mark)
+        ),
+        None,
+    )

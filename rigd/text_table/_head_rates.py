@@ -24,22 +24,29 @@ _PERIOD_PATTERN: Final = re.compile(
 """Pattern of a stated sampling period, in English or German."""
 
 
-def stated_rate_hz(lines: Iterable[str]) -> float | None:
-    """Return the sampling rate that a line states; None if none does. The default unit is Hz."""
-    for line in lines:
-        rate = _RATE_PATTERN.search(line)
-        if rate:
-            unit = (rate["before"] or rate["behind"] or "Hz").lower()
-            return _plausible_product(rate["number"], 1e3 if unit == "khz" else 1.0)
-        period = _PERIOD_PATTERN.search(line)
-        unit_s = time_unit_s(period["before"] or period["behind"] or "") if period else None
-        if period and unit_s:
-            period_s = _plausible_product(period["number"], unit_s)
+def stated_rate_hz(head_lines: Iterable[str]) -> float | None:
+    """Return the sampling rate in Hz that a line above the table states; None without one.
+
+    A rate without a unit is in Hz.
+    """
+    for head_line in head_lines:
+        rate_match = _RATE_PATTERN.search(head_line)
+        if rate_match:
+            unit_name = (rate_match["before"] or rate_match["behind"] or "Hz").lower()
+            return _plausible_product(rate_match["number"], 1e3 if unit_name == "khz" else 1.0)
+        period_match = _PERIOD_PATTERN.search(head_line)
+        unit_s = (
+            time_unit_s(period_match["before"] or period_match["behind"] or "")
+            if period_match
+            else None
+        )
+        if period_match and unit_s:
+            period_s = _plausible_product(period_match["number"], unit_s)
             return 1 / period_s if period_s else None
     return None
 
 
-def _plausible_product(number: str, unit: float) -> float | None:
+def _plausible_product(number_text: str, unit_factor: float) -> float | None:
     """Return a number times its unit; None if the product is not plausible."""
-    value = float(number.replace(",", ".")) * unit
-    return value if 0.0 < value < 1e12 else None
+    product = float(number_text.replace(",", ".")) * unit_factor
+    return product if 0.0 < product < 1e12 else None

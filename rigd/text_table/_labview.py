@@ -38,36 +38,41 @@ class LabviewHead:
     last_line: int
     channels: Mapping[str, tuple[str, ...]]
 
-    def text(self, key: str, column: int) -> str:
+    def text(self, head_key: str, column_index: int) -> str:
         """Return the text that a key has for a column; "" if there is none."""
-        cells = self.channels.get(key, ())
-        return cells[column] if 0 < column < len(cells) else ""
+        key_cells = self.channels.get(head_key, ())
+        return key_cells[column_index] if 0 < column_index < len(key_cells) else ""
 
-    def number(self, key: str, column: int) -> float | None:
+    def number(self, head_key: str, column_index: int) -> float | None:
         """Return the number that a key has for a column; None if there is none."""
         try:
-            return float(self.text(key, column).replace(",", "."))
+            return float(self.text(head_key, column_index).replace(",", "."))
         except ValueError:
             return None
 
-    def start_ns(self, column: int) -> int | None:
+    def start_ns(self, column_index: int) -> int | None:
         """Return the time of a column's first sample in ns since 1970; None if it is not stated."""
-        offset_s = self.number("X0", column)
+        offset_s = self.number("X0", column_index)
         if offset_s is None or not isfinite(offset_s):
             return None
-        day, time = self.text("Date", column), self.text("Time", column).replace(",", ".")
-        seconds, _, fraction = time.partition(".")
+        day, time_text = (
+            self.text("Date", column_index),
+            self.text("Time", column_index).replace(",", "."),
+        )
+        seconds_text, _, fraction_text = time_text.partition(".")
         try:
-            start = datetime.strptime(f"{day} {seconds}", "%Y/%m/%d %H:%M:%S").replace(tzinfo=UTC)
-            head_ns = int(start.timestamp()) * 10**9 + int(f"{fraction[:9]:0<9}")
+            start_time = datetime.strptime(f"{day} {seconds_text}", "%Y/%m/%d %H:%M:%S").replace(
+                tzinfo=UTC
+            )
+            head_ns = int(start_time.timestamp()) * 10**9 + int(f"{fraction_text[:9]:0<9}")
         except ValueError:
-            if day or time:
+            if day or time_text:
                 return None
             head_ns = 0
         return head_ns + round(offset_s * 1e9)
 
 
-def head_of(lines: Sequence[str]) -> LabviewHead | None:
+def head_of(text_lines: Sequence[str]) -> LabviewHead | None:
     """Return the head of a LabVIEW measurement file; None if the text is not such a file.
 
     Raises
@@ -75,26 +80,35 @@ def head_of(lines: Sequence[str]) -> LabviewHead | None:
     TableError
         If the last line of the head is missing.
     """
-    first_line = next((line for line in lines if line.strip()), "")
+    first_line = next((text_line for text_line in text_lines if text_line.strip()), "")
     if not first_line.lstrip('"').startswith(_FIRST_LINE_TEXT):
         return None
     end_lines = [
-        number
-        for number, line in enumerate(lines, 1)
-        if line.strip('"').startswith(_LAST_LINE_TEXT)
+        line_number
+        for line_number, text_line in enumerate(text_lines, 1)
+        if text_line.strip('"').startswith(_LAST_LINE_TEXT)
     ]
     if not end_lines:
         raise TableError(
             f"is a LabVIEW file whose head has no line {_LAST_LINE_TEXT}; export it again."
         )
-    separator = next((character for character in ("\t", ",", ";") if character in first_line), "\t")
+    separator = next(
+        (
+            separator_character
+            for separator_character in ("\t", ",", ";")
+            if separator_character in first_line
+        ),
+        "\t",
+    )
     channels: dict[str, tuple[str, ...]] = {}
-    for line in lines[: end_lines[-1] - 1]:
-        key, *cells = (cell.strip().strip('"') for cell in line.rstrip("\r\n").split(separator))
-        if key == "Separator" and cells:
-            separator = _SEPARATORS_BY_NAME.get(cells[0].lower(), separator)
+    for text_line in text_lines[: end_lines[-1] - 1]:
+        key, *line_cells = (
+            cell.strip().strip('"') for cell in text_line.rstrip("\r\n").split(separator)
+        )
+        if key == "Separator" and line_cells:
+            separator = _SEPARATORS_BY_NAME.get(line_cells[0].lower(), separator)
         elif key.startswith(_LAST_LINE_TEXT):
             channels.clear()  # earlier keys belong to the file and not to a channel
         elif key in _CHANNEL_KEYS:
-            channels[key] = ("", *cells)
+            channels[key] = ("", *line_cells)
     return LabviewHead(separator, end_lines[-1], channels)

@@ -107,19 +107,19 @@ class TableLayout:
 
 def stated_separator(first_line: str) -> str | None:
     """Return the separator that Excel's line ``sep=;`` states; None for any other line."""
-    text = first_line.rstrip("\r\n").strip('"')
+    line_text = first_line.rstrip("\r\n").strip('"')
     is_statement = (
-        text[: len(_EXCEL_SEPARATOR_LINE)].lower() == _EXCEL_SEPARATOR_LINE
-        and len(text) == len(_EXCEL_SEPARATOR_LINE) + 1
+        line_text[: len(_EXCEL_SEPARATOR_LINE)].lower() == _EXCEL_SEPARATOR_LINE
+        and len(line_text) == len(_EXCEL_SEPARATOR_LINE) + 1
     )
-    return text[-1] if is_statement else None
+    return line_text[-1] if is_statement else None
 
 
 def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, list[str]]]:
     """Yield the rows of a text: number of the row's first line, and its cells."""
     if separator == BLANK_SEPARATOR:
-        for number, line in enumerate(lines, 1):
-            yield number, line.split()
+        for line_number, row_cells in enumerate(lines, 1):
+            yield line_number, row_cells.split()
         return
     csv_reader = csv.reader(lines, delimiter=separator)
     lines_before = 0
@@ -130,14 +130,14 @@ def rows_of_cells(lines: Iterable[str], separator: str) -> Iterator[tuple[int, l
 
 def without_trailing_empty_cells(row: Sequence[str], column_count: int) -> list[str]:
     """Return a row without the empty cells that follow the last column."""
-    cells = list(row)
-    while len(cells) > column_count and not cells[-1].strip():
-        cells.pop()
-    return cells
+    row_cells = list(row)
+    while len(row_cells) > column_count and not row_cells[-1].strip():
+        row_cells.pop()
+    return row_cells
 
 
 def wrong_width_message(
-    line: int, cells: int, layout_width: int, titles_line: int, separator: str
+    line_number: int, cell_count: int, layout_width: int, titles_line: int, separator: str
 ) -> str:
     """Return the error message for a row with too many or too few cells."""
     expected_width = (
@@ -146,20 +146,24 @@ def wrong_width_message(
         else f"the lines above have {layout_width}"
     )
     separator_name = _SEPARATOR_NAMES.get(separator, repr(separator))
-    if cells > layout_width:
-        cause = (
+    if cell_count > layout_width:
+        cause_text = (
             "decimal commas in a file that separates by commas, an index without a title and a "
             "separator inside a text add cells"
             if separator == ","
             else "an index without a title, or a separator inside a text, adds cells"
         )
-        remedy = "save the file with another separator or with decimal points, or name each column"
+        remedy_text = (
+            "save the file with another separator or with decimal points, or name each column"
+        )
     else:
-        cause = "a value is missing, a quotation does not end, or the line is not part of the table"
-        remedy = "repair or remove the line; an unknown value is an empty cell"
+        cause_text = (
+            "a value is missing, a quotation does not end, or the line is not part of the table"
+        )
+        remedy_text = "repair or remove the line; an unknown value is an empty cell"
     return (
-        f"line {line} has {_count_with_noun(cells, 'cell')} between {separator_name}, and "
-        f"{expected_width}: {cause}; {remedy}."
+        f"line {line_number} has {_count_with_noun(cell_count, 'cell')} between {separator_name}, "
+        f"and {expected_width}: {cause_text}; {remedy_text}."
     )
 
 
@@ -168,14 +172,14 @@ def _count_with_noun(count: int, noun: str) -> str:
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"
 
 
-def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
+def find_layout(lines: Sequence[str], requested_names: Sequence[str]) -> TableLayout:
     """Return the layout of the table in a file, from the first lines of the file.
 
     Parameters
     ----------
     lines : sequence of str
         First lines with their line ends, at most `MOST_HEAD_LINES`.
-    names : sequence of str
+    requested_names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
 
     Raises
@@ -183,7 +187,7 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     TableError
         If the file contains no table with these columns.
     """
-    if not any(line.strip() for line in lines):
+    if not any(line_number.strip() for line_number in lines):
         raise TableError("is empty; export the record again.")
     separator_in_file = stated_separator(lines[0])
     if separator_in_file:
@@ -192,45 +196,52 @@ def find_layout(lines: Sequence[str], names: Sequence[str]) -> TableLayout:
     if labview_head is not None:
         separator_in_file = labview_head.separator
     present_separators = [
-        character for character in _SEPARATORS if any(character in line for line in lines)
+        separator_character
+        for separator_character in _SEPARATORS
+        if any(separator_character in line_number for line_number in lines)
     ]
-    candidates = (
+    candidate_separators = (
         [separator_in_file] if separator_in_file else [*present_separators, BLANK_SEPARATOR]
     )
-    failures: list[_NotThisTableError] = []
+    failed_attempts: list[_NotThisTableError] = []
     best_layout: TableLayout | None = None
-    for separator in candidates:
+    for separator in candidate_separators:
         try:
-            rows = [
-                TextRow(line, [cell.strip() for cell in cells], index)
-                for index, (line, cells) in enumerate(rows_of_cells(lines, separator))
+            text_rows = [
+                TextRow(line_number, [cell.strip() for cell in cells], row_index)
+                for row_index, (line_number, cells) in enumerate(rows_of_cells(lines, separator))
             ]
         except csv.Error as error:
-            failures.append(
+            failed_attempts.append(
                 _NotThisTableError(_RANK_NO_ROWS, TableError(f"is no table ({error})."))
             )
             continue
-        nonempty_rows = [row for row in rows if any(row.cells)]
+        nonempty_rows = [row for row in text_rows if any(row.cells)]
         if labview_head is not None:
             nonempty_rows = [row for row in nonempty_rows if row.line > labview_head.last_line]
         try:
-            layout = _layout_with_separator(nonempty_rows, separator, names, labview_head)
+            possible_layout = _layout_with_separator(
+                nonempty_rows, separator, requested_names, labview_head
+            )
         except _NotThisTableError as unlikely:
             unlikely.separator = separator
-            failures.append(unlikely)
+            failed_attempts.append(unlikely)
             continue
         if separator == ",":
-            _check_split_decimals(rows[layout.rows_before_numbers :], layout)
-        if best_layout is None or layout.rows_before_numbers < best_layout.rows_before_numbers:
-            best_layout = layout
-    nearest_failure = max(failures, key=lambda failure: failure.rank, default=None)
+            _check_split_decimals(text_rows[possible_layout.rows_before_numbers :], possible_layout)
+        if (
+            best_layout is None
+            or possible_layout.rows_before_numbers < best_layout.rows_before_numbers
+        ):
+            best_layout = possible_layout
+    nearest_failure = max(failed_attempts, key=lambda failure: failure.rank, default=None)
     # A table that starts late does not count if earlier lines nearly form a table.
     has_earlier_titles = any(
         failed_layout.rank == _RANK_ALL_TITLES
         and best_layout
         and failed_layout.index < best_layout.rows_before_numbers
         and failed_layout.separator != BLANK_SEPARATOR
-        for failed_layout in failures
+        for failed_layout in failed_attempts
     )
     if best_layout is None or has_earlier_titles:
         assert nearest_failure is not None
@@ -263,81 +274,102 @@ _RANK_NO_ROWS, _RANK_NO_TITLES, _RANK_SOME_TITLES, _RANK_ALL_TITLES = range(4)
 def _layout_with_separator(
     rows: Sequence[TextRow],
     separator: str,
-    names: Sequence[str],
+    requested_names: Sequence[str],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
     """Return the layout of the table for a given separator, or raise the most specific error."""
-    column_numbers = [_column_number(name) for name in names]
+    column_numbers = [_column_number(column_name) for column_name in requested_names]
     requested_titles = [
-        name for name, number in zip(names, column_numbers, strict=True) if number is None
+        column_name
+        for column_name, column_number in zip(requested_names, column_numbers, strict=True)
+        if column_number is None
     ]
     if not rows:
         raise _NotThisTableError(_RANK_NO_ROWS, TableError("has no lines below its head."))
-    failure: _NotThisTableError | None = None
-    for index, row in enumerate(rows):
+    best_failure: _NotThisTableError | None = None
+    for row_index, row in enumerate(rows):
         if requested_titles and not _has_titles(row, requested_titles):
             continue
         try:
             if requested_titles:
-                return _layout_below_titles(rows, index, separator, names, labview_head)
-            layout = _layout_from_numbers(
-                rows, index, separator, [n or 0 for n in column_numbers], labview_head
+                return _layout_below_titles(
+                    rows, row_index, separator, requested_names, labview_head
+                )
+            found_layout = _layout_from_numbers(
+                rows, row_index, separator, [n or 0 for n in column_numbers], labview_head
             )
-            if layout is not None:
-                return layout
+            if found_layout is not None:
+                return found_layout
         except _NotThisTableError as unlikely:
             if unlikely.index == MOST_HEAD_LINES:
                 unlikely.index = row.index
             if not requested_titles:
                 raise
-            failure = failure or unlikely
-    if failure is not None:
-        raise failure
+            best_failure = best_failure or unlikely
+    if best_failure is not None:
+        raise best_failure
     if requested_titles:
         raise _missing_title_error(rows, requested_titles)
     raise _NotThisTableError(
         _RANK_NO_TITLES
         if max(len(row.cells) for row in rows) >= max(n or 0 for n in column_numbers)
         else 0,
-        _no_numbers_error(rows, names),
+        _no_numbers_error(rows, requested_names),
     )
 
 
-def _column_number(name: str) -> int | None:
+def _column_number(column_name: str) -> int | None:
     """Return the number in a name such as ``#3``; None for a title."""
-    digits = name.removeprefix("#")
-    return int(digits) if name != digits and digits.isdecimal() and int(digits) > 0 else None
+    number_text = column_name.removeprefix("#")
+    return (
+        int(number_text)
+        if column_name != number_text and number_text.isdecimal() and int(number_text) > 0
+        else None
+    )
 
 
 def _plain_titles(row: TextRow) -> list[str]:
     """Return a row's titles without a comment mark and without empty titles at the end."""
-    cells = without_trailing_empty_cells(row.cells, 0)
-    if cells and cells[0] in ("#", "%"):  # with blanks as separator the mark is a separate cell
-        return cells[1:]
-    return [without_comment_mark(cell) if not index else cell for index, cell in enumerate(cells)]
+    title_cells = without_trailing_empty_cells(row.cells, 0)
+    if title_cells and title_cells[0] in (
+        "#",
+        "%",
+    ):  # with blanks as separator the mark is a separate cell
+        return title_cells[1:]
+    return [
+        without_comment_mark(cell) if not cell_index else cell
+        for cell_index, cell in enumerate(title_cells)
+    ]
 
 
-def _has_titles(row: TextRow, names: Iterable[str]) -> bool:
+def _has_titles(row: TextRow, requested_titles: Iterable[str]) -> bool:
     """Return whether a row contains all of the requested titles."""
-    return all(name in row.cells or name in _plain_titles(row) for name in names)
+    return all(
+        requested_title in row.cells or requested_title in _plain_titles(row)
+        for requested_title in requested_titles
+    )
 
 
 def _layout_below_titles(
     rows: Sequence[TextRow],
-    index: int,
+    titles_index: int,
     separator: str,
-    names: Sequence[str],
+    requested_names: Sequence[str],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout:
-    """Return the layout of the table below a row of titles."""
-    titles_row = rows[index]
+    """Return the layout of the table below a row of titles, or raise an error for the user."""
+    titles_row = rows[titles_index]
     raw_titles, plain_titles = (
         without_trailing_empty_cells(titles_row.cells, 0),
         _plain_titles(titles_row),
     )
     titles = (
         raw_titles
-        if all(name in raw_titles for name in names if _column_number(name) is None)
+        if all(
+            column_name in raw_titles
+            for column_name in requested_names
+            if _column_number(column_name) is None
+        )
         else plain_titles
     )
     # "#" or "%" alone may mark a comment or be the title of an index.
@@ -348,57 +380,65 @@ def _layout_below_titles(
             if next_row is None or len(next_row.cells) == len(raw_titles)
             else plain_titles
         )
-    width = len(titles)
-    columns = []
-    for name in names:
-        if titles.count(name) > 1:
+    column_count = len(titles)
+    column_indices = []
+    for column_name in requested_names:
+        if titles.count(column_name) > 1:
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
                 TableError(
-                    f"{titles.count(name)} columns are named '{name}' (line {titles_row.line}); "
-                    f"give the number, such as #{titles.index(name) + 1} for the first of them."
+                    f"{titles.count(column_name)} columns are named '{column_name}' (line "
+                    f"{titles_row.line}); give the number, such as "
+                    f"#{titles.index(column_name) + 1} for the first of "
+                    "them."
                 ),
             )
-        number = _column_number(name)
-        if name in titles:
-            columns.append(titles.index(name))
-        elif number is not None and number <= width:
-            columns.append(number - 1)
+        column_number = _column_number(column_name)
+        if column_name in titles:
+            column_indices.append(titles.index(column_name))
+        elif column_number is not None and column_number <= column_count:
+            column_indices.append(column_number - 1)
         else:
             raise _NotThisTableError(
-                _RANK_ALL_TITLES, MissingColumnError(name, titles, titles_row.line)
+                _RANK_ALL_TITLES, MissingColumnError(column_name, titles, titles_row.line)
             )
     optional_columns = int(labview_head is not None and titles[-1] == _labview.COMMENT_TITLE)
     units: Sequence[str] = ()
-    cells_above = rows[index - 1].cells if index else []
-    if len(without_trailing_empty_cells(cells_above, width)) == width and all(
+    cells_above = rows[titles_index - 1].cells if titles_index else []
+    if len(without_trailing_empty_cells(cells_above, column_count)) == column_count and all(
         is_unit(cell) for cell in cells_above if cell
     ):
         units = cells_above
-    for row in rows[index + 1 : index + 2 + _MOST_LINES_BELOW_TITLES]:
-        cells = without_trailing_empty_cells(row.cells, width)
-        has_table_width = width - optional_columns <= len(cells) <= width
-        if has_table_width and _is_data(cells, columns, _next_row(rows, row)):
-            _check_single_column(row.line, cells)
+    for row in rows[titles_index + 1 : titles_index + 2 + _MOST_LINES_BELOW_TITLES]:
+        row_cells = without_trailing_empty_cells(row.cells, column_count)
+        has_table_width = column_count - optional_columns <= len(row_cells) <= column_count
+        if has_table_width and _is_data(row_cells, column_indices, _next_row(rows, row)):
+            _check_single_column(row.line, row_cells)
             return TableLayout(
                 separator=separator,
                 titles=tuple(titles),
                 titles_line=titles_row.line,
                 units=tuple(bare_unit(cell) for cell in units),
-                width=width,
+                width=column_count,
                 optional_columns=optional_columns,
                 rows_before_numbers=row.index,
-                columns=tuple(columns),
-                first_cells=tuple(cells),
+                columns=tuple(column_indices),
+                first_cells=tuple(row_cells),
                 labview=labview_head,
             )
-        if len(cells) <= width and not units and is_row_of_units(cells, columns):
-            units = cells + [""] * (width - len(cells))
+        if (
+            len(row_cells) <= column_count
+            and not units
+            and is_row_of_units(row_cells, column_indices)
+        ):
+            units = row_cells + [""] * (column_count - len(row_cells))
             continue
-        if is_comment(cells):
+        if is_comment(row_cells):
             continue
-        error = _error_for_unexpected_row(row, cells, columns, names, titles_row, width, separator)
-        raise _NotThisTableError(_RANK_ALL_TITLES, error, row.index)
+        row_error = _error_for_unexpected_row(
+            row, row_cells, column_indices, requested_names, titles_row, column_count, separator
+        )
+        raise _NotThisTableError(_RANK_ALL_TITLES, row_error, row.index)
     raise _NotThisTableError(
         _RANK_ALL_TITLES,
         TableError(
@@ -407,104 +447,113 @@ def _layout_below_titles(
     )
 
 
-def _check_single_column(line: int, cells: Sequence[str]) -> None:
+def _check_single_column(line_number: int, row_cells: Sequence[str]) -> None:
     """Raise if a row with a single cell contains a comma, which may be a decimal comma."""
-    if len(cells) == 1 and "," in cells[0]:
-        raise _NotThisTableError(_RANK_ALL_TITLES, TableError(comma_in_single_message(line)))
+    if len(row_cells) == 1 and "," in row_cells[0]:
+        raise _NotThisTableError(_RANK_ALL_TITLES, TableError(comma_in_single_message(line_number)))
 
 
-def comma_in_single_message(line: int) -> str:
+def comma_in_single_message(line_number: int) -> str:
     """Return the error message for a table of one column with decimal commas."""
     return (
-        f"line {line} has a comma, which separates two cells, and the table has one column; save "
-        "the file with decimal points."
+        f"line {line_number} has a comma, which separates two cells, and the table has one "
+        "column; save the file with decimal points."
     )
 
 
-def _next_row(rows: Sequence[TextRow], row: TextRow) -> TextRow | None:
+def _next_row(rows: Sequence[TextRow], earlier_row: TextRow) -> TextRow | None:
     """Return the row after a given one; None if it is the last."""
-    return next((other for other in rows if other.index > row.index), None)
+    return next((later_row for later_row in rows if later_row.index > earlier_row.index), None)
 
 
-def _is_data(cells: Sequence[str], columns: Sequence[int], next_row: TextRow | None) -> bool:
-    """Return whether a row is one of numbers.
+def _is_data(
+    row_cells: Sequence[str], column_indices: Sequence[int], next_row: TextRow | None
+) -> bool:
+    """Return True if a row belongs to the numbers of the table.
 
     It must have numbers in the requested columns, and no text where the next row has a number.
     """
-    if max(columns) >= len(cells):
+    if max(column_indices) >= len(row_cells):
         return False
-    requested_cells = [cells[column] for column in columns if cells[column]]
+    requested_cells = [
+        row_cells[column_index] for column_index in column_indices if row_cells[column_index]
+    ]
     if not all(is_any_number(cell) or is_stamp(cell) for cell in requested_cells):
         return False
-    if not any(map(is_any_number, cells)):
+    if not any(map(is_any_number, row_cells)):
         return False
     return next_row is None or not any(
         cell and not is_any_number(cell) and is_any_number(cell_below)
-        for cell, cell_below in zip(cells, next_row.cells, strict=False)
+        for cell, cell_below in zip(row_cells, next_row.cells, strict=False)
     )
 
 
 def _error_for_unexpected_row(
     row: TextRow,
-    cells: Sequence[str],
-    columns: Sequence[int],
-    names: Sequence[str],
+    row_cells: Sequence[str],
+    column_indices: Sequence[int],
+    requested_names: Sequence[str],
     titles_row: TextRow,
-    width: int,
+    column_count: int,
     separator: str,
 ) -> TableError:
     """Return the error for a row below the titles that is neither numbers nor units."""
-    if len(cells) != width:
+    if len(row_cells) != column_count:
         return TableError(
-            wrong_width_message(row.line, len(cells), width, titles_row.line, separator)
+            wrong_width_message(row.line, len(row_cells), column_count, titles_row.line, separator)
         )
-    for name, column in zip(names, columns, strict=True):
-        if cells[column] and not is_any_number(cells[column]) and not is_stamp(cells[column]):
-            return not_a_number_error(row.line, name, cells[column])
+    for column_name, column_index in zip(requested_names, column_indices, strict=True):
+        if (
+            row_cells[column_index]
+            and not is_any_number(row_cells[column_index])
+            and not is_stamp(row_cells[column_index])
+        ):
+            return not_a_number_error(row.line, column_name, row_cells[column_index])
     return TableError(
         f"line {row.line} has texts where the line below has numbers, and is no row of units; "
         "remove it."
     )
 
 
-def not_a_number_error(line: int, name: str, cell: str) -> TableError:
+def not_a_number_error(line_number: int, column_name: str, cell_text: str) -> TableError:
     """Return the error for a cell that should be a number."""
-    if is_date(cell):
+    if is_date(cell_text):
         return TableError(
-            f"line {line}: '{name}' is a date or a time of day{{cell}} that is not understood; "
-            "write times as 2026-11-25 12:00:00.001 or in seconds, or leave them out and state the "
+            f"line {line_number}: '{column_name}' is a date or a time of day{{cell}} that is not "
+            "understood; write times as 2026-11-25 12:00:00.001 or in seconds, or leave them out "
+            "and state the "
             "rate (--rate-hz).",
-            cell,
+            cell_text,
         )
     return TableError(
-        f"line {line}: '{name}' is not a number{{cell}}; below the titles and one line of units "
-        "only numbers are allowed.",
-        cell,
+        f"line {line_number}: '{column_name}' is not a number{{cell}}; below the titles and one "
+        "line of units only numbers are allowed.",
+        cell_text,
     )
 
 
 def _layout_from_numbers(
     rows: Sequence[TextRow],
-    index: int,
+    row_index: int,
     separator: str,
-    numbers: Sequence[int],
+    column_numbers: Sequence[int],
     labview_head: "_labview.LabviewHead | None",
 ) -> TableLayout | None:
-    """Return the layout if a row is the first one with numbers; None if it is not.
+    """Return the layout if the row at `row_index` is the first one with numbers; else None.
 
     The requested columns are given by their numbers.
     """
     row, rows_above = (
-        rows[index],
-        list(takewhile(lambda other_row: other_row.index < rows[index].index, rows)),
+        rows[row_index],
+        list(takewhile(lambda other_row: other_row.index < rows[row_index].index, rows)),
     )
-    columns = [number - 1 for number in numbers]
+    column_indices = [number - 1 for number in column_numbers]
     if is_comment(row.cells):
         return None
-    if not _is_data(row.cells, columns, _next_row(rows, row)) or _is_row_of_column_numbers(
-        rows, index
+    if not _is_data(row.cells, column_indices, _next_row(rows, row)) or _is_row_of_column_numbers(
+        rows, row_index
     ):
-        filled_columns = [c for c in columns if c < len(row.cells) and row.cells[c]]
+        filled_columns = [c for c in column_indices if c < len(row.cells) and row.cells[c]]
         number_columns = [c for c in filled_columns if is_any_number(row.cells[c])]
         row_below = _next_row(rows, row)
         if (
@@ -512,11 +561,12 @@ def _layout_from_numbers(
             and len(number_columns) < len(filled_columns)
             and row_below is not None
             and len(row_below.cells) == len(row.cells)
-            and not _is_row_of_column_numbers(rows, index)
+            and not _is_row_of_column_numbers(rows, row_index)
         ):
-            column = next(c for c in filled_columns if c not in number_columns)
+            column_index = next(c for c in filled_columns if c not in number_columns)
             raise _NotThisTableError(
-                _RANK_ALL_TITLES, not_a_number_error(row.line, f"#{column + 1}", row.cells[column])
+                _RANK_ALL_TITLES,
+                not_a_number_error(row.line, f"#{column_index + 1}", row.cells[column_index]),
             )
         return None
     units: Sequence[str] = ()
@@ -526,7 +576,7 @@ def _layout_from_numbers(
     if (
         len(last_rows_above) == 2
         and len(last_rows_above[0]) == len(last_rows_above[1])
-        and is_row_of_units(last_rows_above[1], columns)
+        and is_row_of_units(last_rows_above[1], column_indices)
     ):
         units = rows_above.pop().cells
     titles: Sequence[str] = ()
@@ -537,44 +587,51 @@ def _layout_from_numbers(
         optional_columns = int(labview_head is not None and titles[-1:] == [_labview.COMMENT_TITLE])
     if titles and not units and all(is_unit(title) for title in titles if title):
         units = titles
-    cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
-    if titles and not len(titles) - optional_columns <= len(cells) <= len(titles):
-        if separator != BLANK_SEPARATOR or len(cells) > len(titles):
+    row_cells = without_trailing_empty_cells(row.cells, len(titles)) if titles else row.cells
+    if titles and not len(titles) - optional_columns <= len(row_cells) <= len(titles):
+        if separator != BLANK_SEPARATOR or len(row_cells) > len(titles):
             raise _NotThisTableError(
                 _RANK_ALL_TITLES,
                 TableError(
-                    wrong_width_message(row.line, len(cells), len(titles), titles_line, separator)
+                    wrong_width_message(
+                        row.line, len(row_cells), len(titles), titles_line, separator
+                    )
                 ),
             )
         titles, titles_line = (), 0  # titles of several words cannot be separated
-    width = len(titles) if titles else len(cells)
-    _check_single_column(row.line, cells)
+    column_count = len(titles) if titles else len(row_cells)
+    _check_single_column(row.line, row_cells)
     return TableLayout(
         separator=separator,
         titles=tuple(titles),
         titles_line=titles_line,
-        units=tuple(bare_unit(cell) for cell in [*units, *[""] * (width - len(units))][:width])
+        units=tuple(
+            bare_unit(cell) for cell in [*units, *[""] * (column_count - len(units))][:column_count]
+        )
         if units
         else (),
-        width=width,
+        width=column_count,
         optional_columns=optional_columns,
         rows_before_numbers=row.index,
-        columns=tuple(columns),
-        first_cells=tuple(cells),
+        columns=tuple(column_indices),
+        first_cells=tuple(row_cells),
         labview=labview_head,
     )
 
 
-def _is_row_of_column_numbers(rows: Sequence[TextRow], index: int) -> bool:
+def _is_row_of_column_numbers(text_rows: Sequence[TextRow], row_index: int) -> bool:
     """Return whether the first row contains the numbers of the columns instead of data.
 
     This is the case if it counts from 0 or 1, and no row below contains only integers.
     """
-    cells = [cell for cell in rows[index].cells if cell]
-    if index or len(cells) < 2:
+    filled_cells = [cell for cell in text_rows[row_index].cells if cell]
+    if row_index or len(filled_cells) < 2:
         return False
-    counts_upwards = any(cells == [str(first + n) for n in range(len(cells))] for first in (0, 1))
-    rows_below = rows[1 : 1 + _NUMBERING_LINES]
+    counts_upwards = any(
+        filled_cells == [str(first_number + n) for n in range(len(filled_cells))]
+        for first_number in (0, 1)
+    )
+    rows_below = text_rows[1 : 1 + _NUMBERING_LINES]
     return (
         counts_upwards
         and bool(rows_below)
@@ -584,56 +641,70 @@ def _is_row_of_column_numbers(rows: Sequence[TextRow], index: int) -> bool:
     )
 
 
-def _missing_title_error(rows: Sequence[TextRow], names: Sequence[str]) -> _NotThisTableError:
-    """Return the error for a missing title, with the titles of the most probable row."""
+def _missing_title_error(
+    rows: Sequence[TextRow], requested_names: Sequence[str]
+) -> _NotThisTableError:
+    """Return the error for a requested title that no row has.
+
+    Its message contains the titles of the row that is most probably the one with titles.
+    """
 
     def count_found_names(row: TextRow) -> int:
-        return sum(name in row.cells or name in _plain_titles(row) for name in names)
+        return sum(
+            missing_name in row.cells or missing_name in _plain_titles(row)
+            for missing_name in requested_names
+        )
 
     best_row = max(rows, key=count_found_names)
     if count_found_names(best_row):
         titles = _plain_titles(best_row)
-        name = next(title for title in names if title not in titles and title not in best_row.cells)
-        return _NotThisTableError(
-            _RANK_SOME_TITLES, MissingColumnError(name, titles, best_row.line)
+        missing_name = next(
+            title
+            for title in requested_names
+            if title not in titles and title not in best_row.cells
         )
-    index = next(
+        return _NotThisTableError(
+            _RANK_SOME_TITLES, MissingColumnError(missing_name, titles, best_row.line)
+        )
+    row_index = next(
         (
-            index
-            for index, row in enumerate(rows)
+            row_index
+            for row_index, row in enumerate(rows)
             if all(map(is_any_number, filter(None, row.cells)))
         ),
         None,
     )
-    if index is None:
+    if row_index is None:
         return _NotThisTableError(
-            _RANK_NO_ROWS, MissingColumnError(names[0], _plain_titles(rows[0]), rows[0].line)
+            _RANK_NO_ROWS,
+            MissingColumnError(requested_names[0], _plain_titles(rows[0]), rows[0].line),
         )
-    width = len(rows[index].cells)
-    rows_above = [row for row in rows[:index] if len(_plain_titles(row)) == width]
+    column_count = len(rows[row_index].cells)
+    rows_above = [row for row in rows[:row_index] if len(_plain_titles(row)) == column_count]
     if rows_above:
         best_row = (
             rows_above[-2]
-            if len(rows_above) > 1 and is_row_of_units(rows_above[-1].cells, range(width))
+            if len(rows_above) > 1 and is_row_of_units(rows_above[-1].cells, range(column_count))
             else rows_above[-1]
         )
         titles, line = _plain_titles(best_row), best_row.line
     else:
-        titles, line = [f"#{number}" for number in range(1, width + 1)], 0
+        titles, line = [f"#{column_number}" for column_number in range(1, column_count + 1)], 0
     return _NotThisTableError(
-        _RANK_NO_TITLES if width > 1 else _RANK_NO_ROWS, MissingColumnError(names[0], titles, line)
+        _RANK_NO_TITLES if column_count > 1 else _RANK_NO_ROWS,
+        MissingColumnError(requested_names[0], titles, line),
     )
 
 
-def _no_numbers_error(rows: Sequence[TextRow], names: Sequence[str]) -> TableError:
+def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -> TableError:
     """Return the error for a table that has no row with numbers in the requested columns."""
-    width = max(len(row.cells) for row in rows)
-    for name in names:
-        if (_column_number(name) or 0) > width:
-            return MissingColumnError(name, [f"#{n}" for n in range(1, width + 1)], 0)
+    most_cells = max(len(row.cells) for row in rows)
+    for column_name in requested_names:
+        if (_column_number(column_name) or 0) > most_cells:
+            return MissingColumnError(column_name, [f"#{n}" for n in range(1, most_cells + 1)], 0)
     return TableError(
         f"has 0 samples: none of its first {len(rows)} lines has numbers in all of the columns "
-        f"{', '.join(names)}."
+        f"{', '.join(requested_names)}."
     )
 
 

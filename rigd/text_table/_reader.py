@@ -120,7 +120,7 @@ class TextTable:
     remark: str = ""
 
 
-def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> TextTable:
+def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: int) -> TextTable:
     r"""Read some columns of a table of numbers in a text file.
 
     The separator is a tab, a semicolon, a comma, a bar or blanks. The decimal sign is a point or a
@@ -132,7 +132,7 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     ----------
     stream : file, open for reading bytes
         The file must be seekable; it is not closed.
-    names : sequence of str
+    requested_names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
     most_rows : int
         Number of rows after which reading ends. If the file has more rows, one more is returned.
@@ -156,40 +156,46 @@ def read_table(stream: BinaryIO, names: Sequence[str], *, most_rows: int) -> Tex
     """
     stream.seek(0)
     first_bytes = stream.read(_ENCODING_BYTES)
-    error: UnicodeError | None = None
-    for encoding in encodings(first_bytes):
+    last_decoding_error: UnicodeError | None = None
+    for possible_encoding in encodings(first_bytes):
         try:
-            return _read(stream, encoding, names, most_rows)
+            return _read(stream, possible_encoding, requested_names, most_rows)
         except UnicodeError as found:
-            error = error or found
+            last_decoding_error = last_decoding_error or found
         except csv.Error as found:
             raise TableError(f"is not a table of text ({found}).") from found
-    raise TableError("is not text in UTF-8, UTF-16 or Windows-1252; save it as UTF-8.") from error
+    raise TableError(
+        "is not text in UTF-8, UTF-16 or Windows-1252; save it as UTF-8."
+    ) from last_decoding_error
 
 
-def _read(stream: BinaryIO, encoding: str, names: Sequence[str], most_rows: int) -> TextTable:
+def _read(
+    stream: BinaryIO, encoding: str, requested_names: Sequence[str], most_rows: int
+) -> TextTable:
     """Read columns of a text with a given encoding."""
-    with _open_lines(stream, encoding) as lines:
-        layout = find_layout(_first_lines(lines), names)
-    first_cells = [layout.first_cells[column] for column in layout.columns]
+    with _open_lines(stream, encoding) as text_lines:
+        table_layout = find_layout(_first_lines(text_lines), requested_names)
+    first_cells = [table_layout.first_cells[column_index] for column_index in table_layout.columns]
     decimal_sign = (
         COMMA if any(COMMA in cell and not is_stamp(cell) for cell in first_cells) else POINT
     )
     try:
-        return _read_columns(stream, encoding, layout, names, most_rows, decimal_sign)
+        return _read_columns(
+            stream, encoding, table_layout, requested_names, most_rows, decimal_sign
+        )
     except _DecimalCommaError:
         # Read again from the start: a point in earlier lines may not be a decimal point.
-        return _read_columns(stream, encoding, layout, names, most_rows, COMMA)
+        return _read_columns(stream, encoding, table_layout, requested_names, most_rows, COMMA)
 
 
 def _first_lines(lines: Iterator[str]) -> list[str]:
     """Return the first lines of a file, from which the layout is detected."""
     first_lines: list[str] = []
-    characters = 0
-    for line in islice(lines, MOST_HEAD_LINES):
-        first_lines.append(line)
-        characters += len(line)
-        if characters > _MOST_HEAD_CHARACTERS:
+    character_count = 0
+    for text_line in islice(lines, MOST_HEAD_LINES):
+        first_lines.append(text_line)
+        character_count += len(text_line)
+        if character_count > _MOST_HEAD_CHARACTERS:
             break
     return first_lines
 
@@ -202,24 +208,25 @@ class _DecimalCommaError(Exception):
 def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
     """Provide the lines of a text file, decoded, as a context manager."""
     stream.seek(0)
-    text = TextIOWrapper(stream, encoding, newline="")
+    text_stream = TextIOWrapper(stream, encoding, newline="")
     try:
-        yield _lines_of_bounded_length(text)
+        yield _lines_of_bounded_length(text_stream)
     finally:
-        text.detach()
+        text_stream.detach()
 
 
-def _lines_of_bounded_length(text: TextIOWrapper) -> Iterator[str]:
+def _lines_of_bounded_length(text_stream: TextIOWrapper) -> Iterator[str]:
     """Yield the lines of a text, and raise TableError for a line that is too long."""
-    number = 0
-    while line := text.readline(MOST_LINE_CHARACTERS + 1):
-        number += 1
-        if len(line) > MOST_LINE_CHARACTERS:
+    line_number = 0
+    while text_line := text_stream.readline(MOST_LINE_CHARACTERS + 1):
+        line_number += 1
+        if len(text_line) > MOST_LINE_CHARACTERS:
             raise TableError(
-                f"line {number}: a line of more than {MOST_LINE_CHARACTERS} characters; a table "
-                "has one line per sample and few channels. Export the session's channels alone."
+                f"line {line_number}: a line of more than {MOST_LINE_CHARACTERS} characters; a "
+                "table has one line per sample and few channels. Export the session's channels "
+                "alone."
             )
-        yield line
+        yield text_line
 
 
 @dataclass(slots=True)
@@ -256,85 +263,92 @@ class _NumberRows:
             if c in self.columns_to_read
         }
 
-    def title(self, column: int) -> str:
+    def title(self, column_index: int) -> str:
         """Return the name of a requested column for messages; its number if it has no name."""
-        if column in self.layout.columns:
-            return self.names[self.layout.columns.index(column)]
-        return f"#{column + 1}"
+        if column_index in self.layout.columns:
+            return self.names[self.layout.columns.index(column_index)]
+        return f"#{column_index + 1}"
 
-    def fit(self, row: Sequence[str], line: int) -> list[str]:
-        """Return a row with the table's number of cells, or raise TableError."""
-        width = self.layout.width
-        cells = without_trailing_empty_cells(row, width)
-        if width - self.layout.optional_columns <= len(cells) < width:
-            cells += [""] * (width - len(cells))
-        if len(cells) != width:
+    def fit(self, row: Sequence[str], line_number: int) -> list[str]:
+        """Return a row with as many cells as the table has columns, or raise TableError."""
+        column_count = self.layout.width
+        fitted_cells = without_trailing_empty_cells(row, column_count)
+        if column_count - self.layout.optional_columns <= len(fitted_cells) < column_count:
+            fitted_cells += [""] * (column_count - len(fitted_cells))
+        if len(fitted_cells) != column_count:
             raise TableError(
                 wrong_width_message(
-                    line, len(cells), width, self.layout.titles_line, self.layout.separator
+                    line_number,
+                    len(fitted_cells),
+                    column_count,
+                    self.layout.titles_line,
+                    self.layout.separator,
                 )
             )
-        return cells
+        return fitted_cells
 
-    def numbers(self, row: Sequence[str], line: int) -> list[float]:
+    def numbers(self, row: Sequence[str], line_number: int) -> list[float]:
         """Return the numbers in the checked cells of a row, or raise if a cell is not a number."""
-        values = []
-        for column in self.checked_columns:
-            cell = row[column].strip()
-            if column not in self.columns_to_read:
+        cell_numbers = []
+        for column_index in self.checked_columns:
+            cell = row[column_index].strip()
+            if column_index not in self.columns_to_read:
                 if cell and not is_any_number(cell):
                     raise TableError(
-                        f"line {line}: column {column + 1} is not a number{{cell}}, unlike in the "
-                        "lines above; remove the line if it is not a sample.",
+                        f"line {line_number}: column {column_index + 1} is not a number{{cell}}, "
+                        "unlike in the lines above; remove the line if it is not a sample.",
                         cell,
                     )
-                values.append(float("nan"))
+                cell_numbers.append(float("nan"))
                 continue
             try:
-                values.append(number_of(cell, self.decimal_sign))
+                cell_numbers.append(number_of(cell, self.decimal_sign))
             except ValueError:
-                raise self._invalid_number_error(cell, column, line) from None
-        return values
+                raise self._invalid_number_error(cell, column_index, line_number) from None
+        return cell_numbers
 
-    def stamp(self, row: Sequence[str], column: int, line: int) -> float:
+    def stamp(self, row: Sequence[str], column_index: int, line_number: int) -> float:
         """Return the time stamp in a cell, in seconds since the column's first time stamp."""
         try:
-            return self.stamps[column](row[column])
+            return self.stamps[column_index](row[column_index])
         except ValueError:
-            cell = row[column]
+            cell = row[column_index]
         if is_stamp(cell):
             raise TableError(
-                f"line {line}: '{self.title(column)}' is of another day{{cell}}, and the order of "
-                "day and month is not clear; write the date as 2026-11-25.",
+                f"line {line_number}: '{self.title(column_index)}' is of another day{{cell}}, and "
+                "the order of day and month is not clear; write the date as 2026-11-25.",
                 cell,
             )
-        raise not_a_number_error(line, self.title(column), cell)
+        raise not_a_number_error(line_number, self.title(column_index), cell)
 
-    def _invalid_number_error(self, cell: str, column: int, line: int) -> Exception:
+    def _invalid_number_error(self, cell: str, column_index: int, line_number: int) -> Exception:
         """Return the error for a cell that is not a number with the expected decimal sign."""
         if self.decimal_sign == POINT and is_number(cell, COMMA):
             if self.layout.width == 1:
-                return TableError(comma_in_single_message(line))
+                return TableError(comma_in_single_message(line_number))
             return _DecimalCommaError()
         if is_number(cell, POINT):
             return TableError(
-                f"line {line}: '{self.title(column)}' has a decimal point{{cell}}, and other "
-                "numbers have decimal commas; save the file with one of them, and without "
+                f"line {line_number}: '{self.title(column_index)}' has a decimal point{{cell}}, "
+                "and other numbers have decimal commas; save the file with one of them, and "
+                "without "
                 "separators between thousands.",
                 cell,
             )
-        return not_a_number_error(line, self.title(column), cell)
+        return not_a_number_error(line_number, self.title(column_index), cell)
 
-    def check_row_for_thousands(self, row: Sequence[str], line: int) -> None:
+    def check_row_for_thousands(self, row: Sequence[str], line_number: int) -> None:
         """Update the checks for thousands separators with a row."""
-        for column in tuple(self.thousands_checks):
-            if self.thousands_checks[column].proves_decimal_sign(row[column], line):
-                del self.thousands_checks[column]
+        for column_index in tuple(self.thousands_checks):
+            if self.thousands_checks[column_index].proves_decimal_sign(
+                row[column_index], line_number
+            ):
+                del self.thousands_checks[column_index]
                 self.sign_is_certain = True
 
     def check_thousands(self) -> None:
         """Raise TableError if a column's decimal signs may be thousands separators."""
-        for column, thousands_check in self.thousands_checks.items():
+        for column_index, thousands_check in self.thousands_checks.items():
             is_ambiguous = thousands_check.plain or (
                 self.decimal_sign == COMMA and not self.sign_is_certain
             )
@@ -342,8 +356,9 @@ class _NumberRows:
                 sign_noun = "commas" if self.decimal_sign == COMMA else "points"
                 raise TableError(
                     f"line {thousands_check.grouped_line}: the {sign_noun} in "
-                    f"'{self.title(column)}' may be decimal signs or separators between thousands, "
-                    "as each has three digits behind it; save the file with decimal points and "
+                    f"'{self.title(column_index)}' may be decimal signs or separators between "
+                    "thousands, as each has three digits behind it; save the file with decimal "
+                    "points and "
                     "without separators between thousands."
                 )
 
@@ -352,76 +367,86 @@ def _read_columns(
     stream: BinaryIO,
     encoding: str,
     layout: TableLayout,
-    names: Sequence[str],
+    requested_names: Sequence[str],
     most_rows: int,
     decimal_sign: str,
 ) -> TextTable:
     """Read the requested columns and the column of times, with a given decimal sign."""
     times_column = _times_column(layout)
     columns_to_read = sorted({*layout.columns, *(() if times_column is None else (times_column,))})
-    rows = _NumberRows(layout, names, decimal_sign, columns_to_read)
-    values = {column: array("d") for column in columns_to_read}
+    number_rows = _NumberRows(layout, requested_names, decimal_sign, columns_to_read)
+    values_by_column = {column_index: array("d") for column_index in columns_to_read}
     number_appends = [
-        (values[column].append, rows.checked_columns.index(column))
-        for column in columns_to_read
-        if column not in rows.stamps
+        (values_by_column[column_index].append, number_rows.checked_columns.index(column_index))
+        for column_index in columns_to_read
+        if column_index not in number_rows.stamps
     ]
-    stamp_appends = [(values[column].append, column) for column in rows.stamps]
-    pick_cells, convert = itemgetter(*rows.checked_columns), fast_number_converter(decimal_sign)
-    has_single_column = len(rows.checked_columns) == 1
+    stamp_appends = [
+        (values_by_column[column_index].append, column_index) for column_index in number_rows.stamps
+    ]
+    pick_cells, convert_cell = (
+        itemgetter(*number_rows.checked_columns),
+        fast_number_converter(decimal_sign),
+    )
+    has_single_column = len(number_rows.checked_columns) == 1
     line_numbers = array("I")
     empty_lines: list[int] = []
     blank_line = 0
-    with _open_lines(stream, encoding) as lines:
-        for line, row in islice(
-            rows_of_cells(_skip_excel_separator_line(lines), layout.separator),
+    with _open_lines(stream, encoding) as text_lines:
+        for line_number, row in islice(
+            rows_of_cells(_skip_excel_separator_line(text_lines), layout.separator),
             layout.rows_before_numbers,
             None,
         ):
             if len(row) != layout.width:
                 if not any(cell.strip() for cell in row) and len(row) < 2:
-                    blank_line = blank_line or line
+                    blank_line = blank_line or line_number
                     continue
-                row = rows.fit(row, line)  # noqa: PLW2901 - the row as the table has it
+                row = number_rows.fit(row, line_number)  # noqa: PLW2901 - the row as the table has it
             try:
                 numbers = (
-                    [convert(pick_cells(row))]
+                    [convert_cell(pick_cells(row))]
                     if has_single_column
-                    else list(map(convert, pick_cells(row)))
+                    else list(map(convert_cell, pick_cells(row)))
                 )
-                if any("_" in row[column] for column in rows.checked_columns):
-                    numbers = rows.numbers(row, line)  # Python would read 1_000
+                if any("_" in row[column_index] for column_index in number_rows.checked_columns):
+                    numbers = number_rows.numbers(row, line_number)  # Python would read 1_000
             except ValueError:
                 if not any(cell.strip() for cell in row):
-                    empty_lines.append(line)
+                    empty_lines.append(line_number)
                     continue
-                numbers = rows.numbers(row, line)
+                numbers = number_rows.numbers(row, line_number)
             if blank_line:
                 if layout.width == 1:
                     raise TableError(
                         f"line {blank_line} is empty, so a value is missing or another record "
                         "begins there; repair or remove it."
                     )
-                rows.blank_line = rows.blank_line or blank_line
-                rows.blank_count += 1
+                number_rows.blank_line = number_rows.blank_line or blank_line
+                number_rows.blank_count += 1
                 blank_line = 0
-            if rows.thousands_checks:
-                rows.check_row_for_thousands(row, line)
+            if number_rows.thousands_checks:
+                number_rows.check_row_for_thousands(row, line_number)
             if empty_lines:
-                for column in columns_to_read:
-                    values[column].extend(len(empty_lines) * [float("nan")])
+                for column_index in columns_to_read:
+                    values_by_column[column_index].extend(len(empty_lines) * [float("nan")])
                 line_numbers.extend(empty_lines)
                 empty_lines = []
-            for append, index in number_appends:
-                append(numbers[index])
-            for append, column in stamp_appends:
-                append(rows.stamp(row, column, line))
-            line_numbers.append(line)
+            for append_value, cell_index in number_appends:
+                append_value(numbers[cell_index])
+            for append_value, column_index in stamp_appends:
+                append_value(number_rows.stamp(row, column_index, line_number))
+            line_numbers.append(line_number)
             if len(line_numbers) > most_rows:
                 break
-    rows.check_thousands()
+    number_rows.check_thousands()
     return _text_table(
-        layout, names, values, np.frombuffer(line_numbers, np.uint32), times_column, rows
+        layout,
+        requested_names,
+        values_by_column,
+        np.frombuffer(line_numbers, np.uint32),
+        times_column,
+        number_rows,
     )
 
 
@@ -447,71 +472,73 @@ def _blank_lines_remark(rows: _NumberRows) -> str:
 
 def _times_column(layout: TableLayout) -> int | None:
     """Return the index of a column of times that is not requested; None if there is none."""
-    for column, cell in enumerate(layout.first_cells):
-        if column in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
+    for column_index, cell in enumerate(layout.first_cells):
+        if column_index in layout.columns or not (is_any_number(cell) or is_stamp(cell)):
             continue
         if is_stamp(cell):
-            return column
+            return column_index
         if not layout.titles:
-            return column if column == 0 else None
-        title = layout.titles[column]
-        if is_title_of_times(title) or _time_unit_s(layout, column) is not None:
-            return column
+            return column_index if column_index == 0 else None
+        column_title = layout.titles[column_index]
+        if is_title_of_times(column_title) or _time_unit_s(layout, column_index) is not None:
+            return column_index
     return None
 
 
-def _time_unit_s(layout: TableLayout, column: int) -> float | None:
+def _time_unit_s(layout: TableLayout, column_index: int) -> float | None:
     """Return the length of a time column's unit in seconds; None if the file states no unit."""
-    unit = time_unit_s(_unit_in_file(layout, column))
-    if unit is None and layout.titles and is_title_of_times(layout.titles[column]):
-        unit = time_unit_s(layout.titles[column].rpartition("_")[2])
-    return unit
+    unit_length_s = time_unit_s(_unit_in_file(layout, column_index))
+    if unit_length_s is None and layout.titles and is_title_of_times(layout.titles[column_index]):
+        unit_length_s = time_unit_s(layout.titles[column_index].rpartition("_")[2])
+    return unit_length_s
 
 
-def _unit_in_file(layout: TableLayout, column: int) -> str:
+def _unit_in_file(layout: TableLayout, column_index: int) -> str:
     """Return the unit of a column that the file states; "s" for times of day."""
-    if is_stamp(layout.first_cells[column]):
+    if is_stamp(layout.first_cells[column_index]):
         return "s"
-    in_row = layout.units[column] if layout.units else ""
-    in_head = layout.labview.text("Y_Unit_Label", column) if layout.labview else ""
-    in_title = stated_unit_of(layout.titles[column]) if layout.titles else ""
-    return in_row or in_head or in_title
+    unit_in_row = layout.units[column_index] if layout.units else ""
+    unit_in_head = layout.labview.text("Y_Unit_Label", column_index) if layout.labview else ""
+    unit_in_title = stated_unit_of(layout.titles[column_index]) if layout.titles else ""
+    return unit_in_row or unit_in_head or unit_in_title
 
 
 def _text_table(
     layout: TableLayout,
-    names: Sequence[str],
-    values: Mapping[int, "array[float]"],
-    lines: npt.NDArray[np.uint32],
+    requested_names: Sequence[str],
+    values_by_column: Mapping[int, "array[float]"],
+    line_numbers: npt.NDArray[np.uint32],
     times_column: int | None,
     rows: _NumberRows,
 ) -> TextTable:
     """Return the table from the values that were read."""
-    columns = {}
-    for name, column in zip(names, layout.columns, strict=True):
+    table_columns = {}
+    for requested_name, column_index in zip(requested_names, layout.columns, strict=True):
         period_s = start_ns = None
         if layout.labview is not None:
-            dimension = layout.labview.text("X_Dimension", column)
-            if dimension.lower() not in _TIME_DIMENSIONS:
+            x_dimension = layout.labview.text("X_Dimension", column_index)
+            if x_dimension.lower() not in _TIME_DIMENSIONS:
                 raise TableError(
-                    f"'{name}' is not a function of time by the X_Dimension of the head{{cell}}; "
-                    "give measured samples.",
-                    dimension,
+                    f"'{requested_name}' is not a function of time by the X_Dimension of the "
+                    f"head{{cell}}; give measured samples.",
+                    x_dimension,
                 )
-            period_s = layout.labview.number("Delta_X", column)
-            start_ns = layout.labview.start_ns(column)
-        columns[name] = TableColumn(
-            values=np.frombuffer(values[column]),
-            title=layout.titles[column] if layout.titles else "",
-            unit=_unit_in_file(layout, column),
+            period_s = layout.labview.number("Delta_X", column_index)
+            start_ns = layout.labview.start_ns(column_index)
+        table_columns[requested_name] = TableColumn(
+            values=np.frombuffer(values_by_column[column_index]),
+            title=layout.titles[column_index] if layout.titles else "",
+            unit=_unit_in_file(layout, column_index),
             rate_hz=1 / period_s if period_s and period_s > 0 else layout.rate_hz,
             start_ns=start_ns,
         )
     table_times = None
     if (
         times_column is not None
-        and np.isfinite(time_values := np.frombuffer(values[times_column])).any()
+        and np.isfinite(time_values := np.frombuffer(values_by_column[times_column])).any()
     ):
-        title = layout.titles[times_column] if layout.titles else f"#{times_column + 1}"
-        table_times = TableTimes(title, time_values, _time_unit_s(layout, times_column))
-    return TextTable(columns, lines, layout.width, table_times, _blank_lines_remark(rows))
+        times_title = layout.titles[times_column] if layout.titles else f"#{times_column + 1}"
+        table_times = TableTimes(times_title, time_values, _time_unit_s(layout, times_column))
+    return TextTable(
+        table_columns, line_numbers, layout.width, table_times, _blank_lines_remark(rows)
+    )

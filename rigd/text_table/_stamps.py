@@ -34,30 +34,30 @@ class StampReader:
         ValueError
             If the cell is not a time stamp, or is of another day with an ambiguous date.
         """
-        text = cell.strip()
-        if not text:
+        stamp_text = cell.strip()
+        if not stamp_text:
             return float("nan")
-        stamp = _STAMP_PATTERN.fullmatch(text)
+        stamp = _STAMP_PATTERN.fullmatch(stamp_text)
         if stamp is None:
-            raise ValueError(text)
+            raise ValueError(stamp_text)
         first_stamp = self._first = self._first or stamp
-        days = 0
+        day_difference = 0
         if stamp["date"] != first_stamp["date"]:
-            days = _day_number(stamp["date"]) - _day_number(first_stamp["date"])
-        seconds = (
-            days * _SECONDS_PER_DAY
+            day_difference = _day_number(stamp["date"]) - _day_number(first_stamp["date"])
+        second_difference = (
+            day_difference * _SECONDS_PER_DAY
             + _seconds_since_midnight(stamp)
             - _seconds_since_midnight(first_stamp)
         )
-        return (seconds * 10**9 + _nanoseconds(stamp) - _nanoseconds(first_stamp)) / 1e9
+        return (second_difference * 10**9 + _nanoseconds(stamp) - _nanoseconds(first_stamp)) / 1e9
 
 
 def _seconds_since_midnight(stamp: re.Match[str]) -> int:
     """Return the whole seconds of a time stamp since midnight."""
-    hour = int(stamp["hour"])
+    hour_of_day = int(stamp["hour"])
     if stamp["half"]:
-        hour = hour % 12 + 12 * (stamp["half"] in "Pp")
-    return 3600 * hour + 60 * int(stamp["minute"]) + int(stamp["second"])
+        hour_of_day = hour_of_day % 12 + 12 * (stamp["half"] in "Pp")
+    return 3600 * hour_of_day + 60 * int(stamp["minute"]) + int(stamp["second"])
 
 
 def _nanoseconds(stamp: re.Match[str]) -> int:
@@ -65,11 +65,11 @@ def _nanoseconds(stamp: re.Match[str]) -> int:
     return int(f"{stamp['fraction'] or '':0<9}"[:9])
 
 
-def _day_number(day: str | None) -> int:
+def _day_number(date_text: str | None) -> int:
     """Return the day number of an unambiguous date: year first, or day first with points."""
-    date_parts = re.split(r"[-/.]", day or "")
+    date_parts = re.split(r"[-/.]", date_text or "")
     if len(date_parts) == 3 and len(date_parts[0]) == 4:
         return date(int(date_parts[0]), int(date_parts[1]), int(date_parts[2])).toordinal()
-    if len(date_parts) == 3 and len(date_parts[2]) == 4 and "." in (day or ""):
+    if len(date_parts) == 3 and len(date_parts[2]) == 4 and "." in (date_text or ""):
         return date(int(date_parts[2]), int(date_parts[1]), int(date_parts[0])).toordinal()
-    raise ValueError(day)
+    raise ValueError(date_text)

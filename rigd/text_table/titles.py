@@ -67,11 +67,11 @@ def stated_unit_of(title: str) -> str:
     >>> stated_unit_of("Angle [deg]"), stated_unit_of("t/ms"), stated_unit_of("Rig/Angle")
     ('deg', 'ms', '')
     """
-    match = _BRACKETS_PATTERN.search(title) or _AFTER_SLASH_PATTERN.search(title)
-    if match is None:
+    unit_match = _BRACKETS_PATTERN.search(title) or _AFTER_SLASH_PATTERN.search(title)
+    if unit_match is None:
         return ""
-    is_stated = is_unit(match[1]) or match[0].startswith("[")
-    return match[1].strip() if is_stated else ""
+    is_certain = is_unit(unit_match[1]) or unit_match[0].startswith("[")
+    return unit_match[1].strip() if is_certain else ""
 
 
 def is_unit(cell: str) -> bool:
@@ -81,8 +81,12 @@ def is_unit(cell: str) -> bool:
 
 def bare_unit(cell: str) -> str:
     """Return a unit without the brackets around it."""
-    text = cell.strip()
-    return text[1:-1].strip() if text[:1] + text[-1:] in ("[]", "()", "<>") else text
+    unit_text = cell.strip()
+    return (
+        unit_text[1:-1].strip()
+        if unit_text[:1] + unit_text[-1:] in ("[]", "()", "<>")
+        else unit_text
+    )
 
 
 def _plain_unit(cell: str) -> str:

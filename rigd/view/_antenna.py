@@ -91,7 +91,7 @@ _TRAIL_COLOR: Color = (70, 115, 145)
 
 
 class Antenna:
-    """Drawing of the motor and the bending beam during one session.
+    """Drawing of the motor and of the antenna, which is a flexible beam, during one session.
 
     Parameters
     ----------
@@ -124,20 +124,20 @@ class Antenna:
         return static_drawings()
 
     def samples(self, samples: Records) -> list["Drawing"]:
-        """Return functions that draw the beam for new samples (n,) of ``SAMPLE_DTYPE``, in order.
+        """Return functions that draw the bent beam for new samples (n,) of ``SAMPLE_DTYPE``.
 
-        The beam is drawn 20 times per second. Across gaps between samples the angle is
-        interpolated.
+        The samples are in order of time. The beam is drawn 20 times per second. Across gaps
+        between samples the motor angle is interpolated.
         """
         if len(samples) == 0:
             return []
         samples = np.concatenate([self._waiting, self._interpolate_to_ticks(samples)])
-        count = len(samples) // self._shape_ticks
-        self._waiting = samples[count * self._shape_ticks :]
+        shape_count = len(samples) // self._shape_ticks
+        self._waiting = samples[shape_count * self._shape_ticks :]
         timed_lines: list[_TimedLines] = []
-        labels: list[Drawing] = []
-        for shape_samples in samples[: count * self._shape_ticks].reshape(
-            count, self._shape_ticks, 2
+        label_drawings: list[Drawing] = []
+        for shape_samples in samples[: shape_count * self._shape_ticks].reshape(
+            shape_count, self._shape_ticks, 2
         ):
             deflection_m = self._filter.feed(shape_samples[:, 1])
             self._tips_m.append(abs(float(deflection_m[-1])))
@@ -150,17 +150,17 @@ class Antenna:
                 )
                 timed_lines.append((t_ns, scaled_lines))
             if self._shape_count % self._shapes_per_label == 0:
-                text = tip_label(max(self._tips_m), to_scale=self._to_scale)
-                labels.append(partial(_draw_label, t_ns=t_ns, text=text))
+                label_text = tip_label(max(self._tips_m), to_scale=self._to_scale)
+                label_drawings.append(partial(_draw_label, t_ns=t_ns, label_text=label_text))
         self._trail += [(t_ns, both_lines[1:]) for t_ns, both_lines in timed_lines]
         self._shapes += timed_lines
         drawings: list[Drawing] = []
         if timed_lines:
             drawings.append(partial(_draw_lines, entity=BEAM_ENTITY, timed_lines=timed_lines))
-        if labels and self._trail:
+        if label_drawings and self._trail:
             drawings.append(partial(_draw_lines, entity=TRAIL_ENTITY, timed_lines=self._trail))
             self._trail = []
-        return drawings + labels
+        return drawings + label_drawings
 
     def touch(self, touch: Mapping[str, Any]) -> list["Drawing"]:
         """Return the function that draws a touch: its point, interval and force on the beam.
@@ -171,11 +171,11 @@ class Antenna:
             Touch as in JSON documents. Nothing is drawn if its point or time is unknown, or if the
             beam line at that time is not stored.
         """
-        point, time = touch.get("x_m"), touch.get("time_s")
+        touch_position, touch_time = touch.get("x_m"), touch.get("time_s")
         stored_lines = list(self._shapes)
-        if point is None or time is None or len(stored_lines) < 2:
+        if touch_position is None or touch_time is None or len(stored_lines) < 2:
             return []
-        t_ns = round(1e9 * time["value"])
+        t_ns = round(1e9 * touch_time["value"])
         later_index = next(
             (i for i in range(1, len(stored_lines)) if stored_lines[i][0] >= t_ns),
             len(stored_lines) - 1,
@@ -186,54 +186,64 @@ class Antenna:
         )
         if t_ns < earlier_ns:
             return []  # the shape of that time is no longer stored
-        fraction = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
-        beam_line = (1 - fraction) * earlier_lines[1] + fraction * later_lines[1]
+        time_fraction = min((t_ns - earlier_ns) / (later_ns - earlier_ns), 1.0)
+        beam_line = (1 - time_fraction) * earlier_lines[1] + time_fraction * later_lines[1]
         displacement = later_lines[1] - earlier_lines[1]
         beam_positions = np.linspace(0.0, 1.0, len(beam_line))
-        x = np.array([point["value"], *point["interval_95"]]) / self._length_m
-        points, displacements = (
-            np.column_stack([np.interp(x, beam_positions, axis) for axis in lines.T])
+        x = np.array([touch_position["value"], *touch_position["interval_95"]]) / self._length_m
+        touch_points, displacements = (
+            np.column_stack([np.interp(x, beam_positions, coordinate) for coordinate in lines.T])
             for lines in (beam_line, displacement)
         )
-        force = touch.get("force_n")
+        touch_force = touch.get("force_n")
         arrow_length = (
             0.0
-            if force is None
-            else min(_ARROW_LENGTH_PER_N * abs(force["value"]), _MOST_ARROW_LENGTH)
+            if touch_force is None
+            else min(_ARROW_LENGTH_PER_N * abs(touch_force["value"]), _MOST_ARROW_LENGTH)
         )
         # An obstacle pushes against the motion.
-        speed = float(np.linalg.norm(displacements[0]))
-        arrow_vector = -arrow_length / speed * displacements[0] if speed > 0 else np.zeros(3)
+        displacement_norm = float(np.linalg.norm(displacements[0]))
+        arrow_vector = (
+            -arrow_length / displacement_norm * displacements[0]
+            if displacement_norm > 0
+            else np.zeros(3)
+        )
         return [
             partial(
                 _draw_touch,
-                number=int(touch["number"]),
+                touch_number=int(touch["number"]),
                 t_ns=t_ns,
-                points=points,
-                arrow=arrow_vector,
-                text=touch_label(touch),
+                touch_points=touch_points,
+                force_arrow=arrow_vector,
+                label_text=touch_label(touch),
             )
         ]
 
     def _interpolate_to_ticks(self, samples: Records) -> Real:
-        """Return (time in ns, angle in rad) of every tick up to the last sample, shape (n, 2).
+        """Return time (ns) and motor angle (rad) of every tick to the last sample, shape (n, 2).
 
         The first row is the tick after the previous sample. Ticks without a sample have
         interpolated values.
         """
         ticks = samples["tick"].astype(np.int64)
-        values = np.column_stack([samples["t_ns"], samples["angle_rad"]])
-        last_tick, last_value = self._newest or (int(ticks[0]) - 1, values[0])
-        self._newest = int(ticks[-1]), values[-1]
+        times_and_angles = np.column_stack([samples["t_ns"], samples["angle_rad"]])
+        last_tick, last_values = self._newest or (int(ticks[0]) - 1, times_and_angles[0])
+        self._newest = int(ticks[-1]), times_and_angles[-1]
         tick_steps = np.minimum(
             np.diff(ticks, prepend=last_tick), round(_MOST_INTERPOLATED_GAP_S * self._rate_hz)
         )
         if np.all(tick_steps == 1):
-            return values
-        tick_offsets, values = np.cumsum(np.append(0, tick_steps)), np.vstack([last_value, values])
+            return times_and_angles
+        tick_offsets, times_and_angles = (
+            np.cumsum(np.append(0, tick_steps)),
+            np.vstack([last_values, times_and_angles]),
+        )
         all_tick_offsets = np.arange(1, tick_offsets[-1] + 1)
         return np.column_stack(
-            [np.interp(all_tick_offsets, tick_offsets, column) for column in values.T]
+            [
+                np.interp(all_tick_offsets, tick_offsets, value_column)
+                for value_column in times_and_angles.T
+            ]
         )
 
 
@@ -264,14 +274,14 @@ def static_drawings() -> list["Drawing"]:
     return [_draw_motor, _draw_direction, _draw_styles]
 
 
-def enlarged_lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
-    """Return the straight line and the bent beam in beam lengths, with their motion enlarged.
+def enlarged_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
+    """Return the coordinates of the undeformed line and of the bent beam, drawn enlarged.
 
     Parameters
     ----------
     angle_rad
         Angle of the motor.
-    deflection
+    deflection_per_length
         Deflection at evenly spaced points of the beam, shape (points,), relative to the undeformed
         line, in beam lengths.
 
@@ -280,33 +290,37 @@ def enlarged_lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32
     lines
         Coordinates x, y, z of the line and of the beam, shape (2, points, 3).
     """
-    x = np.linspace(0.0, 1.0, deflection.size)
-    coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
-    coordinates[:, :, 0] = x
-    coordinates[0, :, 1] = ENLARGEMENT * angle_rad * x
-    coordinates[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection)
-    return coordinates
+    x = np.linspace(0.0, 1.0, deflection_per_length.size)
+    line_coordinates = np.zeros((2, x.size, 3), dtype=np.float32)
+    line_coordinates[:, :, 0] = x
+    line_coordinates[0, :, 1] = ENLARGEMENT * angle_rad * x
+    line_coordinates[1, :, 1] = ENLARGEMENT * (angle_rad * x + deflection_per_length)
+    return line_coordinates
 
 
-def unscaled_lines(angle_rad: float, deflection: Real) -> npt.NDArray[np.float32]:
-    """Return the straight line and the bent beam in beam lengths, true to scale.
+def unscaled_lines(angle_rad: float, deflection_per_length: Real) -> npt.NDArray[np.float32]:
+    """Return the coordinates of the undeformed line and of the bent beam, true to scale.
 
     Parameters
     ----------
-    angle_rad, deflection
+    angle_rad, deflection_per_length
         As for `enlarged_lines`.
     """
     along_beam = np.array([math.cos(angle_rad), math.sin(angle_rad), 0.0])
     across_beam = np.array([-along_beam[1], along_beam[0], 0.0])
-    line = np.linspace(0.0, 1.0, deflection.size)[:, None] * along_beam
-    return np.stack([line, line + deflection[:, None] * across_beam]).astype(np.float32)
+    straight_line = np.linspace(0.0, 1.0, deflection_per_length.size)[:, None] * along_beam
+    return np.stack(
+        [straight_line, straight_line + deflection_per_length[:, None] * across_beam]
+    ).astype(np.float32)
 
 
 def tip_label(tip_m: float, *, to_scale: bool = False) -> str:
     """Return the text with the tip's deflection in mm, rounded to two digits or to 0.1 mm."""
     tip_mm = 1e3 * tip_m
-    text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
-    return f"tip deflection ± {text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
+    mm_text = f"{tip_mm:.1f}" if tip_mm < 10 else f"{float(f'{tip_mm:.1e}'):.0f}"
+    return (
+        f"tip deflection ± {mm_text} mm, drawn {'to scale' if to_scale else f'× {ENLARGEMENT:g}'}"
+    )
 
 
 def touch_label(touch: Mapping[str, Any]) -> str:
@@ -317,14 +331,14 @@ def touch_label(touch: Mapping[str, Any]) -> str:
     touch
         Touch as in JSON documents.
     """
-    point = touch["x_m"]
-    return f"touch {touch['number']}: {with_half_width(point['value'], point['interval_95'])} m"
+    x_m = touch["x_m"]
+    return f"touch {touch['number']}: {with_half_width(x_m['value'], x_m['interval_95'])} m"
 
 
 def _assumed_damping(beam: Beam) -> Damping:
     """Return a small viscous damping for drawing, if the nominal damping is unknown."""
-    first_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
-    return Damping(zeta=2 * _ASSUMED_DAMPING_RATIO / first_rad_s)
+    first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
+    return Damping(zeta=2 * _ASSUMED_DAMPING_RATIO / first_mode_rad_s)
 
 
 def _draw_motor(stream: "RecordingStream") -> None:
@@ -352,10 +366,10 @@ def _draw_motor(stream: "RecordingStream") -> None:
         ),
         static=True,
     )
-    axis = [(0, 0, -0.3), (0, 0, 0.2)]
+    shaft_axis = [(0, 0, -0.3), (0, 0, 0.2)]
     stream.log(
         f"{ANTENNA_ENTITY}/axis",
-        rr.LineStrips3D([axis], colors=[GREY], radii=rr.Radius.ui_points(0.5)),
+        rr.LineStrips3D([shaft_axis], colors=[GREY], radii=rr.Radius.ui_points(0.5)),
         static=True,
     )
 
@@ -364,14 +378,19 @@ def _draw_direction(stream: "RecordingStream") -> None:
     """Draw an arrow that shows the direction of positive motor angles."""
     import rerun as rr
 
-    angle = np.linspace(0.35, 1.05, 15)
-    arc = 0.2 * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(angle.size)])
-    end = arc[-1]
-    tangent, out = 0.15 * np.array([end[1], -end[0], 0.0]), 0.075 * end
+    arc_angles_rad = np.linspace(0.35, 1.05, 15)
+    arc = 0.2 * np.column_stack(
+        [np.cos(arc_angles_rad), np.sin(arc_angles_rad), np.zeros(arc_angles_rad.size)]
+    )
+    arc_end = arc[-1]
+    tangent, outward_vector = 0.15 * np.array([arc_end[1], -arc_end[0], 0.0]), 0.075 * arc_end
     stream.log(
         f"{ANTENNA_ENTITY}/positive",
         rr.LineStrips3D(
-            [arc, [end + tangent + out, end, end + tangent - out]],
+            [
+                arc,
+                [arc_end + tangent + outward_vector, arc_end, arc_end + tangent - outward_vector],
+            ],
             colors=[GREY],
             radii=rr.Radius.ui_points(0.75),
         ),
@@ -379,7 +398,7 @@ def _draw_direction(stream: "RecordingStream") -> None:
     )
     stream.log(
         f"{ANTENNA_ENTITY}/positive/sign",
-        rr.Points3D([1.25 * end], radii=[0.0], colors=[GREY], labels=["+"], show_labels=True),
+        rr.Points3D([1.25 * arc_end], radii=[0.0], colors=[GREY], labels=["+"], show_labels=True),
         static=True,
     )
 
@@ -388,17 +407,19 @@ def _draw_styles(stream: "RecordingStream") -> None:
     """Send the colours and widths of the beam lines, and the position of the tip's label, once."""
     import rerun as rr
 
-    for entity, colors, widths in (
+    for entity, line_colors, line_widths in (
         (BEAM_ENTITY, [GREY, SKY_BLUE], [1.0, 2.5]),
         (TRAIL_ENTITY, [_TRAIL_COLOR], [0.6]),
     ):
-        style = rr.LineStrips3D.from_fields(colors=colors, radii=rr.Radius.ui_points(widths))
+        style = rr.LineStrips3D.from_fields(
+            colors=line_colors, radii=rr.Radius.ui_points(line_widths)
+        )
         stream.log(entity, style, static=True)
-    beyond_the_tip = [(1.25, 0.0, 0.0)]
+    label_position = [(1.25, 0.0, 0.0)]
     stream.log(
         LABEL_ENTITY,
         rr.Points3D.from_fields(
-            positions=beyond_the_tip, radii=[0.0], colors=[SKY_BLUE], show_labels=True
+            positions=label_position, radii=[0.0], colors=[SKY_BLUE], show_labels=True
         ),
         static=True,
     )
@@ -410,52 +431,59 @@ def _draw_lines(stream: "RecordingStream", entity: str, timed_lines: Sequence[_T
 
     t_ns = np.array([t_ns for t_ns, _ in timed_lines])
     strips = np.concatenate([strips for _, strips in timed_lines])
-    count = len(strips) // len(timed_lines)
+    lines_per_time = len(strips) // len(timed_lines)
     # Built here, because Rerun's own function for columns takes three times as long.
-    column = rr.ComponentColumn(
+    strip_column = rr.ComponentColumn(
         rr.LineStrips3D.descriptor_strips(),
         rr.components.LineStrip3DBatch(strips),
-        offsets=np.arange(0, len(strips) + 1, count, dtype=np.int32),
+        offsets=np.arange(0, len(strips) + 1, lines_per_time, dtype=np.int32),
     )
-    time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
-    stream.send_columns(entity, [time], [column], strict=True)
+    time_column = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
+    stream.send_columns(entity, [time_column], [strip_column], strict=True)
 
 
-def _draw_label(stream: "RecordingStream", t_ns: int, text: str) -> None:
-    """Send the label with the true deflection of the tip, at its time."""
+def _draw_label(stream: "RecordingStream", t_ns: int, label_text: str) -> None:
+    """Send the label with the deflection of the beam's tip to Rerun, at the time `t_ns`."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    stream.log(LABEL_ENTITY, rr.Points3D.from_fields(labels=[text]))
+    stream.log(LABEL_ENTITY, rr.Points3D.from_fields(labels=[label_text]))
 
 
 def _draw_touch(
-    stream: "RecordingStream", number: int, t_ns: int, points: Real, arrow: Real, text: str
+    stream: "RecordingStream",
+    touch_number: int,
+    t_ns: int,
+    touch_points: Real,
+    force_arrow: Real,
+    label_text: str,
 ) -> None:
     """Draw a touch from its time on: its point, its interval along the beam, and its force."""
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    point, ends = points[:1], points[1:]
-    entity = f"{TOUCH_ENTITY}/{number}"
+    contact_point, interval_ends = touch_points[:1], touch_points[1:]
+    entity = f"{TOUCH_ENTITY}/{touch_number}"
     stream.log(
         f"{entity}/interval",
-        rr.LineStrips3D([ends], colors=[VERMILION], radii=rr.Radius.ui_points(4.0)),
+        rr.LineStrips3D([interval_ends], colors=[VERMILION], radii=rr.Radius.ui_points(4.0)),
     )
     stream.log(
         f"{entity}/point",
-        rr.Points3D(point, radii=rr.Radius.ui_points(5.0), colors=[VERMILION]),
+        rr.Points3D(contact_point, radii=rr.Radius.ui_points(5.0), colors=[VERMILION]),
     )
     # Only the label of the last touch: labels of several passes would overlap.
     stream.log(
         f"{TOUCH_ENTITY}/label",
-        rr.Points3D(point, radii=[0.0], colors=[VERMILION], labels=[text], show_labels=True),
+        rr.Points3D(
+            contact_point, radii=[0.0], colors=[VERMILION], labels=[label_text], show_labels=True
+        ),
     )
     stream.log(
         f"{entity}/force",
         rr.Arrows3D(
-            origins=point - arrow,
-            vectors=[arrow],
+            origins=contact_point - force_arrow,
+            vectors=[force_arrow],
             colors=[VERMILION],
             radii=rr.Radius.ui_points(2.0),
         ),

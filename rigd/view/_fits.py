@@ -34,7 +34,7 @@ _MOST_FINDINGS: Final = 8
 
 @dataclass(frozen=True, slots=True)
 class _Quantity:
-    """Quantity of a mode that is plotted over time: its names, unit and scale."""
+    """Frequency or damping ratio of a mode, as plotted over time: names, unit and factor."""
 
     name: str
     """Name of the quantity in the target precisions of a search."""
@@ -63,51 +63,59 @@ _TARGET_LOW_INDEX, _TARGET_HIGH_INDEX, _LOW_INDEX, _HIGH_INDEX, _VALUE_INDEX = r
 """Indices of the five values in each field of a fit's record; unknown values are NaN."""
 
 
-def fit_source(modes: int, *, with_targets: bool) -> Source:
-    """Return the plots of damping ratio and frequency over time, for each of the first modes.
+def fit_source(mode_count: int, *, with_target_std: bool) -> Source:
+    """Return the plots over time of the fitted damping ratio and frequency of each mode.
 
     Parameters
     ----------
-    modes
+    mode_count
         Number of modes.
-    with_targets
+    with_target_std
         Whether the session may have target precisions.
     """
     plots = (
-        _plot(quantity, n, with_targets=with_targets)
-        for n in range(1, modes + 1)
+        _plot(quantity, n, with_target_std=with_target_std)
+        for n in range(1, mode_count + 1)
         for quantity in _QUANTITIES
     )
     return Source(_PLOTS_ENTITY, tuple(plots))
 
 
-def _plot(quantity: _Quantity, mode: int, *, with_targets: bool) -> Plot:
+def _plot(quantity: _Quantity, mode_number: int, *, with_target_std: bool) -> Plot:
     """Return the plot of a mode's frequency or damping ratio, with its 95 % interval over time."""
-    field, unit = quantity.field(mode), quantity.unit
+    field_name, unit_symbol = quantity.field(mode_number), quantity.unit
 
-    def values(records: npt.NDArray[Any], column: int) -> Values:
-        column_values: Values = records[field][:, column]
-        return column_values
+    def values(records: npt.NDArray[Any], value_index: int) -> Values:
+        field_values: Values = records[field_name][:, value_index]
+        return field_values
 
     # Curves with the same name have one entry in the legend.
-    target, interval = f"asked for, 95 % ({unit})", f"95 % interval ({unit})"
-    target_ends = (
-        PlotCurve(target, GREY, partial(values, column=_TARGET_LOW_INDEX)),
-        PlotCurve(target, GREY, partial(values, column=_TARGET_HIGH_INDEX)),
+    target_label, interval_label = (
+        f"asked for, 95 % ({unit_symbol})",
+        f"95 % interval ({unit_symbol})",
+    )
+    target_limit_curves = (
+        PlotCurve(target_label, GREY, partial(values, value_index=_TARGET_LOW_INDEX)),
+        PlotCurve(target_label, GREY, partial(values, value_index=_TARGET_HIGH_INDEX)),
     )
     return Plot(
-        f"{quantity.name}_{mode}_{quantity.suffix}",
-        f"{quantity.title} of mode {mode} ({unit})",
+        f"{quantity.name}_{mode_number}_{quantity.suffix}",
+        f"{quantity.title} of mode {mode_number} ({unit_symbol})",
         (
-            *(target_ends if with_targets else ()),
-            PlotCurve(interval, ORANGE, partial(values, column=_LOW_INDEX)),
-            PlotCurve(interval, ORANGE, partial(values, column=_HIGH_INDEX)),
-            PlotCurve(f"estimate ({unit})", SKY_BLUE, partial(values, column=_VALUE_INDEX), 2.5),
+            *(target_limit_curves if with_target_std else ()),
+            PlotCurve(interval_label, ORANGE, partial(values, value_index=_LOW_INDEX)),
+            PlotCurve(interval_label, ORANGE, partial(values, value_index=_HIGH_INDEX)),
+            PlotCurve(
+                f"estimate ({unit_symbol})",
+                SKY_BLUE,
+                partial(values, value_index=_VALUE_INDEX),
+                2.5,
+            ),
         ),
     )
 
 
-def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
+def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
     """Return a fit as one record (1,) with time and modes, for the plots of `fit_source`.
 
     Doubtful values and modes that are not visible in the samples are NaN.
@@ -116,39 +124,53 @@ def fit_record(fit: Fit | None, modes: int) -> npt.NDArray[Any]:
     ----------
     fit
         Fit as in JSON documents; None if there is no fit yet.
-    modes
+    mode_count
         Number of modes in the plots; further modes of the fit are omitted.
     """
-    fields = [(q.field(n), "<f8", (5,)) for n in range(1, modes + 1) for q in _QUANTITIES]
-    record = np.zeros(1, [("t_ns", "<i8"), *fields])
-    for name, *_ in fields:
-        record[name] = np.nan
+    dtype_fields = [
+        (q.field(n), "<f8", (5,)) for n in range(1, mode_count + 1) for q in _QUANTITIES
+    ]
+    fit_values = np.zeros(1, [("t_ns", "<i8"), *dtype_fields])
+    for quantity_name, *_ in dtype_fields:
+        fit_values[quantity_name] = np.nan
     if fit is None:
-        return record
-    record["t_ns"] = round(1e9 * fit["duration_s"])
+        return fit_values
+    fit_values["t_ns"] = round(1e9 * fit["duration_s"])
     target_stds = {
-        (target["quantity"], target["mode"]): target["asked_std"] for target in _targets(fit)
+        (target_precision["quantity"], target_precision["mode"]): target_precision["asked_std"]
+        for target_precision in _targets(fit)
     }
     for mode in fit.get("modes", ()):
-        for quantity in _QUANTITIES if mode["mode"] <= modes else ():
+        for quantity in _QUANTITIES if mode["mode"] <= mode_count else ():
             estimate = mode[quantity.key]
             interval = estimate["interval_95"]
             if not mode.get("shown", True) or estimate["flag"] or interval is None:
                 continue
-            value, (low, high) = estimate["value"], interval
+            mode_estimate, (lower_limit, upper_limit) = estimate["value"], interval
             target_std = target_stds.get((quantity.name, mode["mode"]))
             target_half_width = np.nan
             if target_std is not None and estimate["std"]:
-                target_half_width = target_std * (high - low) / (2.0 * estimate["std"])
+                target_half_width = (
+                    target_std * (upper_limit - lower_limit) / (2.0 * estimate["std"])
+                )
             field_values = np.array(
-                [value - target_half_width, value + target_half_width, low, high, value]
+                [
+                    mode_estimate - target_half_width,
+                    mode_estimate + target_half_width,
+                    lower_limit,
+                    upper_limit,
+                    mode_estimate,
+                ]
             )
-            record[quantity.field(mode["mode"])] = quantity.factor * field_values
-    return record
+            fit_values[quantity.field(mode["mode"])] = quantity.factor * field_values
+    return fit_values
 
 
 def _targets(fit: Fit) -> list[Mapping[str, Any]]:
-    """Return the target precisions of a fit's search; an empty list without a search."""
+    """Return the standard deviations that a session is to reach, each with its estimate.
+
+    The list is empty if the session does not stop at a precision.
+    """
     return list((fit.get("search") or {}).get("targets") or ())
 
 
@@ -156,7 +178,9 @@ def _targets(fit: Fit) -> list[Mapping[str, Any]]:
 
 
 def fit_table(fit: Fit | None) -> str:
-    """Return a Markdown table of a fit: target and reached precisions, modes and parameters.
+    """Return Markdown tables of a fit: requested and reached standard deviations, and values.
+
+    The values are those of the modes and of the parameters.
 
     Parameters
     ----------
@@ -165,91 +189,111 @@ def fit_table(fit: Fit | None) -> str:
     """
     if fit is None:
         return "No fit yet."
-    search = fit.get("search") or {}
+    search_document = fit.get("search") or {}
     paragraphs = []
-    if search.get("reason"):
-        paragraphs.append(f"**{plain(search['reason'])}**")
-    targets = _targets(fit)
-    if targets:
-        rows = [_target_row(parameter_item) for parameter_item in targets]
-        paragraphs.append(_markdown_table("asked for", "value", "std", "asked std", rows=rows))
-    if not search.get("reason") and search.get("left_s") is not None:
-        paragraphs.append(f"About **{search['left_s']:.0f} s** more.")
-    if not search.get("reason") and search.get("piece"):
-        paragraphs.append(f"Excited now: {plain(str(search['piece']))}")
+    if search_document.get("reason"):
+        paragraphs.append(f"**{plain(search_document['reason'])}**")
+    target_precisions = _targets(fit)
+    if target_precisions:
+        table_rows = [_target_row(parameter_item) for parameter_item in target_precisions]
+        paragraphs.append(
+            _markdown_table("asked for", "value", "std", "asked std", table_rows=table_rows)
+        )
+    if not search_document.get("reason") and search_document.get("left_s") is not None:
+        paragraphs.append(f"About **{search_document['left_s']:.0f} s** more.")
+    if not search_document.get("reason") and search_document.get("piece"):
+        paragraphs.append(f"Excited now: {plain(str(search_document['piece']))}")
     if fit.get("problem"):
         paragraphs.append(f"**After {fit['duration_s']:.1f} s:** {plain(fit['problem'])}")
     else:
         paragraphs.append(
             f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)"
         )
-    modes = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
-    if modes:
+    mode_rows = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
+    if mode_rows:
         paragraphs.append(
-            _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", rows=modes)
+            _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", table_rows=mode_rows)
         )
     modes_not_visible = unseen_modes(fit.get("modes", ()))
     if modes_not_visible:
         paragraphs.append(f"Not visible so far: {modes_not_visible}.")
-    if modes:
+    if mode_rows:
         validity = Validity.of_document(fit.get("validity"))
         paragraphs.append(validity.sentence)
         if validity.uniform_beam is not None:
             paragraphs.append(validity.uniform_beam.sentence)
-    rows = [_parameter_row(*parameter_item) for parameter_item in fit.get("parameters", {}).items()]
-    if rows:
-        paragraphs.append(_markdown_table("parameter", "value", rows=[row for row in rows if row]))
+    table_rows = [
+        _parameter_row(*parameter_item) for parameter_item in fit.get("parameters", {}).items()
+    ]
+    if table_rows:
+        paragraphs.append(
+            _markdown_table("parameter", "value", table_rows=[row for row in table_rows if row])
+        )
     paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
     return "\n\n".join(paragraphs)
 
 
-def _markdown_table(*headings: str, rows: list[tuple[str, ...]]) -> str:
+def _markdown_table(*column_headings: str, table_rows: list[tuple[str, ...]]) -> str:
     """Return a Markdown table with the given column heads and rows."""
-    lines = (headings, ("---",) * len(headings), *rows)
-    return "\n".join(f"| {' | '.join(cells)} |" for cells in lines)
+    table_lines = (column_headings, ("---",) * len(column_headings), *table_rows)
+    return "\n".join(f"| {' | '.join(row_cells)} |" for row_cells in table_lines)
 
 
-def _target_row(target: Mapping[str, Any]) -> tuple[str, ...]:
-    """Return the table row of a target precision: name, value, reached and target deviation."""
-    value, std, target_std = target["value"], target["std"], target["asked_std"]
-    if value is None:
-        return plain(target["name"]), "–", "–", "–"
-    if std is None:
-        return plain(target["name"]), f"{value:.4g}", "doubtful", with_percentage(target_std, value)
-    check_mark = " ✓" if std <= target_std else ""
+def _target_row(target_precision: Mapping[str, Any]) -> tuple[str, ...]:
+    """Return a table row: name, value, reached and requested standard deviation of a quantity."""
+    estimated_value, reached_std, target_std = (
+        target_precision["value"],
+        target_precision["std"],
+        target_precision["asked_std"],
+    )
+    if estimated_value is None:
+        return plain(target_precision["name"]), "–", "–", "–"
+    if reached_std is None:
+        return (
+            plain(target_precision["name"]),
+            f"{estimated_value:.4g}",
+            "doubtful",
+            with_percentage(target_std, estimated_value),
+        )
+    check_mark = " ✓" if reached_std <= target_std else ""
     return (
-        plain(target["name"]),
-        f"{value:.4g}",
-        f"**{with_percentage(std, value)}**{check_mark}",
-        with_percentage(target_std, value),
+        plain(target_precision["name"]),
+        f"{estimated_value:.4g}",
+        f"**{with_percentage(reached_std, estimated_value)}**{check_mark}",
+        with_percentage(target_std, estimated_value),
     )
 
 
-def _mode_row(mode: Mapping[str, Any]) -> tuple[str, ...]:
+def _mode_row(mode_document: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the table row of a mode: its number, frequency and damping ratio with intervals."""
-    hz, damping = mode["frequency_hz"], mode["damping_ratio"]
+    frequency, damping_ratio = mode_document["frequency_hz"], mode_document["damping_ratio"]
     return (
-        str(mode["mode"]),
-        with_half_width(hz["value"], hz["interval_95"]) + _doubt_suffix(hz),
-        with_half_width(damping["value"], damping["interval_95"], 100.0) + _doubt_suffix(damping),
+        str(mode_document["mode"]),
+        with_half_width(frequency["value"], frequency["interval_95"]) + _doubt_suffix(frequency),
+        with_half_width(damping_ratio["value"], damping_ratio["interval_95"], 100.0)
+        + _doubt_suffix(damping_ratio),
     )
 
 
-def _parameter_row(name: str, estimate: Mapping[str, Any]) -> tuple[str, ...]:
+def _parameter_row(parameter_name: str, estimate: Mapping[str, Any]) -> tuple[str, ...]:
     """Return the table row of a fitted parameter: its name, and its value with interval."""
-    value, interval = estimate["value"], estimate["interval_95"]
-    if value is None:
+    parameter_value, interval_95 = estimate["value"], estimate["interval_95"]
+    if parameter_value is None:
         return ()
     # Small numbers, such as zeta, have a power of ten, the same for value and interval.
     magnitude = (
-        abs(value) if interval is None else max(abs(value), (interval[1] - interval[0]) / 2.0)
+        abs(parameter_value)
+        if interval_95 is None
+        else max(abs(parameter_value), (interval_95[1] - interval_95[0]) / 2.0)
     )
-    power = 0 if magnitude == 0 or magnitude >= 1e-2 else int(np.floor(np.log10(magnitude)))
-    text = with_half_width(value, interval, 10.0**-power)
-    if power:
-        text = f"({text})·10{str(power).translate(_SUPERSCRIPTS)}"
-    label = name.removesuffix(suffix_of(name)).replace("_", " ")
-    return label, f"{text} {unit_of(name)}".rstrip() + _doubt_suffix(estimate)
+    power_of_ten = 0 if magnitude == 0 or magnitude >= 1e-2 else int(np.floor(np.log10(magnitude)))
+    value_text = with_half_width(parameter_value, interval_95, 10.0**-power_of_ten)
+    if power_of_ten:
+        value_text = f"({value_text})·10{str(power_of_ten).translate(_SUPERSCRIPTS)}"
+    parameter_label = parameter_name.removesuffix(suffix_of(parameter_name)).replace("_", " ")
+    return parameter_label, f"{value_text} {unit_of(parameter_name)}".rstrip() + _doubt_suffix(
+        estimate
+    )
 
 
 _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹")

@@ -29,7 +29,7 @@ UNITS: Final = {
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Largest magnitude of a signal, with the limit of the signal.
+    """Gauge of a signal: its largest magnitude, and the limit of this magnitude.
 
     Attributes
     ----------
@@ -53,7 +53,7 @@ class Gauge:
 
 
 class Gauges:
-    """Calculator of the largest magnitudes of each signal, for successive blocks of samples.
+    """Calculator of the largest magnitude of each signal in successive blocks of samples.
 
     The rms torque (i²t) is computed as if the motor were cold at the first sample.
 
@@ -71,7 +71,9 @@ class Gauges:
         self, rate_hz: float, limits: Mapping[str, float], thermal_time_constant_s: float = 10.0
     ) -> None:
         self._rate_hz = rate_hz
-        self._limits = {name: limit for name, limit in limits.items() if isfinite(limit)}
+        self._limits = {
+            name: signal_limit for name, signal_limit in limits.items() if isfinite(signal_limit)
+        }
         self._time_constant_s = thermal_time_constant_s
         self._heat_nm2 = 0.0
         self._last: tuple[int, float] | None = None  # tick and angle of the last fresh reading
@@ -91,24 +93,27 @@ class Gauges:
             "tracking_error": _peak(samples["angle_reference_rad"] - samples["angle_rad"]),
             "torque_command": _peak(torque_nm),
             "i2t": self._update_rms_torque(torque_nm),
-        } | {field.partition("_")[0]: _peak(samples[field]) for field in WRENCH_FIELDS}
+        } | {
+            wrench_field.partition("_")[0]: _peak(samples[wrench_field])
+            for wrench_field in WRENCH_FIELDS
+        }
         return self.with_limits(largest_magnitudes)
 
-    def with_limits(self, values: Mapping[str, float | None]) -> dict[str, Gauge]:
+    def with_limits(self, magnitudes: Mapping[str, float | None]) -> dict[str, Gauge]:
         """Return gauges with the given magnitudes and this session's limits, by signal name.
 
         Parameters
         ----------
-        values
+        magnitudes
             Magnitudes by signal name. A signal that is absent has an unknown magnitude.
         """
         return {
-            name: Gauge(values.get(name), self._limits.get(name), unit)
-            for name, unit in UNITS.items()
+            signal_name: Gauge(magnitudes.get(signal_name), self._limits.get(signal_name), unit)
+            for signal_name, unit in UNITS.items()
         }
 
     def cool(self, duration_s: float) -> float:
-        """Return the rms torque (i²t) in N·m after the motor was without torque for some time.
+        """Return the rms torque (i²t) in N·m after `duration_s` without torque.
 
         Parameters
         ----------
@@ -119,7 +124,7 @@ class Gauges:
         return sqrt(self._heat_nm2)
 
     def forget_angle(self) -> None:
-        """Forget the last angle, so that no speed is computed across two records."""
+        """Forget the last motor angle, so that no speed is computed from angles of two records."""
         self._last = None
 
     def _speeds_from_fresh_angles(self, samples: Records) -> npt.NDArray[np.float64]:
@@ -128,25 +133,27 @@ class Gauges:
         A repeated (stale) reading is omitted, because the speed after it would be doubled.
         """
         fresh_samples = samples[(samples["status"] & Status.ANGLE_STALE) == 0]
-        ticks, angles_rad = fresh_samples["tick"].astype(np.int64), fresh_samples["angle_rad"]
+        fresh_ticks, angles_rad = fresh_samples["tick"].astype(np.int64), fresh_samples["angle_rad"]
         if self._last is not None:
-            ticks = np.append(self._last[0], ticks)
+            fresh_ticks = np.append(self._last[0], fresh_ticks)
             angles_rad = np.append(self._last[1], angles_rad)
-        if ticks.size:
-            self._last = int(ticks[-1]), float(angles_rad[-1])
-        speeds: npt.NDArray[np.float64] = np.diff(angles_rad) / np.diff(ticks) * self._rate_hz
-        return speeds
+        if fresh_ticks.size:
+            self._last = int(fresh_ticks[-1]), float(angles_rad[-1])
+        speeds_rad_s: npt.NDArray[np.float64] = (
+            np.diff(angles_rad) / np.diff(fresh_ticks) * self._rate_hz
+        )
+        return speeds_rad_s
 
     def _update_rms_torque(self, torque_nm: npt.NDArray[np.float64]) -> float:
         """Update the rms torque (i²t) with commanded torques and return it in N·m."""
-        known_nm = torque_nm[np.isfinite(torque_nm)]
+        known_torque_nm = torque_nm[np.isfinite(torque_nm)]
         time_constant_ticks = self._rate_hz * self._time_constant_s
         self._heat_nm2 *= exp(-torque_nm.size / time_constant_ticks)
-        self._heat_nm2 += float(known_nm @ known_nm) / time_constant_ticks
+        self._heat_nm2 += float(known_torque_nm @ known_torque_nm) / time_constant_ticks
         return sqrt(self._heat_nm2)
 
 
-def _peak(values: npt.NDArray[np.float64]) -> float | None:
+def _peak(signal_values: npt.NDArray[np.float64]) -> float | None:
     """Return the largest magnitude of the finite values; None if there are none."""
-    finite_values = values[np.isfinite(values)]
+    finite_values = signal_values[np.isfinite(signal_values)]
     return float(np.abs(finite_values).max()) if finite_values.size else None

@@ -61,7 +61,7 @@ Their values arrive at most once per second."""
 
 @dataclass(frozen=True, slots=True)
 class TimeView:
-    """Position and size of a plot over time in a tab of the window.
+    """View of a plot over time in a tab of the window: its time range and height.
 
     Attributes
     ----------
@@ -132,55 +132,55 @@ _FIT_PLOT_MARGIN_PT: Final = 50.0
 """Height that each plot of the tab Fit needs outside its axes, in points."""
 
 
-def fit_views(source: Source) -> tuple[TimeView, ...]:
+def fit_views(fit_plots: Source) -> tuple[TimeView, ...]:
     """Return the plots of the tab Fit, with heights for their number.
 
     Parameters
     ----------
-    source
+    fit_plots
         Source of the plots, two for each mode.
     """
-    rows = max(1, len(source.plots) // 2)
-    height = _FIT_TAB_HEIGHT_PT / rows - _FIT_PLOT_MARGIN_PT
-    return tuple(TimeView(source, plot, WHOLE_S, height) for plot in source.plots)
+    row_count = max(1, len(fit_plots.plots) // 2)
+    plot_height_pt = _FIT_TAB_HEIGHT_PT / row_count - _FIT_PLOT_MARGIN_PT
+    return tuple(TimeView(fit_plots, plot, WHOLE_S, plot_height_pt) for plot in fit_plots.plots)
 
 
 def blueprint(
     *,
-    absent: Collection[str] = (),
+    absent_components: Collection[str] = (),
     fit_modes: int | None = None,
-    fit_targets: bool = False,
+    with_target_std: bool = False,
 ) -> "rrb.Blueprint":
     """Return the layout of the live window, which follows the newest sample.
 
     Parameters
     ----------
-    absent
+    absent_components
         Component names of plots to omit, because the session has no values for them.
     fit_modes
         Number of modes whose fits are plotted over time. 0: only a table of the last fit. None: no
         tab Fit.
-    fit_targets
+    with_target_std
         Whether the session may have target precisions.
     """
     import rerun.blueprint as rrb
 
-    contents = [
+    tab_contents = [
         _overview(),
         _signals(),
         _frequency_response(),
         _spectrogram(),
-        _health(absent),
+        _health(absent_components),
         _events(),
     ]
-    names = list(TAB_TITLES)
+    tab_names = list(TAB_TITLES)
     if fit_modes is not None:
-        contents.insert(1, _fit(fit_modes, with_targets=fit_targets))
-        names.insert(1, FIT_TAB_TITLE)
-    for tab, name in zip(contents, names, strict=True):
+        tab_contents.insert(1, _fit(fit_modes, with_target_std=with_target_std))
+        tab_names.insert(1, FIT_TAB_TITLE)
+    for tab, name in zip(tab_contents, tab_names, strict=True):
         tab.name = name
     return rrb.Blueprint(
-        rrb.Tabs(*contents, active_tab=0),
+        rrb.Tabs(*tab_contents, active_tab=0),
         rrb.TimePanel(timeline=TIMELINE, play_state="following", state="collapsed"),
         rrb.BlueprintPanel(state="hidden"),
         rrb.SelectionPanel(state="hidden"),
@@ -212,7 +212,7 @@ def _overview() -> "rrb.Container":
 
 
 def _signals() -> "rrb.Container":
-    """Return the contents of the tab Signals: plots of the samples over a short time."""
+    """Return the contents of the tab Signals: plots of the samples of the last 2 s."""
     import rerun.blueprint as rrb
 
     return rrb.Grid(*map(_plot, SIGNALS), grid_columns=2)
@@ -236,11 +236,13 @@ def _spectrogram() -> "rrb.Container":
     )
 
 
-def _health(absent: Collection[str]) -> "rrb.Container":
+def _health(absent_components: Collection[str]) -> "rrb.Container":
     """Return the contents of the tab Health: plots of loop, bus and recorder, and a summary."""
     import rerun.blueprint as rrb
 
-    shown_views = [view for view in HEALTH if view.plot.component not in absent]
+    shown_views = [
+        time_view for time_view in HEALTH if time_view.plot.component not in absent_components
+    ]
     return rrb.Horizontal(
         rrb.Grid(
             *map(_plot, shown_views),
@@ -251,18 +253,19 @@ def _health(absent: Collection[str]) -> "rrb.Container":
     )
 
 
-def _fit(modes: int, *, with_targets: bool) -> "rrb.Container":
+def _fit(mode_count: int, *, with_target_std: bool) -> "rrb.Container":
     """Return the contents of the tab Fit: modes over time, and the table of the last fit."""
     import rerun.blueprint as rrb
 
-    table = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
-    if modes == 0:
-        return rrb.Vertical(table)
+    table_view = rrb.TextDocumentView(name="Fit of the record", origin=FIT_TABLE)
+    if mode_count == 0:
+        return rrb.Vertical(table_view)
     return rrb.Horizontal(
         rrb.Grid(
-            *map(_plot, fit_views(fit_source(modes, with_targets=with_targets))), grid_columns=2
+            *map(_plot, fit_views(fit_source(mode_count, with_target_std=with_target_std))),
+            grid_columns=2,
         ),
-        table,
+        table_view,
         column_shares=[7, 4],
     )
 
@@ -274,13 +277,13 @@ def _events() -> "rrb.Container":
     return rrb.Vertical(_log())
 
 
-def _plot(view: TimeView) -> "rrb.TimeSeriesView":
+def _plot(time_view: TimeView) -> "rrb.TimeSeriesView":
     """Return Rerun's view of a plot over time, with the style of each curve."""
     import rerun as rr
     import rerun.blueprint as rrb
 
-    plot = view.plot
-    lines = rr.SeriesLines(
+    plot = time_view.plot
+    line_style = rr.SeriesLines(
         names=[curve.label for curve in plot.curves],
         colors=[curve.color for curve in plot.curves],
         widths=[curve.width for curve in plot.curves],
@@ -289,85 +292,89 @@ def _plot(view: TimeView) -> "rrb.TimeSeriesView":
     )
     # The points are invisible, but extend the axis. Curves with the same name have one entry in the
     # legend.
-    ticks = rr.SeriesPoints(
+    tick_style = rr.SeriesPoints(
         names=[plot.curves[0].label], colors=[plot.curves[0].color], marker_sizes=[0.0]
     )
     visualizers: dict[EntityPath | str, rrb.Visualizer] = {
-        view.source.entity: lines.visualizer(mappings=[_values_mapping(plot.component)])
+        time_view.source.entity: line_style.visualizer(mappings=[_values_mapping(plot.component)])
     }
     if plot.span is None:
-        visualizers[view.source.ticks] = ticks.visualizer(mappings=[_values_mapping(view.ticks)])
-    start = (
+        visualizers[time_view.source.ticks] = tick_style.visualizer(
+            mappings=[_values_mapping(time_view.ticks)]
+        )
+    start_boundary = (
         rrb.TimeRangeBoundary.absolute(seconds=0.0)
-        if view.window_s == WHOLE_S
-        else rrb.TimeRangeBoundary.cursor_relative(seconds=-view.window_s)
+        if time_view.window_s == WHOLE_S
+        else rrb.TimeRangeBoundary.cursor_relative(seconds=-time_view.window_s)
     )
-    end = rrb.TimeRangeBoundary.cursor_relative()
+    end_boundary = rrb.TimeRangeBoundary.cursor_relative()
     return rrb.TimeSeriesView(
         name=plot.title,
-        origin=view.source.entity,
-        contents=[str(entity) for entity in visualizers],
+        origin=time_view.source.entity,
+        contents=[str(entity_path) for entity_path in visualizers],
         overrides=visualizers,
         # A single curve needs no legend. Intervals of fits are wide at first.
         plot_legend=rrb.PlotLegend(
-            corner="RightTop" if view.window_s == WHOLE_S else "LeftTop",
+            corner="RightTop" if time_view.window_s == WHOLE_S else "LeftTop",
             visible=len(plot.curves) > 1,
         ),
         # The default is a minute around the cursor, half of it in the future.
-        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start, end=end)),
+        axis_x=rrb.TimeAxis(view_range=rr.TimeRange(start=start_boundary, end=end_boundary)),
         axis_y=None if plot.span is None else rrb.ScalarAxis(range=plot.span),
-        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start, end=end),
+        time_ranges=rrb.VisibleTimeRange(TIMELINE, start=start_boundary, end=end_boundary),
     )
 
 
-def _values_mapping(component: str) -> "VisualizerComponentMapping":
+def _values_mapping(component_name: str) -> "VisualizerComponentMapping":
     """Return the mapping that makes Rerun plot the values of a component."""
     from rerun.blueprint.encodings import ComponentSourceKind, VisualizerComponentMapping
 
     return VisualizerComponentMapping(
-        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=component
+        "Scalars:scalars", ComponentSourceKind.SourceComponent, source_component=component_name
     )
 
 
-def chart_view(name: str, entity: str, size: tuple[float, float]) -> "rrb.Spatial2DView":
+def chart_view(
+    view_title: str, entity_path: str, chart_size: tuple[float, float]
+) -> "rrb.Spatial2DView":
     """Return Rerun's view of a chart whose horizontal axis is not time.
 
     Parameters
     ----------
-    name
+    view_title
         Title of the view.
-    entity
+    entity_path
         Entity path of the chart.
-    size
+    chart_size
         Width and height of its canvas, in points.
     """
     import rerun.blueprint as rrb
 
-    width, height = size
+    width, height = chart_size
     return rrb.Spatial2DView(
-        name=name,
-        origin=entity,
+        name=view_title,
+        origin=entity_path,
         visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
     )
 
 
 def chart_page(
-    wide: "rrb.Spatial2DView", *narrow: "rrb.Spatial2DView", name: str | None = None
+    wide_view: "rrb.Spatial2DView", *narrow_views: "rrb.Spatial2DView", tab_title: str | None = None
 ) -> "rrb.Vertical":
-    """Return a tab with a wide chart above a row of narrow charts.
+    """Return the contents of a tab: a wide chart above a row of narrow charts.
 
     Parameters
     ----------
-    wide
+    wide_view
         View at the top, with four sevenths of the height.
-    *narrow
+    *narrow_views
         Views below it, from left to right.
-    name
+    tab_title
         Title of the tab; None: no title.
     """
     import rerun.blueprint as rrb
 
-    return rrb.Vertical(wide, rrb.Horizontal(*narrow), row_shares=[4, 3], name=name)
+    return rrb.Vertical(wide_view, rrb.Horizontal(*narrow_views), row_shares=[4, 3], name=tab_title)
 
 
 def _summary() -> "rrb.TextDocumentView":
@@ -434,18 +441,23 @@ class Scale:
     def __init__(self, source: "Source", views: "Sequence[TimeView]") -> None:
         self._entity = source.ticks
         self._axes = [
-            _AxisExtremes(view)
-            for view in views
-            if view.source is source and view.plot.span is None
+            _AxisExtremes(time_view)
+            for time_view in views
+            if time_view.source is source and time_view.plot.span is None
         ]
 
     def frame(self) -> list["Drawing"]:
-        """Return functions that send an empty first point, without which Rerun reports an error."""
+        """Return the function that sends an empty first point of each axis to Rerun.
+
+        Without a point Rerun reports an error.
+        """
         empty_values = {axis.view.ticks: np.array([[np.nan]]) for axis in self._axes}
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
-    def draw(self, t_ns: npt.NDArray[np.int64], columns: Mapping[str, Values]) -> list["Drawing"]:
+    def draw(
+        self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]
+    ) -> list["Drawing"]:
         """Return functions that send the invisible points that the axes need for their labels.
 
         The values have shape (n, k), by component, at times (n,). Values that are not finite are
@@ -454,40 +466,49 @@ class Scale:
         interval_indices = (t_ns - t_ns[0]) // _EXTREMES_INTERVAL_NS
         interval_starts = np.append(0, np.flatnonzero(np.diff(interval_indices)) + 1)
         times_ns = t_ns[np.append(interval_starts[1:], len(t_ns)) - 1].tolist()
-        lows, highs = (
+        least_values, greatest_values = (
             {
-                component: reduction.reduceat(
-                    values.ravel(), interval_starts * values.shape[1]
+                component_name: extreme_function.reduceat(
+                    component_values.ravel(), interval_starts * component_values.shape[1]
                 ).tolist()
-                for component, values in columns.items()
+                for component_name, component_values in plot_values.items()
             }
-            for reduction in (np.fmin, np.fmax)
+            for extreme_function in (np.fmin, np.fmax)
         )
         drawings: list[Drawing] = []
-        for axis in self._axes:
-            component = axis.view.plot.component
-            points = [
-                point
-                for interval in zip(times_ns, lows[component], highs[component], strict=True)
-                for point in axis.take(*interval)
+        for axis_extremes in self._axes:
+            component_name = axis_extremes.view.plot.component
+            tick_points = [
+                tick_point
+                for interval_extremes in zip(
+                    times_ns,
+                    least_values[component_name],
+                    greatest_values[component_name],
+                    strict=True,
+                )
+                for tick_point in axis_extremes.take(*interval_extremes)
             ]
-            if points:
-                drawings.append(self._tick_points_drawing(axis.view.ticks, points))
+            if tick_points:
+                drawings.append(self._tick_points_drawing(axis_extremes.view.ticks, tick_points))
         return drawings
 
-    def _tick_points_drawing(self, component: str, points: Sequence[_CurvePoint]) -> "Drawing":
+    def _tick_points_drawing(
+        self, component_name: str, tick_points: Sequence[_CurvePoint]
+    ) -> "Drawing":
         """Return the function that sends invisible points (time, value) of one axis."""
-        times_ns, values = zip(*points, strict=True)
-        columns = {component: np.array(values)[:, None]}
-        return partial(send_columns, entity=self._entity, t_ns=np.array(times_ns), columns=columns)
+        times_ns, tick_values = zip(*tick_points, strict=True)
+        point_columns = {component_name: np.array(tick_values)[:, None]}
+        return partial(
+            send_columns, entity=self._entity, t_ns=np.array(times_ns), columns=point_columns
+        )
 
 
 class _AxisExtremes:
     """Least and greatest plotted value in a time window, and the invisible points sent last."""
 
-    def __init__(self, view: "TimeView") -> None:
-        self.view = view
-        self._window_ns = round(1e9 * view.window_s)
+    def __init__(self, time_view: "TimeView") -> None:
+        self.view = time_view
+        self._window_ns = round(1e9 * time_view.window_s)
         self._greatest, self._least = (
             _RunningMaximum(self._window_ns),
             _RunningMaximum(self._window_ns),
@@ -495,14 +516,17 @@ class _AxisExtremes:
         self._below: _CurvePoint | None = None
         self._above: _CurvePoint | None = None
 
-    def take(self, t_ns: int, low: float, high: float) -> list[_CurvePoint]:
-        """Add the least and greatest value of an interval; return the invisible points to send."""
-        if not (math.isfinite(low) and math.isfinite(high)):
+    def take(self, t_ns: int, least_value: float, greatest_value: float) -> list[_CurvePoint]:
+        """Add the least and greatest value of a time interval.
+
+        Returns the invisible points (time, value) that the axis needs for its labels.
+        """
+        if not (math.isfinite(least_value) and math.isfinite(greatest_value)):
             return []
-        high_ns, high = self._greatest.take(t_ns, high)
-        low_ns, minus_low = self._least.take(t_ns, -low)
+        high_ns, greatest_value = self._greatest.take(t_ns, greatest_value)
+        low_ns, minus_low = self._least.take(t_ns, -least_value)
         value_below, value_above = missing_ticks(
-            -minus_low, high, self.view.height, self.view.plot.least_span
+            -minus_low, greatest_value, self.view.height, self.view.plot.least_span
         )
         # When either extreme leaves the window, the missing points are computed again.
         first_extreme_ns = min(low_ns, high_ns)
@@ -515,11 +539,11 @@ class _AxisExtremes:
             new_points.append(self._below)
         return new_points
 
-    def _must_send(self, last_point: _CurvePoint | None, value: float, t_ns: int) -> bool:
-        """Return whether to send an invisible point: its value changes, or it leaves the window."""
+    def _must_send(self, last_point: _CurvePoint | None, tick_value: float, t_ns: int) -> bool:
+        """Return True if an invisible point is new, has changed or leaves the time window."""
         return (
             last_point is None
-            or last_point[1] != value
+            or last_point[1] != tick_value
             or last_point[0] <= t_ns - self._window_ns + _EXTREMES_INTERVAL_NS
         )
 
@@ -532,26 +556,26 @@ class _RunningMaximum:
         # Each value is greater than all later ones.
         self._marks: collections.deque[_CurvePoint] = collections.deque()
 
-    def take(self, t_ns: int, value: float) -> _CurvePoint:
-        """Add the newest value and return the largest value in the window, with its time."""
-        while self._marks and self._marks[-1][1] <= value:
+    def take(self, t_ns: int, newest_value: float) -> _CurvePoint:
+        """Add the newest value; return time (ns) and value of the largest one in the window."""
+        while self._marks and self._marks[-1][1] <= newest_value:
             self._marks.pop()
-        self._marks.append((t_ns, value))
+        self._marks.append((t_ns, newest_value))
         while self._marks[0][0] <= t_ns - self._window_ns:
             self._marks.popleft()
         return self._marks[0]
 
 
 def missing_ticks(
-    low: float, high: float, height: float, least_span: float = 0.0
+    lowest_value: float, highest_value: float, height_pt: float, least_span: float = 0.0
 ) -> tuple[float | None, float | None]:
     """Return the values to add to a plot so that its axis has two labels and its least length.
 
     Parameters
     ----------
-    low, high
+    lowest_value, highest_value
         Least and greatest plotted value.
-    height
+    height_pt
         Height of the plot, in points.
     least_span
         Least length of the axis, in the unit of the values.
@@ -561,43 +585,56 @@ def missing_ticks(
     value_below, value_above
         Values to add below and above the plotted values; None if none is needed on that side.
     """
-    if 0.0 <= high - low < least_span and max(-low, high) < _MOST_VALUE_TO_AXIS_RATIO * least_span:
+    if (
+        0.0 <= highest_value - lowest_value < least_span
+        and max(-lowest_value, highest_value) < _MOST_VALUE_TO_AXIS_RATIO * least_span
+    ):
         # The ends are multiples of a step, so that noise does not move the axis.
-        step = least_span / 2
-        first_multiple, last_multiple = math.floor(low / step), math.ceil(high / step)
+        tick_step = least_span / 2
+        first_multiple, last_multiple = (
+            math.floor(lowest_value / tick_step),
+            math.ceil(highest_value / tick_step),
+        )
         if last_multiple - first_multiple < 2:
             first_multiple, last_multiple = (
                 (first_multiple - 1, last_multiple + 1)
                 if first_multiple == last_multiple
                 else (
                     (first_multiple - 1, last_multiple)
-                    if low - first_multiple * step < last_multiple * step - high
+                    if lowest_value - first_multiple * tick_step
+                    < last_multiple * tick_step - highest_value
                     else (first_multiple, last_multiple + 1)
                 )
             )
-        ends = first_multiple * step, last_multiple * step
-        ticks = missing_ticks(*ends, height)
+        axis_ends = first_multiple * tick_step, last_multiple * tick_step
+        further_ticks = missing_ticks(*axis_ends, height_pt)
         value_below, value_above = (
-            end if tick is None else tick for end, tick in zip(ends, ticks, strict=True)
+            end if further_tick is None else further_tick
+            for end, further_tick in zip(axis_ends, further_ticks, strict=True)
         )
         return (
-            value_below if value_below < low else None,
-            value_above if value_above > high else None,
+            value_below if value_below < lowest_value else None,
+            value_above if value_above > highest_value else None,
         )
-    spacing = AXIS_TO_RANGE_RATIO * (high - low) / height * LEAST_LABEL_SPACING_PT
+    label_spacing = (
+        AXIS_TO_RANGE_RATIO * (highest_value - lowest_value) / height_pt * LEAST_LABEL_SPACING_PT
+    )
     # Rerun shows a single value with one unit on either side.
-    if not _LEAST_LABEL_SPACING < spacing < _MOST_LABEL_SPACING:
+    if not _LEAST_LABEL_SPACING < label_spacing < _MOST_LABEL_SPACING:
         return None, None
-    step = 10.0 ** math.ceil(math.log10(spacing))
-    first_multiple, last_multiple = math.ceil(low / step), math.floor(high / step)
+    tick_step = 10.0 ** math.ceil(math.log10(label_spacing))
+    first_multiple, last_multiple = (
+        math.ceil(lowest_value / tick_step),
+        math.floor(highest_value / tick_step),
+    )
     if last_multiple > first_multiple:
         return None, None
-    value_below, value_above = (first_multiple - 1) * step, (last_multiple + 1) * step
+    value_below, value_above = (first_multiple - 1) * tick_step, (last_multiple + 1) * tick_step
     if last_multiple < first_multiple:
         return value_below, value_above
     # Prefer above: the point stays there while a signal oscillates, and makes room for the legend.
     return (
         (None, value_above)
-        if value_above - high <= 2.0 * (low - value_below)
+        if value_above - highest_value <= 2.0 * (lowest_value - value_below)
         else (value_below, None)
     )

@@ -52,7 +52,7 @@ _ATTACHMENTS_WITH_DAMPING: Final = ("specimen.toml", "profile.toml")
 
 
 def subject_of_session(
-    session: Session, timings: Records | None = None, *, fitted: bool = False
+    session: Session, tick_timings: Records | None = None, *, has_fit: bool = False
 ) -> Subject:
     """Return the description of a recorded session that its views need.
 
@@ -63,9 +63,9 @@ def subject_of_session(
     ----------
     session
         Session as read from its file.
-    timings
+    tick_timings
         Ages (n,) of the readings, of ``TIMING_DTYPE``; None if the file has none.
-    fitted
+    has_fit
         Whether the file contains a fit of the session's record (`rigd.session.fit_of`).
 
     Raises
@@ -73,32 +73,35 @@ def subject_of_session(
     SessionError
         If there are no samples or far too few, or a number is missing or not plausible.
     """
-    ticks = session.samples["tick"]
-    if len(ticks) == 0:
+    sample_ticks = session.samples["tick"]
+    if len(sample_ticks) == 0:
         raise SessionError(f"{session.path}: no samples were recorded, so there is nothing to see.")
-    first_tick, end = int(ticks[0]), int(ticks[-1]) + 1
+    first_tick, end_tick = int(sample_ticks[0]), int(sample_ticks[-1]) + 1
     if session.start_utc_ns > _LAST_UTC_NS:
         raise SessionError(
             f"{session.path}: start_utc_ns is {session.start_utc_ns} ns, after the year 2262, "
             "which Rerun cannot show. The writing program must correct it."
         )
-    if end - first_tick > _MOST_TICKS_PER_SAMPLE * len(ticks):
+    if end_tick - first_tick > _MOST_TICKS_PER_SAMPLE * len(sample_ticks):
         raise SessionError(
-            f"{session.path}: only {len(ticks)} of the {end - first_tick} ticks from "
-            f"{first_tick} to {end - 1} have a sample, too few to be shown as a session."
+            f"{session.path}: only {len(sample_ticks)} of the {end_tick - first_tick} ticks from "
+            f"{first_tick} to {end_tick - 1} have a sample, too few to be shown as a session."
         )
-    attachments = [session.attachments.get(name, b"") for name in _ATTACHMENTS_WITH_DAMPING]
+    profile_files = [
+        session.attachments.get(attachment_name, b"")
+        for attachment_name in _ATTACHMENTS_WITH_DAMPING
+    ]
     return Subject(
         name=session.metadata.get("id") or session.path.stem,
         rate_hz=_number_in_range(session, "rate_hz", 1.0, 1e5),
-        ticks=max(end, *(segment_end for _, segment_end in session.segments.values()), 0),
-        sweep=sweep_ticks({"sweep": (first_tick, end), **session.segments}),
+        ticks=max(end_tick, *(segment_end for _, segment_end in session.segments.values()), 0),
+        sweep=sweep_ticks({"sweep": (first_tick, end_tick), **session.segments}),
         beam=Beam(
             _number_in_range(session, "beam_length_m", 1e-3, 1e3),
             _number_in_range(session, "beam_density_kg_per_m", 1e-6, 1e3),
             _number_in_range(session, "beam_bending_stiffness_n_m2", 1e-9, 1e9),
         ),
-        damping=next(filter(None, map(nominal_damping, attachments)), None),
+        damping=next(filter(None, map(nominal_damping, profile_files)), None),
         tool_inertia_kg_m2=session.number("tool_inertia_kg_m2", 0.0),
         angle_delay_s=session.number("angle_delay_s", 0.0),
         torque_delay_s=session.number("torque_delay_s", 0.0),
@@ -106,11 +109,11 @@ def subject_of_session(
         sweep_hz=linear_sweep_band_hz(session.metadata.get("excitation", ""), session.metadata),
         back=session.segments.get("back"),
         specimen=session.metadata.get("specimen", ""),
-        limits=_stated_limits(attachments[-1]),
-        absent=_components_without_values(session, timings),
+        limits=_stated_limits(profile_files[-1]),
+        absent=_components_without_values(session, tick_timings),
         recorded=True,
         # The file has only the last fit.
-        fit_modes=0 if fitted else None,
+        fit_modes=0 if has_fit else None,
     )
 
 
@@ -125,39 +128,39 @@ _PROFILE_KEYS_OF_LIMITS: Final = {
 """Section and key of a profile with the limit of each gauge, by the name of the gauge."""
 
 
-def _stated_limits(profile: bytes) -> dict[str, float]:
+def _stated_limits(profile_bytes: bytes) -> dict[str, float]:
     """Return the positive limits that a profile of any version states, by gauge name."""
     try:
-        table = parse_toml(decode_text(profile))
+        profile_table = parse_toml(decode_text(profile_bytes))
     except (UnicodeDecodeError, DocumentError):
         return {}
-    limits = {}
-    for name, (section, key) in _PROFILE_KEYS_OF_LIMITS.items():
+    positive_limits = {}
+    for gauge_name, (section_name, key) in _PROFILE_KEYS_OF_LIMITS.items():
         with suppress(KeyError, TypeError, ValueError, OverflowError):
-            if (limit := float(table[section][key]["value"])) > 0.0:
-                limits[name] = limit
-    return limits
+            if (stated_limit := float(profile_table[section_name][key]["value"])) > 0.0:
+                positive_limits[gauge_name] = stated_limit
+    return positive_limits
 
 
-def _components_without_values(session: Session, timings: Records | None) -> frozenset[str]:
-    """Return the component names of plots for which a recorded session has no values."""
-    components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
-    if timings is None or len(timings) == 0:
-        components.add(AGES.component)
+def _components_without_values(session: Session, tick_timings: Records | None) -> frozenset[str]:
+    """Return Rerun's names (components) of the plots for which a session has no values."""
+    absent_components = {plot.component for plot in HEALTH.plots if plot is not FAULTY_TICKS}
+    if tick_timings is None or len(tick_timings) == 0:
+        absent_components.add(AGES.component)
     if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
-        components |= REAL_TIME_PLOT_COMPONENTS
-    return frozenset(components)
+        absent_components |= REAL_TIME_PLOT_COMPONENTS
+    return frozenset(absent_components)
 
 
-def nominal_damping(profile: bytes) -> Damping | None:
+def nominal_damping(profile_bytes: bytes) -> Damping | None:
     """Return the nominal damping in a profile or specimen; None if it states no usable one.
 
     Only the damping parameters are read, so the profile may be of any version.
     """
     try:
-        table = parse_toml(decode_text(profile))["beam"]["damping"]
+        damping_table = parse_toml(decode_text(profile_bytes))["beam"]["damping"]
         zeta, alpha, gamma, lambda_ = (
-            float(table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
+            float(damping_table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
         )
     except (KeyError, TypeError, ValueError, OverflowError):
         return None
@@ -169,9 +172,9 @@ def nominal_damping(profile: bytes) -> Damping | None:
 def draw_session(
     stream: "RecordingStream",
     session: Session,
-    timings: Records,
+    tick_timings: Records,
     *,
-    front: "Sequence[rrb.Container]" = (),
+    front_tabs: "Sequence[rrb.Container]" = (),
     on_progress: Callable[[float], None] = lambda _fraction: None,
 ) -> None:
     """Draw a recorded session as if it were live, so that every chart grows with time.
@@ -182,9 +185,9 @@ def draw_session(
         Stream for the drawings.
     session
         Session to draw.
-    timings
+    tick_timings
         Ages (n,) of the readings, of ``TIMING_DTYPE``; may be empty.
-    front
+    front_tabs
         Tabs to show before those of the live view.
     on_progress
         Function that is called from time to time with the fraction of the session that is drawn.
@@ -194,136 +197,143 @@ def draw_session(
     SessionError
         As `subject_of_session` does.
     """
-    fit = fit_of(session.outcome)
-    subject = subject_of_session(session, timings, fitted=fit is not None)
+    fit_document = fit_of(session.outcome)
+    subject = subject_of_session(session, tick_timings, has_fit=fit_document is not None)
     scene = Scene(
-        subject, lambda: recorded_blueprint(front, subject.absent, fit_modes=subject.fit_modes)
+        subject, lambda: recorded_blueprint(front_tabs, subject.absent, fit_modes=subject.fit_modes)
     )
-    outcome = session.outcome or {}
-    state = ended(outcome.get("outcome", "no outcome"), outcome.get("reason", ""))
-    scene.state(0, replace(state, over=False))
+    outcome_document = session.outcome or {}
+    banner_state = ended(
+        outcome_document.get("outcome", "no outcome"), outcome_document.get("reason", "")
+    )
+    scene.state(0, replace(banner_state, over=False))
     # The viewer shows session time only, not the time of drawing.
     stream.set_log_time_enabled(False)
     stream.set_log_tick_enabled(False)
     stream.send_recording_start_time_nanos(session.start_utc_ns)
     for send_drawing in scene.frame():
         send_drawing(stream)
-    touches = _touches(session)
-    for send_drawing in scene.events(sorted(_notes(session, touches), key=lambda note: note.t_ns)):
+    remaining_touches = _touches(session)
+    for send_drawing in scene.events(
+        sorted(_notes(session, remaining_touches), key=lambda note: note.t_ns)
+    ):
         send_drawing(stream)
-    samples = session.samples
-    counts = np.zeros(3, np.int64)
+    recorded_samples = session.samples
+    faulty_tick_counts = np.zeros(3, np.int64)
     drawn_samples, last_tick = 0, -1
     block_ticks = max(1, round(_BLOCK_S * subject.rate_hz))
-    for block, block_timings in _blocks(samples, timings, block_ticks):
-        drawn_samples += len(block)
-        counts += _count_faulty_ticks(block, last_tick)
-        last_tick, t_ns = int(block["tick"][-1]), int(block["t_ns"][-1])
-        missed_ticks, late_ticks, lost_ticks = counts.tolist()
+    for sample_block, block_timings in _blocks(recorded_samples, tick_timings, block_ticks):
+        drawn_samples += len(sample_block)
+        faulty_tick_counts += _count_faulty_ticks(sample_block, last_tick)
+        last_tick, t_ns = int(sample_block["tick"][-1]), int(sample_block["t_ns"][-1])
+        missed_ticks, late_ticks, lost_ticks = faulty_tick_counts.tolist()
         health = Health(missed_ticks=missed_ticks, late_ticks=late_ticks, lost_ticks=lost_ticks)
         for send_drawing in (
             *scene.timings(block_timings),
-            *scene.samples(block),
+            *scene.samples(sample_block),
             *scene.health(t_ns, health),
         ):
             send_drawing(stream)
         due_touches = [
             touch
-            for touch in touches
+            for touch in remaining_touches
             if _TOUCH_DRAWING_DELAY_S + touch["time_s"]["value"] < 1e-9 * t_ns
         ]
         for send_drawing in scene.touches(due_touches):
             send_drawing(stream)
-        touches = touches[len(due_touches) :]
-        on_progress(drawn_samples / len(samples))
+        remaining_touches = remaining_touches[len(due_touches) :]
+        on_progress(drawn_samples / len(recorded_samples))
     for send_drawing in (
         *scene.finish(),
-        *scene.touches(touches),
-        *(scene.fit(fit) if fit is not None else ()),
+        *scene.touches(remaining_touches),
+        *(scene.fit(fit_document) if fit_document is not None else ()),
     ):
         send_drawing(stream)
 
 
 def recorded_blueprint(
-    front: "Sequence[rrb.Container]" = (),
-    absent: Collection[str] = (),
+    front_tabs: "Sequence[rrb.Container]" = (),
+    absent_components: Collection[str] = (),
     fit_modes: int | None = None,
 ) -> "rrb.Blueprint":
     """Return the layout of the live view for a recorded session, with playback from the start.
 
     Parameters
     ----------
-    front
+    front_tabs
         Tabs to show before those of the live view.
-    absent
+    absent_components
         Component names of plots to omit, because the session has no values for them.
     fit_modes
         0: add a tab with a table of the last fit. None: no tab Fit.
     """
     import rerun.blueprint as rrb
 
-    live_layout = blueprint(absent=absent, fit_modes=fit_modes)
+    live_layout = blueprint(absent_components=absent_components, fit_modes=fit_modes)
     return rrb.Blueprint(
-        rrb.Tabs(*front, *live_layout.root_container.contents),
+        rrb.Tabs(*front_tabs, *live_layout.root_container.contents),
         rrb.TimePanel(timeline=TIMELINE, play_state="playing", state="collapsed"),
         live_layout.blueprint_panel,
         live_layout.selection_panel,
     )
 
 
-def _number_in_range(session: Session, key: str, least: float, most: float) -> float:
-    """Return a number that the session file states, or raise if it is not in a plausible range."""
-    value = session.number(key)
-    if not least <= value <= most:
+def _number_in_range(
+    session: Session, metadata_key: str, least_value: float, greatest_value: float
+) -> float:
+    """Return a number that the session file states; raise SessionError outside a given range."""
+    stated_number = session.number(metadata_key)
+    if not least_value <= stated_number <= greatest_value:
         raise SessionError(
-            f"{session.path}: {key} is {value:g} {unit_of(key)}, but must be from {least:g} to "
-            f"{most:g} {unit_of(key)}. The writing program must correct it."
+            f"{session.path}: {metadata_key} is {stated_number:g} {unit_of(metadata_key)}, "
+            f"but must be from {least_value:g} to {greatest_value:g} {unit_of(metadata_key)}. The "
+            "writing program must correct it."
         )
-    return value
+    return stated_number
 
 
-def _notes(session: Session, touches: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
+def _notes(session: Session, touch_documents: Sequence[Mapping[str, Any]]) -> Iterator[Note]:
     """Yield the log lines of a session, its touches and its outcome as notes for the views."""
-    for event in session.events:
-        yield Note(event.t_ns, event.level, event.message)
-    for touch in touches:
+    for session_event in session.events:
+        yield Note(session_event.t_ns, session_event.level, session_event.message)
+    for touch in touch_documents:
         yield Note(round(1e9 * touch["time_s"]["value"]), "info", touch_line(touch))
     if session.outcome is not None:
-        outcome = session.outcome.get("outcome", "unknown")
-        reason = session.outcome.get("reason", "")
-        yield outcome_note(int(session.samples["t_ns"][-1]), outcome, reason)
+        outcome_name = session.outcome.get("outcome", "unknown")
+        outcome_reason = session.outcome.get("reason", "")
+        yield outcome_note(int(session.samples["t_ns"][-1]), outcome_name, outcome_reason)
 
 
 def _touches(session: Session) -> list[dict[str, Any]]:
     """Return the session's touches with an estimated time within the record, in order of time."""
-    last_s = 1e-9 * int(session.samples["t_ns"][-1])
+    record_end_s = 1e-9 * int(session.samples["t_ns"][-1])
     touches_with_time = [
         touch for touch in touches_of(session.outcome) if touch["time_s"] is not None
     ]
     touches_in_record = [
-        touch for touch in touches_with_time if 0.0 <= touch["time_s"]["value"] <= last_s
+        touch for touch in touches_with_time if 0.0 <= touch["time_s"]["value"] <= record_end_s
     ]
     return sorted(touches_in_record, key=lambda touch: touch["time_s"]["value"])
 
 
 def _count_faulty_ticks(samples: Records, last_tick: int) -> npt.NDArray[np.int64]:
     """Return the number of missed, late and lost ticks since the tick `last_tick`, shape (3,)."""
-    gaps = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
-    status = samples["status"]
-    lost_ticks = np.where(status & Status.AFTER_LOST, gaps, 0)
-    is_late = (status & Status.LATE) != 0
-    return np.array([(gaps - lost_ticks).sum(), is_late.sum(), lost_ticks.sum()], np.int64)
+    gap_ticks = np.diff(samples["tick"].astype(np.int64), prepend=last_tick) - 1
+    status_bits = samples["status"]
+    lost_ticks = np.where(status_bits & Status.AFTER_LOST, gap_ticks, 0)
+    is_late = (status_bits & Status.LATE) != 0
+    return np.array([(gap_ticks - lost_ticks).sum(), is_late.sum(), lost_ticks.sum()], np.int64)
 
 
 def _blocks(
-    samples: Records, timings: Records, block_ticks: int
+    samples: Records, tick_timings: Records, block_ticks: int
 ) -> Iterator[tuple[Records, Records]]:
     """Yield samples in blocks of `block_ticks` ticks, each with the timings of the same ticks."""
-    starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
-    ends = np.append(starts, len(samples))
-    last_ticks = samples["tick"][ends - 1]
-    timing_ends = np.searchsorted(timings["tick"], last_ticks, side="right")
-    first = first_timing = 0
-    for end, timing_end in zip(ends, timing_ends, strict=True):
-        yield samples[first:end], timings[first_timing:timing_end]
-        first, first_timing = end, timing_end
+    block_starts = np.flatnonzero(np.diff(samples["tick"] // block_ticks)) + 1
+    block_ends = np.append(block_starts, len(samples))
+    last_ticks = samples["tick"][block_ends - 1]
+    timing_ends = np.searchsorted(tick_timings["tick"], last_ticks, side="right")
+    first_sample = first_timing = 0
+    for end, timing_end in zip(block_ends, timing_ends, strict=True):
+        yield samples[first_sample:end], tick_timings[first_timing:timing_end]
+        first_sample, first_timing = end, timing_end

@@ -66,27 +66,30 @@ class Scene:
     ----------
     subject
         The session.
-    layout
+    make_layout
         Function that returns the layout of the window; None: the layout of the live view.
-    last
+    last_response
         Response of the last session of the same specimen, which is drawn for comparison.
     """
 
     def __init__(
         self,
         subject: Subject,
-        layout: "Callable[[], rrb.Blueprint] | None" = None,
-        last: LastResponse | None = None,
+        make_layout: "Callable[[], rrb.Blueprint] | None" = None,
+        last_response: LastResponse | None = None,
     ) -> None:
         self._subject = subject
-        with_targets = subject.excitation == "until"
-        self._layout = layout or partial(
-            blueprint, absent=subject.absent, fit_modes=subject.fit_modes, fit_targets=with_targets
+        with_target_std = subject.excitation == "until"
+        self._layout = make_layout or partial(
+            blueprint,
+            absent_components=subject.absent,
+            fit_modes=subject.fit_modes,
+            with_target_std=with_target_std,
         )
         last_hz = min(LAST_HZ, subject.rate_hz / 2)
         self._antenna = Antenna(subject)
         self._response = SweepResponse(subject, last_hz)
-        self.response_charts = ResponseCharts(subject, last)
+        self.response_charts = ResponseCharts(subject, last_response)
         self._response_is_final = False
         self._spectrogram = RunningSpectrogram(
             subject.rate_hz, step_s=_SPECTROGRAM_STEP_S, last_hz=last_hz
@@ -100,14 +103,19 @@ class Scene:
         self._charts_due = _PeriodicTimer(_CHART_UPDATE_PERIOD_S)
         self._samples = _BlockBuffer(subject.rate_hz)
         self._timings = _BlockBuffer(subject.rate_hz)
-        self._scales = {source: Scale(source, TIME_VIEWS) for source in (SIGNALS, READINGS, HEALTH)}
+        self._scales = {
+            record_source: Scale(record_source, TIME_VIEWS)
+            for record_source in (SIGNALS, READINGS, HEALTH)
+        }
         # An empty record first: a view reports missing components as errors.
         self._fits = [fit_record(None, subject.fit_modes or 0)]
         self._fit: Mapping[str, Any] | None = None
         self._fit_source: Source | None = None
         if subject.fit_modes:
-            source = self._fit_source = fit_source(subject.fit_modes, with_targets=with_targets)
-            self._scales[source] = Scale(source, fit_views(source))
+            record_source = self._fit_source = fit_source(
+                subject.fit_modes, with_target_std=with_target_std
+            )
+            self._scales[record_source] = Scale(record_source, fit_views(record_source))
         self._gauges = Gauges(subject.rate_hz, subject.limits, subject.thermal_time_constant_s)
         self._peaks: dict[str, Gauge] = {}
         self._peaks_are_drawn = False
@@ -120,12 +128,12 @@ class Scene:
         return self.response_charts.as_last_response(self._subject)
 
     def frame(self) -> list[Drawing]:
-        """Return functions that draw the window of a new connection with all contents so far."""
-        name = self._subject.name
+        """Return functions that draw the whole window for a newly connected viewer."""
+        session_name = self._subject.name
         return [
-            lambda stream: stream.send_recording_name(name),
+            lambda stream: stream.send_recording_name(session_name),
             lambda stream: stream.send_blueprint(self._layout()),
-            *(drawing for scale in self._scales.values() for drawing in scale.frame()),
+            *(drawing for axis_scale in self._scales.values() for drawing in axis_scale.frame()),
             self.response_charts.draw_frames,
             self.response_charts.draw,
             self._spectrogram_chart.draw_frame,
@@ -139,67 +147,75 @@ class Scene:
         ]
 
     def samples(self, samples: Records) -> list[Drawing]:
-        """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE``.
+        """Return functions that draw new samples (n,) of ``SAMPLE_DTYPE`` in all views.
 
         The samples are in order. Gaps are allowed.
         """
         return self._draw_samples(self._samples.add(samples))
 
-    def timings(self, timings: Records) -> list[Drawing]:
-        """Return functions that draw the ages (n,) of readings, of ``TIMING_DTYPE``."""
-        return self._draw_timings(self._timings.add(timings))
+    def timings(self, tick_timings: Records) -> list[Drawing]:
+        """Return functions that plot the ages of the devices' readings (n,), ``TIMING_DTYPE``."""
+        return self._draw_timings(self._timings.add(tick_timings))
 
-    def events(self, events: Sequence[Note]) -> list[Drawing]:
+    def events(self, session_notes: Sequence[Note]) -> list[Drawing]:
         """Return functions that add events to the log in the window."""
-        if not events:
+        if not session_notes:
             return []
-        self._notes.extend(events)
+        self._notes.extend(session_notes)
         return [
-            *(partial(send_note, note=note) for note in events),
-            self._draw_recent_events(max(self._t_ns, events[-1].t_ns)),
+            *(partial(send_note, note=note) for note in session_notes),
+            self._draw_recent_events(max(self._t_ns, session_notes[-1].t_ns)),
         ]
 
-    def touches(self, touches: Sequence[Mapping[str, Any]]) -> list[Drawing]:
-        """Return functions that draw touches (JSON documents), which replace earlier estimates."""
-        drawings_of_touches = {touch["number"]: self._antenna.touch(touch) for touch in touches}
-        self._touches |= drawings_of_touches
-        return [drawing for drawings in drawings_of_touches.values() for drawing in drawings]
+    def touches(self, touch_documents: Sequence[Mapping[str, Any]]) -> list[Drawing]:
+        """Return functions that draw touches of the beam (JSON documents).
 
-    def fit(self, fit: Mapping[str, Any]) -> list[Drawing]:
+        A touch replaces an earlier estimate with the same number.
+        """
+        drawings_of_touches = {
+            touch_document["number"]: self._antenna.touch(touch_document)
+            for touch_document in touch_documents
+        }
+        self._touches |= drawings_of_touches
+        return [
+            touch_drawing for drawings in drawings_of_touches.values() for touch_drawing in drawings
+        ]
+
+    def fit(self, fit_document: Mapping[str, Any]) -> list[Drawing]:
         """Return functions that draw a fit (JSON document) of the record so far."""
-        self._fit = fit
-        self._fits.append(fit_record(fit, self._subject.fit_modes or 0))
+        self._fit = fit_document
+        self._fits.append(fit_record(fit_document, self._subject.fit_modes or 0))
         return self._draw_fits(self._fits[-1])
 
-    def state(self, t_ns: int, state: BannerState) -> list[Drawing]:
+    def state(self, t_ns: int, banner_state: BannerState) -> list[Drawing]:
         """Return functions that draw a new state of the session; none if it is unchanged.
 
         Parameters
         ----------
         t_ns
             Time since the session's start.
-        state
+        banner_state
             State of the session.
         """
-        if state == self._state:
+        if banner_state == self._state:
             return []
-        self._state, self._health_ns = state, max(self._health_ns, t_ns)
+        self._state, self._health_ns = banner_state, max(self._health_ns, t_ns)
         return self._draw_banner()
 
-    def health(self, t_ns: int, health: Health) -> list[Drawing]:
-        """Return functions that draw a health reading.
+    def health(self, t_ns: int, health_reading: Health) -> list[Drawing]:
+        """Return functions that draw the condition of loop, recorder, disk and bus at one time.
 
         Parameters
         ----------
         t_ns
             Time since the session's start.
-        health
+        health_reading
             Health reading, which arrives a few times per second.
         """
-        self._health, self._health_ns = health, t_ns
+        self._health, self._health_ns = health_reading, t_ns
         drawings: list[Drawing] = [
-            *self._plot(HEALTH, health_record(t_ns, health)),
-            partial(send_summary, subject=self._subject, t_ns=t_ns, health=health),
+            *self._plot(HEALTH, health_record(t_ns, health_reading)),
+            partial(send_summary, subject=self._subject, t_ns=t_ns, health=health_reading),
             *self._draw_banner(),
         ]
         self._peaks_are_drawn = True
@@ -213,12 +229,12 @@ class Scene:
             *self._draw_charts(),
         ]
 
-    def _draw_fits(self, records: Records) -> list[Drawing]:
+    def _draw_fits(self, fit_records: Records) -> list[Drawing]:
         """Return functions that draw records of fits and the table of the last fit."""
         if self._subject.fit_modes is None:
             return []
-        source = self._fit_source
-        plot_drawings = [] if source is None else self._plot(source, records)
+        record_source = self._fit_source
+        plot_drawings = [] if record_source is None else self._plot(record_source, fit_records)
         return [*plot_drawings, partial(send_table, fit=self._fit)]
 
     def _draw_samples(self, samples: Records | None) -> list[Drawing]:
@@ -236,21 +252,25 @@ class Scene:
 
     def _update_peaks(self, samples: Records) -> None:
         """Update the largest magnitude of each signal since the gauges were last drawn."""
-        peaks = self._gauges.take(samples)
+        largest_magnitudes = self._gauges.take(samples)
         if not self._peaks_are_drawn:
-            peaks = {
-                name: _gauge_with_larger_value(gauge, self._peaks.get(name))
-                for name, gauge in peaks.items()
+            largest_magnitudes = {
+                signal_name: _gauge_with_larger_value(gauge, self._peaks.get(signal_name))
+                for signal_name, gauge in largest_magnitudes.items()
             }
-        self._peaks, self._peaks_are_drawn = peaks, False
+        self._peaks, self._peaks_are_drawn = largest_magnitudes, False
 
     def _draw_banner(self) -> list[Drawing]:
         """Return functions that draw the session's state and its gauges."""
-        subject, t_ns, health = self._subject, self._health_ns, self._health
-        gauge_of_missed_ticks = banner.missed_gauge(subject, t_ns, health)
+        subject, t_ns, health_reading = self._subject, self._health_ns, self._health
+        gauge_of_missed_ticks = banner.missed_gauge(subject, t_ns, health_reading)
         return [
             partial(
-                banner.send_banner, subject=subject, state=self._state, t_ns=t_ns, health=health
+                banner.send_banner,
+                subject=subject,
+                state=self._state,
+                t_ns=t_ns,
+                health=health_reading,
             ),
             partial(
                 banner.send_values,
@@ -264,24 +284,27 @@ class Scene:
         """Return the function that draws the newest events as a document."""
         return partial(send_recent, t_ns=t_ns, notes=tuple(self._notes))
 
-    def _draw_timings(self, timings: Records | None) -> list[Drawing]:
+    def _draw_timings(self, tick_timings: Records | None) -> list[Drawing]:
         """Return functions that plot the ages of readings; none if no block of them is complete."""
-        return [] if timings is None else self._plot(READINGS, timings)
+        return [] if tick_timings is None else self._plot(READINGS, tick_timings)
 
-    def _plot(self, source: Source, records: Records) -> list[Drawing]:
+    def _plot(self, record_source: Source, records: Records) -> list[Drawing]:
         """Return functions that plot the records of a source over time."""
-        t_ns, columns = records["t_ns"].astype(np.int64), source.columns(records)
+        t_ns, plot_values = records["t_ns"].astype(np.int64), record_source.columns(records)
         return [
-            partial(send_columns, entity=source.entity, t_ns=t_ns, columns=columns),
-            *self._scales[source].draw(t_ns, columns),
+            partial(send_columns, entity=record_source.entity, t_ns=t_ns, columns=plot_values),
+            *self._scales[record_source].draw(t_ns, plot_values),
         ]
 
     def _draw_charts(self) -> list[Drawing]:
         """Return functions that draw the frequency response and the spectrogram so far."""
         drawings: list[Drawing] = []
-        if not self._response_is_final and (estimate := self._response.estimate()) is not None:
-            self.response_charts.update(self._t_ns, estimate)
-            self._response_is_final = estimate.final
+        if (
+            not self._response_is_final
+            and (response_estimate := self._response.estimate()) is not None
+        ):
+            self.response_charts.update(self._t_ns, response_estimate)
+            self._response_is_final = response_estimate.final
         # Drawn again even if final: the last drawing may have been dropped.
         drawings.append(self.response_charts.draw)
         if self._columns:
@@ -291,15 +314,15 @@ class Scene:
         return drawings
 
 
-def _gauge_with_larger_value(gauge: Gauge, other: Gauge | None) -> Gauge:
+def _gauge_with_larger_value(gauge: Gauge, earlier_gauge: Gauge | None) -> Gauge:
     """Return the gauge with the larger value; an unknown value counts as the smallest."""
-    if other is None or other.value is None:
+    if earlier_gauge is None or earlier_gauge.value is None:
         return gauge
-    return other if gauge.value is None or other.value > gauge.value else gauge
+    return earlier_gauge if gauge.value is None or earlier_gauge.value > gauge.value else gauge
 
 
 class _PeriodicTimer:
-    """Timer in session time: a call returns True once per period."""
+    """Timer in session time: a call with the time in ns returns True once per period."""
 
     def __init__(self, period_s: float) -> None:
         self._period_ns = round(1e9 * period_s)
@@ -319,15 +342,15 @@ class _BlockBuffer:
         self._ticks = max(1, round(_LEAST_BLOCK_S * rate_hz))
         self._parts: list[Records] = []
 
-    def add(self, records: Records) -> Records | None:
+    def add(self, new_records: Records) -> Records | None:
         """Add records (n,); return all buffered records once they span a block, else None."""
-        if len(records) == 0:
+        if len(new_records) == 0:
             return None
-        self._parts.append(records)
-        span_ticks = int(records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
+        self._parts.append(new_records)
+        span_ticks = int(new_records["tick"][-1]) - int(self._parts[0]["tick"][0]) + 1
         return self.take_remaining() if span_ticks >= self._ticks else None
 
     def take_remaining(self) -> Records | None:
-        """Return and remove the records that are still stored; None if there are none."""
-        parts, self._parts = self._parts, []
-        return np.concatenate(parts) if parts else None
+        """Return and remove the records that are still in the buffer; None if there are none."""
+        stored_blocks, self._parts = self._parts, []
+        return np.concatenate(stored_blocks) if stored_blocks else None

@@ -109,8 +109,8 @@ class Subject:
         """
         if self.sweep_hz is None:
             return None
-        segments = {"sweep": self.sweep} | ({} if self.back is None else {"back": self.back})
-        return sweep_frequency_hz(segments, self.sweep_hz, tick)
+        sweep_segments = {"sweep": self.sweep} | ({} if self.back is None else {"back": self.back})
+        return sweep_frequency_hz(sweep_segments, self.sweep_hz, tick)
 
 
 def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
@@ -123,23 +123,27 @@ def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
     """
     # After its scan, the segments of a search do not sweep the band. The first of two sweeps is the
     # same as the only sweep of other chirps.
-    return next(segments[name] for name in ("scan", "there", "sweep") if name in segments)
+    return next(
+        segments[segment_name]
+        for segment_name in ("scan", "there", "sweep")
+        if segment_name in segments
+    )
 
 
 def linear_sweep_band_hz(
-    kind: str, parameters: Mapping[str, float | int | str]
+    excitation_kind: str, excitation_parameters: Mapping[str, float | int | str]
 ) -> tuple[float, float] | None:
     """Return the frequencies at the start and end of a linear sweep; None for other excitations.
 
     Parameters
     ----------
-    kind, parameters
+    excitation_kind, excitation_parameters
         Name of the excitation and its parameters, as numbers or as texts of a session file.
     """
-    if kind != "chirp":
+    if excitation_kind != "chirp":
         return None
     try:
-        return float(parameters["start_hz"]), float(parameters["stop_hz"])
+        return float(excitation_parameters["start_hz"]), float(excitation_parameters["stop_hz"])
     except (KeyError, ValueError):
         return None
 
@@ -163,18 +167,20 @@ class Note:
     message: str
 
 
-def outcome_note(t_ns: int, outcome: str, reason: str) -> Note:
+def outcome_note(t_ns: int, outcome_name: str, outcome_reason: str) -> Note:
     """Return the last log line of a session, which states its outcome.
 
     Parameters
     ----------
     t_ns
         Time of the last sample since the start of the session.
-    outcome, reason
+    outcome_name, outcome_reason
         Outcome of the session ("complete", "stopped", "fault") and the reason for it.
     """
     return Note(
-        t_ns, _LEVEL_OF_OUTCOME.get(outcome, "warning"), f"Outcome: {outcome}. {reason}".rstrip()
+        t_ns,
+        _LEVEL_OF_OUTCOME.get(outcome_name, "warning"),
+        f"Outcome: {outcome_name}. {outcome_reason}".rstrip(),
     )
 
 
@@ -228,8 +234,10 @@ HEALTH_DTYPE: Final = np.dtype([("t_ns", "<i8")] + [(each.name, "<f8") for each 
 
 def health_record(t_ns: int, health: Health) -> npt.NDArray[Any]:
     """Return a health reading as an array (1,) of ``HEALTH_DTYPE``."""
-    values = (np.nan if value is None else value for value in astuple(health))
-    return np.array([(t_ns, *values)], HEALTH_DTYPE)
+    health_values = (
+        np.nan if health_value is None else health_value for health_value in astuple(health)
+    )
+    return np.array([(t_ns, *health_values)], HEALTH_DTYPE)
 
 
 _RERUN_LEVELS: Final = {
@@ -248,26 +256,30 @@ def send_note(stream: "RecordingStream", note: "Note") -> None:
 
     # The time has milliseconds only, because more digits are hard to read.
     stream.set_time(TIMELINE, duration=1e-3 * round(1e-6 * note.t_ns))
-    text = "\n".join(
-        line
+    wrapped_text = "\n".join(
+        wrapped_line
         for paragraph in note.message.splitlines()
-        for line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
+        for wrapped_line in wrap(paragraph, _LOG_WIDTH_CHARACTERS) or [""]
     )
-    stream.log(EVENTS_ENTITY, rr.TextLog(text, level=_RERUN_LEVELS.get(note.level, "INFO")))
+    stream.log(EVENTS_ENTITY, rr.TextLog(wrapped_text, level=_RERUN_LEVELS.get(note.level, "INFO")))
 
 
 def send_recent(stream: "RecordingStream", t_ns: int, notes: "Sequence[Note]") -> None:
-    """Send the newest of `notes`, which are in order of time, as a document with wrapped lines."""
+    """Send the newest lines of the session's log to Rerun as a document with wrapped lines.
+
+    `notes` are in order of time.
+    """
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    lines = []
-    for note in reversed(notes[-_MOST_RECENT_EVENTS:]):
-        time_s = max(0.0, 1e-9 * note.t_ns)  # the first event may come a tick early
-        symbol = _LEVEL_PREFIXES.get(note.level, "")
-        lines.append(f"**{time_s:.1f} s** {symbol}{plain(note.message)}")
+    document_lines = []
+    for log_note in reversed(notes[-_MOST_RECENT_EVENTS:]):
+        time_s = max(0.0, 1e-9 * log_note.t_ns)  # the first event may come a tick early
+        level_prefix = _LEVEL_PREFIXES.get(log_note.level, "")
+        document_lines.append(f"**{time_s:.1f} s** {level_prefix}{plain(log_note.message)}")
     stream.log(
-        RECENT_EVENTS_ENTITY, rr.TextDocument("\n\n".join(lines), media_type=rr.MediaType.MARKDOWN)
+        RECENT_EVENTS_ENTITY,
+        rr.TextDocument("\n\n".join(document_lines), media_type=rr.MediaType.MARKDOWN),
     )
 
 
@@ -279,15 +291,15 @@ def plain(text: str) -> str:
     text
         Text from an operator or a process.
     """
-    escaped = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
-    return escaped.replace("\n", "  \n")
+    escaped_text = "".join(f"\\{c}" if c in r"\`*_{}[]<>#|~$" else c for c in text)
+    return escaped_text.replace("\n", "  \n")
 
 
 def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
     """Return a Markdown table of the session's progress and health, without unknown values."""
     elapsed_s = 1e-9 * t_ns
     total_s = subject.ticks / subject.rate_hz
-    rows = [
+    table_rows = [
         ("rate", _number_text(health.rate_hz, "{:.1f} Hz"), True),
         ("missed ticks", _number_text(health.missed_ticks), not health.missed_ticks),
         ("late ticks", _number_text(health.late_ticks), not health.late_ticks),
@@ -299,13 +311,13 @@ def summary(subject: "Subject", t_ns: int, health: "Health") -> str:
         ("sensor status", _sensor_status_text(health.sensor_status), not health.sensor_status),
         ("free on the disk", _disk_space_text(health.disk_free_mb), True),
     ]
-    lines = [
-        f"| {name} | {text if is_normal else f'⚠ **{text}**'} |"
-        for name, text, is_normal in rows
-        if text
+    table_lines = [
+        f"| {row_name} | {value_text if is_normal else f'⚠ **{value_text}**'} |"
+        for row_name, value_text, is_normal in table_rows
+        if value_text
     ]
     session_row = f"| session | {elapsed_s:.0f} of {total_s:.0f} s |"
-    return "\n".join([session_row, "|---|---|", *lines])
+    return "\n".join([session_row, "|---|---|", *table_lines])
 
 
 def send_summary(
@@ -315,13 +327,13 @@ def send_summary(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    text = summary(subject, t_ns, health)
-    stream.log(SUMMARY_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    summary_text = summary(subject, t_ns, health)
+    stream.log(SUMMARY_ENTITY, rr.TextDocument(summary_text, media_type=rr.MediaType.MARKDOWN))
 
 
-def _number_text(value: float | None, number_format: str = "{:.0f}") -> str:
+def _number_text(number: float | None, number_format: str = "{:.0f}") -> str:
     """Return a number as text; an empty text for an unknown one."""
-    return "" if value is None else number_format.format(value)
+    return "" if number is None else number_format.format(number)
 
 
 def _sensor_status_text(status_word: float | None) -> str:

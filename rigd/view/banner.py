@@ -93,16 +93,18 @@ def preparing(activity: str = "") -> BannerState:
     return BannerState("PREPARING", ORANGE, activity)
 
 
-def ended(outcome: str, reason: str) -> BannerState:
+def ended(outcome_name: str, end_reason: str) -> BannerState:
     """Return the banner's state for a session that is over.
 
     Parameters
     ----------
-    outcome, reason
+    outcome_name, end_reason
         Outcome of the session and the reason for it. An empty outcome means unknown.
     """
-    state_name = outcome.upper() or "ENDED"
-    return BannerState(state_name, _COLOR_OF_OUTCOME.get(outcome, ORANGE), reason, over=True)
+    state_name = outcome_name.upper() or "ENDED"
+    return BannerState(
+        state_name, _COLOR_OF_OUTCOME.get(outcome_name, ORANGE), end_reason, over=True
+    )
 
 
 # State in words
@@ -126,26 +128,28 @@ def banner(subject: "Subject", state: BannerState, t_ns: int, health: "Health") 
     heading = f"# {'Recorded: ' if subject.recorded else ''}{state.word}"
     if state is RUNNING and remaining_s > 0.0:
         heading += f" · {math.ceil(remaining_s)} s left"
-    lines = [heading]
+    banner_lines = [heading]
     if state.reason:
-        lines.append(f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason))
-    if not state.over and health.missed_ticks:
-        percentage = 100.0 * health.missed_ticks / max(1e-9 * t_ns * subject.rate_hz, 1.0)
-        lines.append(
-            f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({percentage:.2g} %)."
+        banner_lines.append(
+            f"**{plain(state.reason)}**" if state.color == RED else plain(state.reason)
         )
-    description = f"**{plain(subject.excitation or 'session')}**"
+    if not state.over and health.missed_ticks:
+        missed_percent = 100.0 * health.missed_ticks / max(1e-9 * t_ns * subject.rate_hz, 1.0)
+        banner_lines.append(
+            f"Computer overloaded: {health.missed_ticks:.0f} ticks missed ({missed_percent:.2g} %)."
+        )
+    excitation_text = f"**{plain(subject.excitation or 'session')}**"
     if subject.sweep_hz is not None:
         start_hz, stop_hz = subject.sweep_hz
-        way_back = "" if subject.back is None else f" → {start_hz:g}"
-        description += f" {start_hz:g} → {stop_hz:g}{way_back} Hz"
-    tick = round(1e-9 * t_ns * subject.rate_hz)
-    if not state.over and (frequency_hz := subject.frequency_hz(tick)) is not None:
-        description += f", now **{frequency_hz:.3g} Hz**"
+        back_sweep_text = "" if subject.back is None else f" → {start_hz:g}"
+        excitation_text += f" {start_hz:g} → {stop_hz:g}{back_sweep_text} Hz"
+    sweep_tick = round(1e-9 * t_ns * subject.rate_hz)
+    if not state.over and (frequency_hz := subject.frequency_hz(sweep_tick)) is not None:
+        excitation_text += f", now **{frequency_hz:.3g} Hz**"
     if subject.specimen:
-        description += f", specimen **{plain(subject.specimen)}**"
-    lines.append(f"{description}, session {plain(subject.name)}")
-    return "\n\n".join(lines)
+        excitation_text += f", specimen **{plain(subject.specimen)}**"
+    banner_lines.append(f"{excitation_text}, session {plain(subject.name)}")
+    return "\n\n".join(banner_lines)
 
 
 def send_banner(
@@ -169,8 +173,8 @@ def send_banner(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    text = banner(subject, state, t_ns, health)
-    stream.log(STATE_ENTITY, rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN))
+    banner_text = banner(subject, state, t_ns, health)
+    stream.log(STATE_ENTITY, rr.TextDocument(banner_text, media_type=rr.MediaType.MARKDOWN))
 
 
 # Values with their limits
@@ -219,27 +223,27 @@ def missed_gauge(subject: "Subject", t_ns: int, health: "Health") -> Gauge:
     """
     scheduled_ticks = max(1e-9 * t_ns, 10.0) * subject.rate_hz
     missed_ticks = health.missed_ticks
-    percentage = None if missed_ticks is None else 100.0 * missed_ticks / scheduled_ticks
-    return Gauge(percentage, subject.limits.get("missed"), "%")
+    missed_percent = None if missed_ticks is None else 100.0 * missed_ticks / scheduled_ticks
+    return Gauge(missed_percent, subject.limits.get("missed"), "%")
 
 
-def gauge_text(label: str, gauge: Gauge) -> str:
+def gauge_text(gauge_label: str, gauge: Gauge) -> str:
     """Return the text of a gauge, such as ``speed 1.05 of 15 rad/s``.
 
     Parameters
     ----------
-    label
+    gauge_label
         Label of the signal.
     gauge
         Value and limit of the signal.
     """
     if gauge.value is None:
-        return f"{label} unknown"
+        return f"{gauge_label} unknown"
     if gauge.limit is None:
-        return f"{label} {gauge.value:.3g} {gauge.unit}"
+        return f"{gauge_label} {gauge.value:.3g} {gauge.unit}"
     # The resolution is a thousandth of the limit, with a constant number of digits.
     digits = max(0, 3 - math.floor(math.log10(gauge.limit)))
-    return f"{label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
+    return f"{gauge_label} {gauge.value:.{digits}f} of {gauge.limit:.3g} {gauge.unit}"
 
 
 def gauge_color(gauge: Gauge) -> Color:
@@ -250,10 +254,10 @@ def gauge_color(gauge: Gauge) -> Color:
     gauge
         Value and limit of the signal.
     """
-    fraction = gauge.fraction
-    if fraction is None:
+    limit_fraction = gauge.fraction
+    if limit_fraction is None:
         return GREY
-    return RED if fraction >= 1.0 else ORANGE if fraction >= WARNING_FRACTION else GREEN
+    return RED if limit_fraction >= 1.0 else ORANGE if limit_fraction >= WARNING_FRACTION else GREEN
 
 
 def send_values(
@@ -275,37 +279,41 @@ def send_values(
     import rerun as rr
 
     stream.set_time(TIMELINE, duration=1e-9 * t_ns)
-    width, _ = SIZE
-    lines, colors, radii = [[[0.0, 8.0], [width, 8.0]]], [state.color], [_BAND_HEIGHT_PT / 2]
-    label_positions, labels, label_colors = [], [], []
-    for index, (name, label) in enumerate(_GAUGE_LABELS.items()):
-        gauge = gauges.get(name)
+    canvas_width, _ = SIZE
+    bar_lines, bar_colors, bar_radii = (
+        [[[0.0, 8.0], [canvas_width, 8.0]]],
+        [state.color],
+        [_BAND_HEIGHT_PT / 2],
+    )
+    label_positions, label_texts, label_colors = [], [], []
+    for gauge_index, (signal_name, gauge_label) in enumerate(_GAUGE_LABELS.items()):
+        gauge = gauges.get(signal_name)
         if gauge is None:
             continue
-        column, row = divmod(index, _GAUGES_PER_COLUMN)
-        x, y = column * (width / 2 + 10.0), _FIRST_ROW_Y_PT + row * _ROW_HEIGHT_PT
-        text, color = gauge_text(label, gauge), gauge_color(gauge)
+        gauge_column, row = divmod(gauge_index, _GAUGES_PER_COLUMN)
+        x, y = gauge_column * (canvas_width / 2 + 10.0), _FIRST_ROW_Y_PT + row * _ROW_HEIGHT_PT
+        value_text, bar_color = gauge_text(gauge_label, gauge), gauge_color(gauge)
         # Rerun centres a label, whose width is not known here.
         label_positions.append([x + _GAUGE_TEXT_WIDTH_PT / 2, y - LABEL_DROP])
-        labels.append(text)
-        label_colors.append(GREY if color == GREEN else color)
+        label_texts.append(value_text)
+        label_colors.append(GREY if bar_color == GREEN else bar_color)
         bar_left = x + _GAUGE_TEXT_WIDTH_PT
         if gauge.fraction is not None:
             bar_end = bar_left + _BAR_WIDTH_PT * min(gauge.fraction, 1.0)
-            lines += [
+            bar_lines += [
                 [[bar_left, y], [bar_left + _BAR_WIDTH_PT, y]],
                 [[bar_left, y], [bar_end, y]],
             ]
-            colors += [_EMPTY_BAR_COLOR, color]
-            radii += [_BAR_HEIGHT_PT / 2] * 2
+            bar_colors += [_EMPTY_BAR_COLOR, bar_color]
+            bar_radii += [_BAR_HEIGHT_PT / 2] * 2
     stream.log(
         f"{GAUGES_ENTITY}/bars",
-        rr.LineStrips2D(lines, colors=colors, radii=rr.Radius.ui_points(radii)),
+        rr.LineStrips2D(bar_lines, colors=bar_colors, radii=rr.Radius.ui_points(bar_radii)),
     )
     stream.log(
         f"{GAUGES_ENTITY}/texts",
         rr.Points2D(
-            label_positions, labels=labels, colors=label_colors, radii=0.0, show_labels=True
+            label_positions, labels=label_texts, colors=label_colors, radii=0.0, show_labels=True
         ),
     )
 
@@ -314,12 +322,14 @@ def views() -> "tuple[rrb.View, rrb.View]":
     """Return Rerun's views of the session's state and of the gauges."""
     import rerun.blueprint as rrb
 
-    width, height = SIZE
+    canvas_width, canvas_height = SIZE
     return (
         rrb.TextDocumentView(name="State", origin=STATE_ENTITY),
         rrb.Spatial2DView(
             name="Values and limits",
             origin=GAUGES_ENTITY,
-            visual_bounds=rrb.VisualBounds2D(x_range=[0.0, width], y_range=[0.0, height]),
+            visual_bounds=rrb.VisualBounds2D(
+                x_range=[0.0, canvas_width], y_range=[0.0, canvas_height]
+            ),
         ),
     )

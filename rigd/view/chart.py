@@ -69,16 +69,20 @@ class Axis:
     lines: tuple[float, ...] = ()
     logarithmic: bool = False
 
-    def fraction(self, values: npt.ArrayLike) -> Real:
+    def fraction(self, axis_values: npt.ArrayLike) -> Real:
         """Return positions on the axis, from 0 (first value) to 1 (last value), clipped."""
-        positions, first, last = np.asarray(values, dtype=np.float64), self.first, self.last
+        axis_positions, axis_start, axis_end = (
+            np.asarray(axis_values, dtype=np.float64),
+            self.first,
+            self.last,
+        )
         if self.logarithmic:
-            positions, first, last = (
-                np.log(np.maximum(positions, first)),
-                np.log(first),
-                np.log(last),
+            axis_positions, axis_start, axis_end = (
+                np.log(np.maximum(axis_positions, axis_start)),
+                np.log(axis_start),
+                np.log(axis_end),
             )
-        return np.clip((positions - first) / (last - first), 0.0, 1.0)
+        return np.clip((axis_positions - axis_start) / (axis_end - axis_start), 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,20 +150,32 @@ class Chart:
         x, y
             Values on the horizontal and on the vertical axis, shape (n,).
         """
-        left, top, right, bottom = self.frame
-        x_fraction, up = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
-        return np.stack([left + (right - left) * x_fraction, bottom - (bottom - top) * up], axis=-1)
+        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        x_fraction, y_fraction = np.broadcast_arrays(self.x.fraction(x), self.y.fraction(y))
+        return np.stack(
+            [
+                frame_left + (frame_right - frame_left) * x_fraction,
+                frame_bottom - (frame_bottom - frame_top) * y_fraction,
+            ],
+            axis=-1,
+        )
 
     def draw_frame(self, stream: "RecordingStream") -> None:
         """Send the static parts of the chart: frame, grid, tick labels, titles and legend."""
         import rerun as rr
 
-        left, top, right, bottom = self.frame
-        corners = [[left, top], [right, top], [right, bottom], [left, bottom], [left, top]]
+        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_corners = [
+            [frame_left, frame_top],
+            [frame_right, frame_top],
+            [frame_right, frame_bottom],
+            [frame_left, frame_bottom],
+            [frame_left, frame_top],
+        ]
         stream.log(
             f"{self.entity}/frame",
             rr.LineStrips2D(
-                [corners], colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=1.0
+                [frame_corners], colors=[GREY], radii=rr.Radius.ui_points(0.5), draw_order=1.0
             ),
             static=True,
         )
@@ -169,13 +185,21 @@ class Chart:
 
     def tick_labels(self) -> list[tuple[str, float, float]]:
         """Return the text of each tick label and the canvas coordinates of its middle."""
-        left, _, _, bottom = self.frame
+        frame_left, _, _, frame_bottom = self.frame
         return [
-            (tick_text(tick), float(self.to_canvas(tick, self.y.first)[0]), bottom + 14.0)
-            for tick in self.x.ticks
+            (
+                tick_text(tick_value),
+                float(self.to_canvas(tick_value, self.y.first)[0]),
+                frame_bottom + 14.0,
+            )
+            for tick_value in self.x.ticks
         ] + [
-            (tick_text(tick), left - 26.0, float(self.to_canvas(self.x.first, tick)[1]))
-            for tick in self.y.ticks
+            (
+                tick_text(tick_value),
+                frame_left - 26.0,
+                float(self.to_canvas(self.x.first, tick_value)[1]),
+            )
+            for tick_value in self.y.ticks
         ]
 
     def draw_curve(
@@ -187,7 +211,7 @@ class Chart:
         *,
         static: bool = False,
         dotted: bool = False,
-        order: int = 0,
+        curve_order: int = 0,
     ) -> None:
         """Draw a curve as separate lines, one through each strip of points (n, 2).
 
@@ -200,13 +224,15 @@ class Chart:
             Whether the curve never changes. Static curves lie beneath all others.
         dotted
             Whether to draw points only, because a line between them would have no meaning.
-        order
+        curve_order
             Position in the stack of static curves or of other curves; higher numbers lie above.
         """
         import rerun as rr
 
-        canvas_strips = [self.to_canvas(strip[:, 0], strip[:, 1]) for strip in strips]
-        draw_order = (20.0 if static else 30.0) + order
+        canvas_strips = [
+            self.to_canvas(curve_strip[:, 0], curve_strip[:, 1]) for curve_strip in strips
+        ]
+        draw_order = (20.0 if static else 30.0) + curve_order
         drawn_curve = (
             rr.Points2D(
                 np.concatenate(canvas_strips or [np.zeros((0, 2))]),
@@ -224,35 +250,35 @@ class Chart:
         )
         stream.log(f"{self.entity}/{name}", drawn_curve, static=static)
 
-    def draw_note(self, stream: "RecordingStream", text: str, color: Color) -> None:
+    def draw_note(self, stream: "RecordingStream", note_text: str, text_color: Color) -> None:
         """Write a text into the middle of the frame; an empty text removes the previous text.
 
         Parameters
         ----------
         stream
             Recording to draw into.
-        text
+        note_text
             Text to show.
-        color
+        text_color
             Colour of the text.
         """
         import rerun as rr
 
-        left, top, right, bottom = self.frame
-        middle = [(left + right) / 2, (top + bottom) / 2 - LABEL_DROP]
+        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_middle = [(frame_left + frame_right) / 2, (frame_top + frame_bottom) / 2 - LABEL_DROP]
         stream.log(
             f"{self.entity}/note",
             rr.Points2D(
-                [middle] if text else [],
-                labels=[text] if text else [],
-                colors=[color],
+                [frame_middle] if note_text else [],
+                labels=[note_text] if note_text else [],
+                colors=[text_color],
                 radii=0.0,
                 show_labels=True,
                 draw_order=40.0,
             ),
         )
 
-    def draw_shade(self, stream: "RecordingStream", name: str) -> None:
+    def draw_shade(self, stream: "RecordingStream", shade_name: str) -> None:
         """Send the image of a shaded area, which `move_shade` then moves to its position.
 
         It is an image, because Rerun's views fill no other shapes.
@@ -261,17 +287,17 @@ class Chart:
         ----------
         stream
             Recording to draw into.
-        name
+        shade_name
             Name of the shaded area under the chart's entity path.
         """
         import rerun as rr
 
-        pixel = np.array([[GREY]], dtype=np.uint8)
+        grey_pixel = np.array([[GREY]], dtype=np.uint8)
         stream.log(
-            f"{self.entity}/{name}",
+            f"{self.entity}/{shade_name}",
             # Rerun supports opacity for images only.
             rr.Image(
-                bytes=pixel.tobytes(),
+                bytes=grey_pixel.tobytes(),
                 width=1,
                 height=1,
                 color_model="RGB",
@@ -281,44 +307,50 @@ class Chart:
             static=True,
         )
 
-    def move_shade(self, stream: "RecordingStream", name: str, first: float, last: float) -> None:
+    def move_shade(
+        self, stream: "RecordingStream", shade_name: str, first_x: float, last_x: float
+    ) -> None:
         """Move a shaded area so that it lies between two values of the horizontal axis.
 
         Parameters
         ----------
         stream
             Recording to draw into.
-        name
+        shade_name
             Name of the shaded area under the chart's entity path.
-        first, last
+        first_x, last_x
             Values of the horizontal axis at the left and right end of the area.
         """
-        _, top, _, bottom = self.frame
-        left, right = self.to_canvas([first, last], self.y.first)[:, 0]
-        self._position_shade(stream, name, (left, top, right, bottom))
+        _, frame_top, _, frame_bottom = self.frame
+        shade_left, shade_right = self.to_canvas([first_x, last_x], self.y.first)[:, 0]
+        self._position_shade(stream, shade_name, (shade_left, frame_top, shade_right, frame_bottom))
 
     def _draw_labels(self, stream: "RecordingStream") -> None:
         """Draw the tick labels, the titles of the axes and the labels of the legend."""
         import rerun as rr
 
-        left, top, right, bottom = self.frame
-        middle = (left + right) / 2
-        labels = [
+        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        frame_middle = (frame_left + frame_right) / 2
+        placed_labels = [
             *self.tick_labels(),
-            (self.y.title, left - 44.0 + _label_width(self.y.title) / 2, top - _TITLE_DISTANCE),
+            (
+                self.y.title,
+                frame_left - 44.0 + _label_width(self.y.title) / 2,
+                frame_top - _TITLE_DISTANCE,
+            ),
         ]
         if self.x.title:
-            labels.append((self.x.title, middle, bottom + 40.0))
-        labels += [
+            placed_labels.append((self.x.title, frame_middle, frame_bottom + 40.0))
+        placed_labels += [
             (key.label, x + _label_width(key.label) / 2, y)
             for key, x, y in self._legend_positions()
         ]
         stream.log(
             f"{self.entity}/labels",
             rr.Points2D(
-                [[x, y - LABEL_DROP] for _, x, y in labels],
-                labels=[text for text, _, _ in labels],
-                colors=[GREY] * (len(labels) - len(self.legend))
+                [[x, y - LABEL_DROP] for _, x, y in placed_labels],
+                labels=[label_text for label_text, _, _ in placed_labels],
+                colors=[GREY] * (len(placed_labels) - len(self.legend))
                 + [key.color for key in self.legend],
                 radii=0.0,
                 show_labels=True,
@@ -330,12 +362,20 @@ class Chart:
         """Draw dotted grid lines, since solid lines are opaque and distract from the curves."""
         import rerun as rr
 
-        left, top, right, bottom = self.frame
-        verticals = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
-        horizontals = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
+        frame_left, frame_top, frame_right, frame_bottom = self.frame
+        vertical_line_x = self.to_canvas([*self.x.ticks, *self.x.lines], self.y.first)[:, 0]
+        horizontal_line_y = self.to_canvas(self.x.first, [*self.y.ticks, *self.y.lines])[:, 1]
         dot_positions = [
-            *([x, y] for x in verticals for y in np.arange(bottom, top, -_DOT_SPACING)),
-            *([x, y] for y in horizontals for x in np.arange(left, right, _DOT_SPACING)),
+            *(
+                [x, y]
+                for x in vertical_line_x
+                for y in np.arange(frame_bottom, frame_top, -_DOT_SPACING)
+            ),
+            *(
+                [x, y]
+                for y in horizontal_line_y
+                for x in np.arange(frame_left, frame_right, _DOT_SPACING)
+            ),
         ]
         stream.log(
             f"{self.entity}/grid",
@@ -349,7 +389,9 @@ class Chart:
         """Draw the lines and shaded areas of the legend."""
         import rerun as rr
 
-        line_entries = [entry for entry in self._legend_positions() if not entry[0].is_area]
+        line_entries = [
+            legend_entry for legend_entry in self._legend_positions() if not legend_entry[0].is_area
+        ]
         if line_entries:
             stream.log(
                 f"{self.entity}/legend",
@@ -362,60 +404,61 @@ class Chart:
             )
         for key, x, y in self._legend_positions():
             if key.is_area:
-                name = f"legend/{key.label.replace(' ', '_')}"
-                self.draw_shade(stream, name)
+                shade_name = f"legend/{key.label.replace(' ', '_')}"
+                self.draw_shade(stream, shade_name)
                 self._position_shade(
-                    stream, name, (x - 28.0, y - 7.0, x - 10.0, y + 7.0), static=True
+                    stream, shade_name, (x - 28.0, y - 7.0, x - 10.0, y + 7.0), static=True
                 )
 
     def _position_shade(
         self,
         stream: "RecordingStream",
-        name: str,
-        corners: tuple[float, float, float, float],
+        shade_name: str,
+        rectangle_edges: tuple[float, float, float, float],
         *,
         static: bool = False,
     ) -> None:
         """Move a shaded area to the rectangle (left, top, right, bottom) on the canvas."""
         import rerun as rr
 
-        left, top, right, bottom = corners
+        left_edge, top_edge, right_edge, bottom_edge = rectangle_edges
         stream.log(
-            f"{self.entity}/{name}",
+            f"{self.entity}/{shade_name}",
             rr.Transform3D.from_fields(
-                translation=[left, top, 0.0], scale=[right - left, bottom - top, 1.0]
+                translation=[left_edge, top_edge, 0.0],
+                scale=[right_edge - left_edge, bottom_edge - top_edge, 1.0],
             ),
             static=static,
         )
 
     def _legend_positions(self) -> list[tuple[LegendEntry, float, float]]:
         """Return the legend's entries with positions above the frame, aligned to the right."""
-        _, top, right, _ = self.frame
-        entries = []
-        x = right
+        _, frame_top, right_edge, _ = self.frame
+        placed_entries = []
+        x = right_edge
         for key in reversed(self.legend):
             x -= _label_width(key.label)
-            entries.append((key, x, top - _TITLE_DISTANCE))
+            placed_entries.append((key, x, frame_top - _TITLE_DISTANCE))
             x -= 46.0
-        return entries[::-1]
+        return placed_entries[::-1]
 
 
-def tick_text(value: float) -> str:
+def tick_text(tick_value: float) -> str:
     """Return a number as the text of a tick label, with a true minus sign."""
-    return f"{value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
+    return f"{tick_value + 0.0:.9g}".replace("-", "−")  # adding turns −0 into 0
 
 
-def _label_width(text: str) -> float:
+def _label_width(label_text: str) -> float:
     """Return the approximate width of a text in a label, in points."""
-    return _CHARACTER_WIDTH * len(text)
+    return _CHARACTER_WIDTH * len(label_text)
 
 
-def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
+def decades(first_value: float, last_value: float) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Return ticks (1, 2 and 5 in each decade) and further grid lines of a logarithmic axis.
 
     Parameters
     ----------
-    first, last
+    first_value, last_value
         Values at both ends of the axis, above 0.
 
     Examples
@@ -424,25 +467,33 @@ def decades(first: float, last: float) -> tuple[tuple[float, ...], tuple[float, 
     >>> decades(0.5, 20.0)[0]
     (0.5, 1.0, 2.0, 5.0, 10.0, 20.0)
     """
-    exponents = range(int(np.floor(np.log10(first))), int(np.ceil(np.log10(last))) + 1)
-    multiples = [
-        (digit, float(f"{digit}e{exponent}")) for exponent in exponents for digit in range(1, 10)
+    decade_exponents = range(
+        int(np.floor(np.log10(first_value))), int(np.ceil(np.log10(last_value))) + 1
+    )
+    digit_multiples = [
+        (digit, float(f"{digit}e{exponent}"))
+        for exponent in decade_exponents
+        for digit in range(1, 10)
     ]
-    multiples_in_range = [(digit, value) for digit, value in multiples if first <= value <= last]
+    multiples_in_range = [
+        (digit, multiple)
+        for digit, multiple in digit_multiples
+        if first_value <= multiple <= last_value
+    ]
     return (
-        tuple(value for digit, value in multiples_in_range if digit in (1, 2, 5)),
-        tuple(value for digit, value in multiples_in_range if digit not in (1, 2, 5)),
+        tuple(multiple for digit, multiple in multiples_in_range if digit in (1, 2, 5)),
+        tuple(multiple for digit, multiple in multiples_in_range if digit not in (1, 2, 5)),
     )
 
 
-def steps(first: float, last: float, most: int) -> tuple[float, ...]:
-    """Return at most `most` evenly spaced round values from `first` to `last`, for axis ticks.
+def steps(first_value: float, last_value: float, most_steps: int) -> tuple[float, ...]:
+    """Return at most `most_steps` evenly spaced round values within a range, for axis ticks.
 
     Parameters
     ----------
-    first, last
+    first_value, last_value
         Values at both ends of the axis.
-    most
+    most_steps
         Largest number of values.
 
     Examples
@@ -451,16 +502,19 @@ def steps(first: float, last: float, most: int) -> tuple[float, ...]:
     >>> steps(1.0, 47.0, 6)
     (10.0, 20.0, 30.0, 40.0)
     """
-    least_step = (last - first) / most
+    least_step = (last_value - first_value) / most_steps
     power_of_ten = 10.0 ** np.floor(np.log10(least_step))
-    step = next(
-        digit * power_of_ten
-        for digit in (1.0, 2.0, 5.0, 10.0)
-        if digit * power_of_ten >= least_step
+    step_size = next(
+        leading_digit * power_of_ten
+        for leading_digit in (1.0, 2.0, 5.0, 10.0)
+        if leading_digit * power_of_ten >= least_step
     )
-    first_index, last_index = np.ceil(first / step - 1e-9), np.floor(last / step + 1e-9)
-    values = step * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
-    return tuple(float(f"{value:.9g}") for value in values)
+    first_index, last_index = (
+        np.ceil(first_value / step_size - 1e-9),
+        np.floor(last_value / step_size + 1e-9),
+    )
+    step_values = step_size * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
+    return tuple(float(f"{step_value:.9g}") for step_value in step_values)
 
 
 # Decimation of curves
@@ -483,27 +537,35 @@ class CurveDecimation:
     groups: npt.NDArray[np.intp]
 
     @classmethod
-    def logarithmic(cls, grid: Real, first: float, last: float, groups: int) -> "CurveDecimation":
-        """Return the decimation with groups of equal frequency ratio; empty groups are omitted.
+    def logarithmic(
+        cls, grid: Real, first_hz: float, last_hz: float, most_groups: int
+    ) -> "CurveDecimation":
+        """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
+
+        Groups without points are omitted.
 
         Parameters
         ----------
         grid
             Frequencies of the points, increasing, shape (n,).
-        first, last
+        first_hz, last_hz
             Lowest and highest frequency. Points outside are dropped.
-        groups
+        most_groups
             Largest number of groups.
         """
-        edges = np.geomspace(first, last, groups + 1)
+        group_edges = np.geomspace(first_hz, last_hz, most_groups + 1)
         # A point at the very end belongs to the last group.
-        edges[-1] = np.nextafter(last, np.inf)
-        bounds = np.unique(np.searchsorted(grid, edges))
-        starts, sizes = bounds[:-1], np.diff(bounds)
-        offsets = np.arange(sizes.max(initial=1))  # 1 if there is no group
-        return cls(grid, starts[:, None] + np.where(offsets < sizes[:, None], offsets, 0))
+        group_edges[-1] = np.nextafter(last_hz, np.inf)
+        group_bounds = np.unique(np.searchsorted(grid, group_edges))
+        group_starts, group_sizes = group_bounds[:-1], np.diff(group_bounds)
+        index_offsets = np.arange(group_sizes.max(initial=1))  # 1 if there is no group
+        return cls(
+            grid,
+            group_starts[:, None]
+            + np.where(index_offsets < group_sizes[:, None], index_offsets, 0),
+        )
 
-    def strips(self, values: Real) -> list[Real]:
+    def strips(self, curve_values: Real) -> list[Real]:
         """Return the decimated curve as strips (p, 2) of grid value and curve value.
 
         Each strip contains the least and the greatest value of every group. A new strip begins
@@ -511,49 +573,54 @@ class CurveDecimation:
 
         Parameters
         ----------
-        values
+        curve_values
             Values of the curve on the grid, shape (n,); NaN if unknown.
         """
-        group_indices, extreme_indices = self._extremes(values)
+        group_indices, extreme_indices = self._extremes(curve_values)
         if group_indices.size == 0:
             return []
         strip_starts = np.flatnonzero(np.diff(group_indices) > 1) + 1
         return [
-            np.column_stack([self.grid[indices], values[indices]])
-            for indices in map(np.unique, np.split(extreme_indices, strip_starts))
+            np.column_stack([self.grid[strip_indices], curve_values[strip_indices]])
+            for strip_indices in map(np.unique, np.split(extreme_indices, strip_starts))
         ]
 
-    def extremes(self, values: Real) -> npt.NDArray[np.intp]:
+    def extremes(self, curve_values: Real) -> npt.NDArray[np.intp]:
         """Return the grid indices of the least and greatest value of every group, in order.
 
         Parameters
         ----------
-        values
+        curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
-        return np.unique(self._extremes(values)[1])
+        return np.unique(self._extremes(curve_values)[1])
 
-    def gaps(self, values: Real) -> npt.NDArray[np.intp]:
+    def gaps(self, curve_values: Real) -> npt.NDArray[np.intp]:
         """Return the grid indices of both ends of each gap between known values, in order.
 
         Parameters
         ----------
-        values
+        curve_values
             Values on the grid, shape (n,); NaN if unknown.
         """
-        group_indices, _ = self._extremes(values)
+        group_indices, _ = self._extremes(curve_values)
         before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
         first_indices = self.groups[group_indices[before_gaps] + 1, 0]
         last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
         return np.unique(np.concatenate([first_indices, last_indices]))
 
-    def _extremes(self, values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Return the indices of groups with known values, and of both extremes of each group."""
-        grouped_values = values[self.groups]
+    def _extremes(self, curve_values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
+        """Return the indices of groups with known values, and the grid indices of their extremes.
+
+        The extremes are the least and the greatest value, shape (groups, 2).
+        """
+        grouped_values = curve_values[self.groups]
         is_unknown = np.isnan(grouped_values)
         group_indices = np.flatnonzero(~is_unknown.all(axis=1))
         grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
         least_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
         greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
-        columns = np.stack([least_columns, greatest_columns], axis=1)
-        return group_indices, np.take_along_axis(self.groups[group_indices], columns, axis=1)
+        extreme_columns = np.stack([least_columns, greatest_columns], axis=1)
+        return group_indices, np.take_along_axis(
+            self.groups[group_indices], extreme_columns, axis=1
+        )

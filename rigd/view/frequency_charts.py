@@ -33,7 +33,9 @@ _STALE_STATUS: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
 
 
 class SweepResponse:
-    """Running estimate of the frequency response torque over angle in a sweep (Welch's method).
+    """Running estimate of the frequency response torque over motor angle in a sweep.
+
+    It is computed by Welch's method.
 
     The segments are the default ones of `analyze`.
 
@@ -43,19 +45,20 @@ class SweepResponse:
         The session.
     last_hz
         Highest frequency of the estimated response.
-    every
+    resolution_divisor
         Divisor of the FFT length that `analyze` uses. The FFT is never shorter than a segment.
     """
 
-    def __init__(self, subject: "Subject", last_hz: float, *, every: int = 1) -> None:
-        self._first, end = subject.sweep
-        samples = end - self._first
-        segmentation = segmentation_of(samples, subject.rate_hz)
+    def __init__(self, subject: "Subject", last_hz: float, *, resolution_divisor: int = 1) -> None:
+        self._first, end_tick = subject.sweep
+        sweep_sample_count = end_tick - self._first
+        segmentation = segmentation_of(sweep_sample_count, subject.rate_hz)
         segmentation = replace(
-            segmentation, nfft=max(segmentation.nfft // every, segmentation.segment_length)
+            segmentation,
+            nfft=max(segmentation.nfft // resolution_divisor, segmentation.segment_length),
         )
         self._running = RunningResponse(
-            subject.rate_hz, samples, last_hz=last_hz, segmentation=segmentation
+            subject.rate_hz, sweep_sample_count, last_hz=last_hz, segmentation=segmentation
         )
         self._at_rest: list[npt.NDArray[np.float64]] = []
         self._rest_rad: float | None = None
@@ -65,8 +68,8 @@ class SweepResponse:
 
         The samples are in order. Gaps are allowed.
         """
-        ticks = samples["tick"].astype(np.int64) - self._first
-        samples_before_sweep = int(np.searchsorted(ticks, 0))
+        sweep_ticks = samples["tick"].astype(np.int64) - self._first
+        samples_before_sweep = int(np.searchsorted(sweep_ticks, 0))
         if samples_before_sweep:
             self._at_rest.append(samples["angle_rad"][:samples_before_sweep].copy())
         if samples_before_sweep == len(samples):
@@ -79,7 +82,7 @@ class SweepResponse:
         # A stale reading is not a measurement: its gap is filled like any other.
         fresh_or_nan = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
         self._running.feed(
-            ticks[samples_before_sweep:],
+            sweep_ticks[samples_before_sweep:],
             sweep_samples["angle_reference_rad"] - self._rest_rad,
             (sweep_samples["angle_rad"] - self._rest_rad) * fresh_or_nan,
             sweep_samples["coupling_torque_nm"],
@@ -206,36 +209,42 @@ class ResponseCharts:
     ----------
     subject
         The session.
-    last
+    last_response
         Response of the last session of the specimen, which is drawn beneath the present one; None
         if there is none.
     """
 
-    def __init__(self, subject: "Subject", last: LastResponse | None = None) -> None:
-        frequency_hz, model = nominal_response(
+    def __init__(self, subject: "Subject", last_response: LastResponse | None = None) -> None:
+        frequency_hz, model_response = nominal_response(
             subject.beam, subject.damping or _ASSUMED_DAMPING, subject.tool_inertia_kg_m2
         )
-        model_db = magnitude_db(model)
-        magnitude = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
+        model_db = magnitude_db(model_response)
+        magnitude_chart_axis = magnitude_axis(model_db.min() - 3.0, model_db.max() + 6.0)
         damping_is_known = subject.damping is not None
-        extra_keys = ((MODEL_ENTRY,) if damping_is_known else ()) + (
-            (LAST_SESSION_ENTRY,) if last else ()
+        extra_entries = ((MODEL_ENTRY,) if damping_is_known else ()) + (
+            (LAST_SESSION_ENTRY,) if last_response else ()
         )
-        keys = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *extra_keys)
+        legend_entries = (MEASURED_ENTRY, UNCERTAIN_ENTRY, *extra_entries)
         # The title of the view names the quantity.
-        axis_with_short_title = replace(magnitude, title="dB re 1 N·m/rad")
+        axis_with_short_title = replace(magnitude_chart_axis, title="dB re 1 N·m/rad")
         self._response_curves = (
             *(
                 _ResponseCurve(
-                    _chart(entity, axis, *keys), MEASURED_ENTRY, _magnitude_db, magnitude_db
+                    _chart(entity_path, vertical_axis, *legend_entries),
+                    MEASURED_ENTRY,
+                    _magnitude_db,
+                    magnitude_db,
                 )
-                for entity, axis in (
+                for entity_path, vertical_axis in (
                     (OVERVIEW_MAGNITUDE_ENTITY, axis_with_short_title),
-                    (MAGNITUDE_ENTITY, magnitude),
+                    (MAGNITUDE_ENTITY, magnitude_chart_axis),
                 )
             ),
             _ResponseCurve(
-                _chart(PHASE_ENTITY, PHASE_AXIS, *keys), MEASURED_ENTRY, _phase_deg, phase_deg
+                _chart(PHASE_ENTITY, PHASE_AXIS, *legend_entries),
+                MEASURED_ENTRY,
+                _phase_deg,
+                phase_deg,
             ),
             _ResponseCurve(
                 _chart(COHERENCE_ENTITY, COHERENCE_AXIS, COHERENCE_ENTRY),
@@ -247,19 +256,21 @@ class ResponseCharts:
             "input_delay_s": subject.angle_delay_s,
             "output_delay_s": subject.torque_delay_s,
         }
-        thinning = response_decimation(frequency_hz)
-        magnitude_strips = thinning.strips(model_db)
+        decimation = response_decimation(frequency_hz)
+        magnitude_strips = decimation.strips(model_db)
         self._models = (
             {
                 OVERVIEW_MAGNITUDE_ENTITY: magnitude_strips,
                 MAGNITUDE_ENTITY: magnitude_strips,
-                PHASE_ENTITY: thinning.strips(phase_deg(model)),
+                PHASE_ENTITY: decimation.strips(phase_deg(model_response)),
             }
             if damping_is_known
             else {}
         )
         self._last_curves = (
-            {} if last is None else _last_response_curves(last, self._response_curves)
+            {}
+            if last_response is None
+            else _last_response_curves(last_response, self._response_curves)
         )
         self._thinning: CurveDecimation | None = None
         self._t_ns = 0
@@ -269,20 +280,20 @@ class ResponseCharts:
         self._excited_hz = (LAST_HZ, LAST_HZ)
         self._note = NO_COHERENCE_YET
 
-    def chart(self, entity: str) -> Chart:
+    def chart(self, entity_path: str) -> Chart:
         """Return the chart with a given entity path."""
         return next(
             response_curve.chart
             for response_curve in self._response_curves
-            if response_curve.chart.entity == entity
+            if response_curve.chart.entity == entity_path
         )
 
     def draw_frames(self, stream: "RecordingStream") -> None:
         """Send the static parts: frames, nominal model and the last session's response."""
         for response_curve in self._response_curves:
             response_curve.chart.draw_frame(stream)
-            for name in _SHADE_NAMES:
-                response_curve.chart.draw_shade(stream, name)
+            for curve_name in _SHADE_NAMES:
+                response_curve.chart.draw_shade(stream, curve_name)
             if response_curve.chart.entity in self._models:
                 response_curve.chart.draw_curve(
                     stream,
@@ -298,7 +309,7 @@ class ResponseCharts:
                     self._last_curves[response_curve.chart.entity],
                     LAST_SESSION_ENTRY,
                     static=True,
-                    order=1,
+                    curve_order=1,
                 )
 
     def update(self, t_ns: int, estimate: "RunningEstimate") -> None:
@@ -311,31 +322,38 @@ class ResponseCharts:
         estimate
             Response estimated so far.
         """
-        response = estimate.response.without_delays(**self._delays_s)
-        frequency_hz = response.frequency_hz
+        corrected_response = estimate.response.without_delays(**self._delays_s)
+        frequency_hz = corrected_response.frequency_hz
         if self._thinning is None or self._thinning.grid.size != frequency_hz.size:
             self._thinning = response_decimation(frequency_hz)
         is_excited = estimate.excited
         self._t_ns = t_ns
-        self._last_update = frequency_hz, np.where(is_excited, response.response, np.nan)
+        self._last_update = frequency_hz, np.where(is_excited, corrected_response.response, np.nan)
         is_coherent = is_excited
-        if response.coherence is not None:
-            is_coherent = is_excited & (response.coherence >= LOW_COHERENCE)
-        strips = self._thinning.strips
+        if corrected_response.coherence is not None:
+            is_coherent = is_excited & (corrected_response.coherence >= LOW_COHERENCE)
+        decimated_strips = self._thinning.strips
         self._curves, self._uncertain = {}, {}
         for response_curve in self._response_curves:
-            values, entity = response_curve.values(response), response_curve.chart.entity
+            curve_values, entity_path = (
+                response_curve.values(corrected_response),
+                response_curve.chart.entity,
+            )
             # The coherence itself is always reliable.
             is_reliable = is_coherent if response_curve.from_complex else is_excited
-            self._curves[entity] = strips(np.where(is_reliable, values, np.nan))
+            self._curves[entity_path] = decimated_strips(
+                np.where(is_reliable, curve_values, np.nan)
+            )
             if response_curve.from_complex:
-                self._uncertain[entity] = strips(np.where(is_excited, values, np.nan))
+                self._uncertain[entity_path] = decimated_strips(
+                    np.where(is_excited, curve_values, np.nan)
+                )
         excited_ends_hz = (
             frequency_hz[is_excited][[0, -1]] if is_excited.any() else (LAST_HZ, LAST_HZ)
         )
         self._excited_hz = float(excited_ends_hz[0]), float(excited_ends_hz[1])
-        missing_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
-        self._note = missing_text if response.coherence is None else ""
+        no_coherence_text = NO_COHERENCE if estimate.final else NO_COHERENCE_YET
+        self._note = no_coherence_text if corrected_response.coherence is None else ""
 
     def draw(self, stream: "RecordingStream") -> None:
         """Send the curves that the last `update` computed to Rerun, at their session time."""
@@ -347,7 +365,7 @@ class ResponseCharts:
                 uncertain_curve = self._uncertain.get(chart.entity, ())
                 chart.draw_curve(stream, "uncertain", uncertain_curve, UNCERTAIN_ENTRY)
             measured_curve = self._curves.get(chart.entity, ())
-            chart.draw_curve(stream, "measured", measured_curve, response_curve.key, order=1)
+            chart.draw_curve(stream, "measured", measured_curve, response_curve.key, curve_order=1)
             ends_hz = (FIRST_HZ, *self._excited_hz, LAST_HZ)
             for name, first_hz, last_hz in zip(
                 _SHADE_NAMES, ends_hz[::2], ends_hz[1::2], strict=True
@@ -356,7 +374,9 @@ class ResponseCharts:
         self.chart(COHERENCE_ENTITY).draw_note(stream, self._note, COHERENCE_ENTRY.color)
 
     def as_last_response(self, subject: "Subject") -> LastResponse | None:
-        """Return the last update for comparison with a later session; None without an update.
+        """Return the newest frequency response for comparison with a later session.
+
+        It is None before the first estimate.
 
         Parameters
         ----------
@@ -369,12 +389,14 @@ class ResponseCharts:
 
 
 def _last_response_curves(
-    last: LastResponse, response_curves: "Sequence[_ResponseCurve]"
+    last_response: LastResponse, response_curves: "Sequence[_ResponseCurve]"
 ) -> dict[str, Sequence[Real]]:
     """Return the curves of an earlier session's response, by the entity path of their chart."""
-    thinning = response_decimation(last.frequency_hz)
+    decimation = response_decimation(last_response.frequency_hz)
     return {
-        response_curve.chart.entity: thinning.strips(response_curve.from_complex(last.response))
+        response_curve.chart.entity: decimation.strips(
+            response_curve.from_complex(last_response.response)
+        )
         for response_curve in response_curves
         if response_curve.from_complex
     }
@@ -383,8 +405,8 @@ def _last_response_curves(
 def magnitude_db(response: Complex) -> Real:
     """Return the magnitude of complex responses, in dB re 1 N·m/rad."""
     with np.errstate(divide="ignore"):
-        magnitude: Real = 20.0 * np.log10(np.abs(response))
-    return magnitude
+        level_db: Real = 20.0 * np.log10(np.abs(response))
+    return level_db
 
 
 def phase_deg(response: Complex) -> Real:
@@ -461,50 +483,58 @@ def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:
         Range of the magnitudes, in dB re 1 N·m/rad. If the range is larger than the axis, the axis
         begins above the lowest magnitude.
     """
-    last = _MAGNITUDE_TICK_STEP_DB * np.ceil(highest_db / _MAGNITUDE_TICK_STEP_DB)
-    first = max(
+    axis_end_db = _MAGNITUDE_TICK_STEP_DB * np.ceil(highest_db / _MAGNITUDE_TICK_STEP_DB)
+    axis_start_db = max(
         _MAGNITUDE_TICK_STEP_DB * np.floor(lowest_db / _MAGNITUDE_TICK_STEP_DB),
-        last - _MOST_MAGNITUDE_RANGE_DB,
+        axis_end_db - _MOST_MAGNITUDE_RANGE_DB,
     )
-    ticks = steps(first, last, max(1, round((last - first) / _MAGNITUDE_TICK_STEP_DB)))
-    return Axis("Magnitude (dB re 1 N·m/rad)", float(first), float(last), ticks)
+    tick_levels_db = steps(
+        axis_start_db,
+        axis_end_db,
+        max(1, round((axis_end_db - axis_start_db) / _MAGNITUDE_TICK_STEP_DB)),
+    )
+    return Axis(
+        "Magnitude (dB re 1 N·m/rad)", float(axis_start_db), float(axis_end_db), tick_levels_db
+    )
 
 
 def response_chart(
-    entity: str,
-    size: tuple[float, float],
+    entity_path: str,
+    chart_size: tuple[float, float],
     band_hz: tuple[float, float],
-    y: Axis,
-    *keys: LegendEntry,
+    vertical_axis: Axis,
+    *legend_entries: LegendEntry,
 ) -> Chart:
     """Return a chart with a logarithmic frequency axis.
 
     Parameters
     ----------
-    entity
+    entity_path
         Entity path of the chart in Rerun.
-    size
+    chart_size
         Width and height of the canvas, in points.
     band_hz
         Lowest and highest frequency of the axis, above 0.
-    y
+    vertical_axis
         Vertical axis.
-    *keys
+    *legend_entries
         Entries of the legend, in reading order.
     """
-    ticks, lines = decades(*band_hz)
-    frequency = Axis("Frequency (Hz)", *band_hz, ticks, lines, logarithmic=True)
-    return Chart(entity, *size, frequency, y, keys)
+    tick_values, grid_lines = decades(*band_hz)
+    frequency_axis = Axis("Frequency (Hz)", *band_hz, tick_values, grid_lines, logarithmic=True)
+    return Chart(entity_path, *chart_size, frequency_axis, vertical_axis, legend_entries)
 
 
-def _chart(entity: str, y: Axis, *keys: LegendEntry) -> Chart:
+def _chart(entity_path: str, vertical_axis: Axis, *legend_entries: LegendEntry) -> Chart:
     """Return a chart of the frequency response, with a legend entry for bands without estimate."""
-    size = SIZES[entity]
+    chart_size = SIZES[entity_path]
     if (
-        LAST_SESSION_ENTRY not in keys or size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
+        LAST_SESSION_ENTRY not in legend_entries or chart_size[0] > _MOST_WIDTH_FOR_FOUR_ENTRIES
     ):  # there is room for another entry
-        keys = (*keys, NOT_ESTIMATED_ENTRY)
-    return response_chart(entity, size, (FIRST_HZ, LAST_HZ), y, *keys)
+        legend_entries = (*legend_entries, NOT_ESTIMATED_ENTRY)
+    return response_chart(
+        entity_path, chart_size, (FIRST_HZ, LAST_HZ), vertical_axis, *legend_entries
+    )
 
 
 # Spectrogram
@@ -553,22 +583,22 @@ class SpectrogramChart:
         half_bin_hz = float(frequency_hz[1] - frequency_hz[0]) / 2
         end_hz = float(frequency_hz[-1]) + half_bin_hz
         self._lowest_hz = float(frequency_hz[1]) - half_bin_hz
-        width, height = SIZE
+        canvas_width, canvas_height = SIZE
         self.chart = Chart(
             SPECTROGRAM_ENTITY,
-            width,
-            height,
+            canvas_width,
+            canvas_height,
             Axis("Time since the start of the session (s)", 0.0, end_s, steps(0.0, end_s, 15)),
             Axis("Frequency (Hz)", 0.0, end_hz, steps(0.0, end_hz, 8)),
             right=_BAR_MARGIN,
         )
         self._bar = Chart(
             f"{SPECTROGRAM_ENTITY}/bar",
-            width,
-            height,
+            canvas_width,
+            canvas_height,
             Axis("", 0.0, 1.0, ()),
             Axis("dB re 1 N·m", LOWEST_DB, HIGHEST_DB, steps(LOWEST_DB, HIGHEST_DB, 8)),
-            left=width - _COLOR_BAR_WIDTH - 24.0,
+            left=canvas_width - _COLOR_BAR_WIDTH - 24.0,
         )
         # Row 0 is at the top. The mean torque is omitted, because it is no motion.
         self._image = np.zeros((frequency_hz.size - 1, column_count), np.uint8)
@@ -577,39 +607,42 @@ class SpectrogramChart:
 
     @property
     def image(self) -> npt.NDArray[np.uint8]:
-        """Levels so far as bytes (0–255), shape (frequencies, times), highest frequency first."""
+        """Levels of the spectrogram so far as bytes (0–255), shape (frequencies, times).
+
+        The first row is that of the highest frequency.
+        """
         return self._image[:, : self._filled]
 
     def draw_frame(self, stream: "RecordingStream") -> None:
         """Send the static parts of the chart: the axes and the colour bar."""
-        corners = self.chart.to_canvas(
+        image_corners = self.chart.to_canvas(
             [0.0, self.chart.x.last], [self._lowest_hz, self.chart.y.last]
         )
-        _position_image(stream, f"{SPECTROGRAM_ENTITY}/levels", corners, self._image.shape)
-        corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
-        bar = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
-        _position_image(stream, f"{SPECTROGRAM_ENTITY}/colors", corners, bar.shape)
-        _send_image(stream, f"{SPECTROGRAM_ENTITY}/colors", bar, static=True)
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/levels", image_corners, self._image.shape)
+        image_corners = self._bar.to_canvas([0.0, 1.0], [LOWEST_DB, HIGHEST_DB])
+        bar_levels = np.arange(255, -1, -1, dtype=np.uint8)[:, None]
+        _position_image(stream, f"{SPECTROGRAM_ENTITY}/colors", image_corners, bar_levels.shape)
+        _send_image(stream, f"{SPECTROGRAM_ENTITY}/colors", bar_levels, static=True)
         self.chart.draw_frame(stream)
         self._bar.draw_frame(stream)
 
-    def update(self, t_ns: int, columns: Sequence[tuple[float, Real]]) -> None:
+    def update(self, t_ns: int, level_columns: Sequence[tuple[float, Real]]) -> None:
         """Add columns to the spectrogram, which `draw` then sends.
 
         Parameters
         ----------
         t_ns
             Time since the start of the session.
-        columns
+        level_columns
             Time in s of the middle of each column's window, and the column's levels (m,) in dB re 1
             N·m.
         """
         self._t_ns = t_ns
-        for time_s, level_db in columns:
+        for time_s, level_db in level_columns:
             column_index = min(max(int(time_s / self._column_s), 0), self._image.shape[1] - 1)
-            fraction = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
-            column = (255.0 * np.clip(fraction, 0.0, 1.0)).astype(np.uint8)
-            np.maximum(self._image[:, column_index], column, out=self._image[:, column_index])
+            level_fraction = (level_db[:0:-1] - LOWEST_DB) / (HIGHEST_DB - LOWEST_DB)
+            byte_column = (255.0 * np.clip(level_fraction, 0.0, 1.0)).astype(np.uint8)
+            np.maximum(self._image[:, column_index], byte_column, out=self._image[:, column_index])
             self._filled = max(self._filled, column_index + 1)
 
     def draw(self, stream: "RecordingStream") -> None:
@@ -620,43 +653,51 @@ class SpectrogramChart:
 
 
 def _position_image(
-    stream: "RecordingStream", entity: str, corners: Real, shape: tuple[int, ...]
+    stream: "RecordingStream", entity_path: str, image_corners: Real, image_shape: tuple[int, ...]
 ) -> None:
     """Send the position and colour map of an image of levels (0–255).
 
-    `corners` contains the bottom left and the top right corner on the canvas, shape (2, 2). `shape`
-    contains the number of rows and columns.
+    `image_corners` contains the bottom left and the top right corner on the canvas, shape (2, 2).
+    `image_shape` contains the number of rows and columns.
     """
     import rerun as rr
 
-    (left, bottom), (right, top) = corners
-    rows, columns = shape
+    (left_edge, bottom_edge), (right_edge, top_edge) = image_corners
+    row_count, column_count = image_shape
     stream.log(
-        entity,
+        entity_path,
         rr.DepthImage.from_fields(
             colormap=rr.components.Colormap.Viridis, depth_range=(0.0, 255.0), draw_order=0.0
         ),
         rr.Transform3D(
-            translation=[left, top, 0.0],
-            scale=[(right - left) / columns, (bottom - top) / rows, 1.0],
+            translation=[left_edge, top_edge, 0.0],
+            scale=[
+                (right_edge - left_edge) / column_count,
+                (bottom_edge - top_edge) / row_count,
+                1.0,
+            ],
         ),
         static=True,
     )
 
 
 def _send_image(
-    stream: "RecordingStream", entity: str, levels: npt.NDArray[np.uint8], *, static: bool = False
+    stream: "RecordingStream",
+    entity_path: str,
+    image_levels: npt.NDArray[np.uint8],
+    *,
+    static: bool = False,
 ) -> None:
     """Send an image of levels (0–255) to Rerun."""
     import rerun as rr
 
-    rows, columns = levels.shape
+    row_count, column_count = image_levels.shape
     stream.log(
-        entity,
+        entity_path,
         rr.DepthImage.from_fields(
-            buffer=levels.tobytes(),
+            buffer=image_levels.tobytes(),
             format=rr.components.ImageFormat(
-                width=columns, height=rows, channel_datatype=rr.ChannelDatatype.U8
+                width=column_count, height=row_count, channel_datatype=rr.ChannelDatatype.U8
             ),
         ),
         static=static,

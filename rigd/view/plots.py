@@ -119,7 +119,9 @@ class Source:
     def columns(self, records: Records) -> dict[str, Values]:
         """Return the values (n, curves) of each plot from records (n,), by component name."""
         return {
-            plot.component: np.column_stack([curve.values(records) for curve in plot.curves])
+            plot.component: np.column_stack(
+                [plot_curve.values(records) for plot_curve in plot.curves]
+            )
             for plot in self.plots
         }
 
@@ -145,30 +147,43 @@ def send_columns(
     """
     import rerun as rr
 
-    time = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
+    time_column = rr.TimeColumn(TIMELINE, duration=t_ns.astype("timedelta64[ns]"))
     stream.send_columns(
-        entity, [time], [_column(name, values) for name, values in columns.items()], strict=True
+        entity,
+        [time_column],
+        [
+            _column(component_name, component_values)
+            for component_name, component_values in columns.items()
+        ],
+        strict=True,
     )
 
 
-def _column(component: str, values: Values) -> "ComponentColumn":
-    """Return values (n, k) in the form that Rerun stores, with k scalars in each row."""
+def _column(component_name: str, component_values: Values) -> "ComponentColumn":
+    """Return values (n, k) as a column of Rerun's data, with k scalars in each of n rows."""
     import rerun as rr
 
-    row_count, values_per_row = values.shape
-    scalar_batch = rr.components.ScalarBatch(values.ravel())
+    row_count, values_per_row = component_values.shape
+    scalar_batch = rr.components.ScalarBatch(component_values.ravel())
     return rr.ComponentColumn(
-        rr.ComponentDescriptor(component, component_type=scalar_batch.component_type()),
+        rr.ComponentDescriptor(component_name, component_type=scalar_batch.component_type()),
         scalar_batch,
         offsets=np.arange(0, row_count * values_per_row + 1, values_per_row, dtype=np.int32),
     )
 
 
-def _axes(field: str, symbol: str, unit: str) -> tuple[PlotCurve, ...]:
-    """Return the curves of the sensor's three axes. `field` is a name pattern such as ``f{}_n``."""
+def _axes(field_pattern: str, axis_symbol: str, unit: str) -> tuple[PlotCurve, ...]:
+    """Return the curves of one signal of the sensor, one for each axis x, y and z.
+
+    `field_pattern` is the name of the samples' fields, such as ``f{}_n``, with {} for the axis.
+    """
     return tuple(
-        PlotCurve(f"{symbol}{axis} ({unit})", color, itemgetter(field.format(axis)))
-        for axis, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
+        PlotCurve(
+            f"{axis_symbol}{axis_letter} ({unit})",
+            color,
+            itemgetter(field_pattern.format(axis_letter)),
+        )
+        for axis_letter, color in zip("xyz", (ORANGE, SKY_BLUE, PURPLE), strict=True)
     )
 
 

@@ -31,9 +31,9 @@ _OS_ERROR_PATTERN: Final = re.compile(r"os error (\d+)")
 def without_rerun_variables(environment: Mapping[str, str]) -> dict[str, str]:
     """Return an environment without Rerun's variables, such as ``RERUN=off``."""
     return {
-        name: value
-        for name, value in environment.items()
-        if not name.lstrip("_").startswith("RERUN")
+        variable_name: variable_value
+        for variable_name, variable_value in environment.items()
+        if not variable_name.lstrip("_").startswith("RERUN")
     }
 
 
@@ -43,8 +43,8 @@ def prepare_sdk_environment() -> None:
     Rerun's variables are removed. The SDK's log is switched off, because the callers report a lost
     server or a full disk themselves.
     """
-    for name in os.environ.keys() - without_rerun_variables(os.environ).keys():
-        del os.environ[name]
+    for variable_name in os.environ.keys() - without_rerun_variables(os.environ).keys():
+        del os.environ[variable_name]
     os.environ["RUST_LOG"] = "off"
 
 
@@ -108,8 +108,8 @@ def check_rrd_file(path: Path) -> None:
     try:
         if not stat.S_ISREG(path.stat().st_mode):
             raise RrdFileError(f"{path} is not a file. Give a recording of Rerun's (*.rrd).")
-        with path.open("rb") as file:
-            first_bytes = file.read(len(_RRD_FIRST_BYTES))
+        with path.open("rb") as rrd_file:
+            first_bytes = rrd_file.read(len(_RRD_FIRST_BYTES))
     except OSError as error:
         raise RrdFileError(
             f"{path} cannot be read: {error.strerror}. Check the path and its permissions."
@@ -133,8 +133,12 @@ def _translate_write_errors(path: Path, temporary_path: Path) -> Iterator[None]:
     except OSError as error:
         raise RrdFileError(f"{path} cannot be written: {error.strerror}.") from None
     except RuntimeError as error:  # from the SDK
-        number = _OS_ERROR_PATTERN.search(str(error))
-        cause = os.strerror(int(number[1])) if number else _reason_of_write_failure(temporary_path)
+        error_number = _OS_ERROR_PATTERN.search(str(error))
+        cause = (
+            os.strerror(int(error_number[1]))
+            if error_number
+            else _reason_of_write_failure(temporary_path)
+        )
         raise RrdFileError(f"{path} cannot be written: {cause}.") from None
 
 
@@ -144,8 +148,8 @@ def _reason_of_write_failure(temporary_path: Path) -> str:
     Rerun's SDK may not report the reason.
     """
     try:
-        with temporary_path.open("ab") as file:
-            file.write(bytes(_TRIAL_WRITE_BYTES))
+        with temporary_path.open("ab") as trial_file:
+            trial_file.write(bytes(_TRIAL_WRITE_BYTES))
     except OSError as error:
         return error.strerror or str(error)
     return "Rerun gave up"

@@ -152,7 +152,7 @@ class SessionResponse:
 
     def __init__(self, subject: Subject) -> None:
         self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ, every=_BIN_STEP)
+        self._sweep = SweepResponse(subject, LAST_HZ, resolution_divisor=_BIN_STEP)
         self._thinning: CurveDecimation | None = None
         self._queued_blocks: list[PageSignalBlock] = []
         self._has_new_data = False

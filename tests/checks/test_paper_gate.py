@@ -56,7 +56,7 @@ def lie(tmp_path, can_profile):
         section, _, name = key.partition(".")
         owner = getattr(can_profile, section, None) or getattr(can_profile.rig, section)
         value = type(getattr(owner, name))(getattr(owner, name) * factor)
-        return write_profile(tmp_path, {"name": "one_lie", key: value}, base="antenna_can")
+        return write_profile(tmp_path, {"name": "one_lie", key: value}, base_profile="antenna_can")
 
     return lie
 
@@ -137,7 +137,7 @@ def test_a_name_that_is_none_is_refused_with_those_there_are(can_profile):
 def test_a_drive_s_file_is_asked_for_too(can_profile, tmp_path):
     shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
     values = {"cia402.eds": "drive.eds"}
-    profile = load_profile(write_profile(tmp_path, values, base="antenna_can"))
+    profile = load_profile(write_profile(tmp_path, values, base_profile="antenna_can"))
     assert "It has no object 6072 (Max torque)" in refusal(profile, tmp_path, "hold")
     assert not refusal(profile, tmp_path, "hold", accept=["eds"])
 

@@ -16,7 +16,7 @@ LENGTH, HOP, LONGEST_GAP = 40, 30, 5
 
 
 def cut(ticks, values, edges, end=None):
-    segments = Segments(len(values), LENGTH, HOP, longest_gap=LONGEST_GAP, end=end)
+    segments = Segments(len(values), LENGTH, HOP, longest_gap_ticks=LONGEST_GAP, end_tick=end)
     found = [
         (first, segment.copy())
         for start, stop in zip([0, *edges], [*edges, len(ticks)], strict=True)

@@ -48,7 +48,7 @@ def test_a_profile_differs_where_it_is_asked_to(tmp_path):
         "sensor.range": (10.0, 10.0, 30.0, 0.5, 0.5, 0.5),
         "cia402.accept_without": ("watchdog",),
     }
-    path = testing.write_profile(tmp_path, values, base="antenna_can")
+    path = testing.write_profile(tmp_path, values, base_profile="antenna_can")
     made, base = load_profile(path), load_profile("antenna_can")
     assert (path.name, made.name) == ("other.toml", "other")
     assert made.limits == replace(base.limits, angle_rad=0.5)
