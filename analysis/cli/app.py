@@ -314,7 +314,7 @@ def analyze(
     if method == "record":
         _check_record_method(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
-    analysis_routes = Routes(
+    run_routes = Routes(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
@@ -330,7 +330,7 @@ def analyze(
         if rerun is not None:
             _check_rerun(rerun, files)
         if not is_campaign:
-            exit_code = session_command(files, analysis_routes, output_options, rerun)
+            exit_code = session_command(files, run_routes, output_options, rerun)
         else:
             from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
@@ -339,12 +339,12 @@ def analyze(
             try:
                 exit_code = campaign_command(
                     files, settings, output_options,
-                    structures=tuple(STRUCTURES) if analysis_routes.whole_record else (),
-                    fixed=analysis_routes.fixed, band_hz=analysis_routes.band_hz, jobs=jobs, dask=dask,
-                    uniformity=analysis_routes.uniformity, with_paper=paper, formats=analysis_routes.figures,
+                    structures=tuple(STRUCTURES) if run_routes.whole_record else (),
+                    fixed=run_routes.fixed, band_hz=run_routes.band_hz, jobs=jobs, dask=dask,
+                    uniformity=run_routes.uniformity, with_paper=paper, formats=run_routes.figures,
                 )  # fmt: skip
             except SingleSessionError as single:
-                exit_code = _report_single_session(single, analysis_routes, output_options)
+                exit_code = _report_single_session(single, run_routes, output_options)
             except CampaignError as error:
                 print_error(str(error))
                 exit_code = 1

@@ -163,13 +163,13 @@ def session_command(
 
 
 def _print_tables(
-    console: Console, results: Sequence[RecordResult], *, is_single: bool, verbose: bool
+    console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, summary_table
 
     welch_results = [result for result in results if result.welch is not None]
-    if is_single or not welch_results:
+    if single or not welch_results:
         for result in results:
             console.print(result_text(result, verbose=verbose))
     else:
