@@ -113,7 +113,8 @@ class Structure:
     def has(self, parameter_name: str) -> bool:
         """Return whether the structure has the kind of damping to which a parameter belongs.
 
-        The result is True for a parameter of beam or rig.
+        The kinds are internal and external damping. The result is True for a parameter of beam or
+        rig.
 
         Parameters
         ----------
@@ -127,7 +128,7 @@ class Structure:
         return True
 
     def damping(self, free_values: Mapping[Parameter, float]) -> Damping:
-        """Return the damping with given values of the free parameters, and the fixed values."""
+        """Return the damping with given free parameters, and the structure's fixed ones."""
         values_by_name = {
             **self.fixed,
             **{parameter_name: free_values[parameter_name] for parameter_name in self.free},

@@ -93,7 +93,10 @@ class OnlineEstimate:
 
     @property
     def doubt(self) -> str | None:
-        """Reason against all estimates; None if at least one has no flag."""
+        """Reason to doubt all estimates, or None if at least one has no flag.
+
+        Without estimates it is the problem that prevented them.
+        """
         headline = self.headline
         if headline is None:
             return self.problem
@@ -110,7 +113,7 @@ class OnlineEstimate:
 
     @property
     def predicting(self) -> RecordFit | None:
-        """Fit with which the next excitation is planned; None without a fit.
+        """Fit from which the next excitation is planned; None without a fit.
 
         It has internal and external damping. A damping that is insignificant, or whose order is not
         identifiable (so that it may be a stiffness or an inertia), has order 1.
@@ -138,10 +141,10 @@ class OnlineEstimate:
 
     @property
     def plant(self) -> Plant | None:
-        """Plant with which the next excitation is planned; None without a fit.
+        """Model of beam and rig from which the next excitation is planned; None without a fit.
 
-        It is the plant of the fit `predicting`. If a uniform beam does not predict the modal
-        constants, each mode has its own measured stiffness.
+        It is that of the fit `predicting`. If a uniform beam does not predict the modal constants,
+        each mode has its own measured stiffness.
         """
         headline, fit = self.headline, self.predicting
         if headline is None or fit is None:
@@ -181,7 +184,7 @@ class OnlineEstimate:
 
 
 def _noise_spectrum(analysis: RecordAnalysis) -> dict[str, Any]:
-    """Return the noise spectrum, interpolated at a few frequencies, as a JSON document."""
+    """Return frequencies in Hz and the noise spectrum in (N·m)²/Hz there, as a JSON document."""
     import numpy as np
 
     hz = analysis.frequency_hz

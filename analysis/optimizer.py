@@ -141,7 +141,7 @@ class Box:
     """Upper bounds, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return infinite limits of a step, because `end` clips the step."""
+        """Return infinite limits for the change of each unknown, because `end` clips the step."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -152,7 +152,10 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
 
 
 def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
-    """Fit a record; return the estimates (or None), their validity, and remarks."""
+    """Fit a record; return its reported estimates, their validity, and remarks.
+
+    The estimates are None if the record is not fitted.
+    """
     from analysis.identify import Measurement, MeasurementError, fit_freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
@@ -193,7 +196,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
 
 
 def _mode_document(mode: ReportedMode) -> dict[str, Any]:
-    """Return a mode as part of the JSON document."""
+    """Return one mode (frequency, damping ratio, visibility) as a section of the JSON document."""
     return {
         "mode": mode.number,
         "frequency_hz": mode.frequency_hz.as_json(),
@@ -237,7 +240,8 @@ def _model_document(
 def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], list[str]]:
     """Return response and coherence at the excited frequencies, and remarks.
 
-    The estimates are those of the live view.
+    The first two are sections of the JSON document; the response is None if it cannot be estimated.
+    The estimates are those of the live view of a running session.
     """
     import numpy as np
 
@@ -314,7 +318,11 @@ def _estimate_response(
 def _estimate_coherence(
     record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
 ) -> tuple[Real | None, Segmentation]:
-    """Return the coherence, from shorter segments if there is only one, and these segments."""
+    """Return the coherence of a record, and the segments by which it is estimated.
+
+    If `segments` give only one segment, which has no coherence, shorter ones are used. The
+    coherence is None if these do not give an estimate either.
+    """
     from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
 
     if estimate.response.coherence is None:
@@ -330,10 +338,10 @@ def _estimate_coherence(
 def _join_bins(
     frequency_hz: Real, is_selected: NDArray[np.bool_], resolution_hz: float
 ) -> Iterator[tuple[float, float]]:
-    """Yield the frequency bands that the selected bins form.
+    """Yield the frequency bands, as first and last frequency in Hz, that the selected bins form.
 
-    Bins nearer than a tenth of their frequency belong to one band. A band narrower than the
-    resolution of the segments is omitted.
+    Bins nearer than a tenth of their frequency belong to one band. A band narrower than
+    `resolution_hz`, the resolution of the segments, is omitted.
     """
     import numpy as np
 
@@ -355,7 +363,10 @@ def _empty_coherence() -> dict[str, Any]:
 
 
 def _stored_quick_look(session_path: Path) -> dict[str, Any]:
-    """Return the stored quick look of a session; raise if it has none."""
+    """Return the stored quick look of a session file as a JSON document.
+
+    Raise QuickLookError if the session has none.
+    """
     quick_look = read_quick_look(quick_look_path(session_path))
     if quick_look is None:
         raise QuickLookError(
@@ -380,7 +391,10 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
 def _compare_modes(
     modes: list[dict[str, Any]], other_document: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Compare the modes of a session with those of an earlier one, if visible in both."""
+    """Compare the modes of a session with those of an earlier one, if visible in both.
+
+    Return the comparison as a section of the JSON document.
+    """
     other_modes = {mode["mode"]: mode for mode in other_document["modes"] if mode["shown"]}
     compared_modes, changed_modes, unchanged_modes = [], [], []
     for mode in modes:

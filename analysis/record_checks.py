@@ -135,7 +135,7 @@ def first_mode_hz(beam: Beam) -> float:
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
-    """Return the inertia between torque sensor and beam in kg·m², 0 if not stated.
+    """Return the moment of inertia between torque sensor and beam in kg·m², 0 if not stated.
 
     Raises
     ------
@@ -281,7 +281,7 @@ def stated_uniformity(session: Session) -> float:
 
 
 def _invalid_value_error(session: Session, key: str, stated_value: float, rule: str) -> RecordError:
-    """Return the error for an invalid value in the metadata."""
+    """Return the error for an invalid number of the session's metadata, with the violated rule."""
     return RecordError(
         f"{session.path}: {key} is {f'{stated_value:g} {unit_of(key)}'.rstrip()}, but {rule}; "
         "correct the file's metadata."

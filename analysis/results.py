@@ -104,12 +104,12 @@ class WholeRecord:
 
     @property
     def fits(self) -> Mapping[str, RecordFit]:
-        """Fits by their names in tables, the lowest BIC first."""
+        """Fits of all damping structures by the structure's name, the lowest BIC first."""
         return {candidate.name: candidate.fit for candidate in self.selection.candidates}
 
     @property
     def delta_bic(self) -> Mapping[str, float]:
-        """Difference of each fit's BIC from the lowest BIC, by the name of the fit."""
+        """Difference of each fit's BIC from the lowest BIC, by the name of its structure."""
         best_candidate, *_ = self.selection.candidates
         return {
             candidate.name: candidate.bic - best_candidate.bic
@@ -118,7 +118,7 @@ class WholeRecord:
 
     @property
     def headline(self) -> Headline:
-        """Reported estimates, which follow from one of `fits`."""
+        """Reported estimates (modes, parameters, loss factors), which follow from one of `fits`."""
         return self.selection.headline
 
     @property
@@ -150,7 +150,7 @@ class WholeRecord:
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Orders of the reported fit whose estimates have a flag against them."""
+        """Orders of the reported fit that are not to be reported: their estimate has a flag."""
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
@@ -166,7 +166,7 @@ class WholeRecord:
         return with_scale_uncertainty(self.headline.parameters, self.record.uncertainty)
 
     def headline_json(self) -> dict[str, Any]:
-        """Return the reported estimates as the content of a JSON document."""
+        """Return the reported estimates of the record as the content of a JSON document."""
         from analysis.identify import headline_json
         from analysis.record_checks import SCALE_QUANTITIES
 
@@ -179,8 +179,8 @@ class WholeRecord:
         return {
             **json_content,
             "scale_uncertainty": {
-                parameter_name: parameter_document
-                for parameter_name, parameter_document in self.record.uncertainty.items()
+                parameter_name: relative_std
+                for parameter_name, relative_std in self.record.uncertainty.items()
                 if parameter_name in SCALE_QUANTITIES
             },
             "combined": {
@@ -190,7 +190,10 @@ class WholeRecord:
         }
 
     def _covariance_json(self) -> dict[str, Any]:
-        """Return names and covariance matrix of the fit; ``ln_`` marks a logarithm."""
+        """Return the parameter names of the fit and their covariance matrix, as JSON values.
+
+        The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
+        """
         from analysis.identify import LOGARITHMIC_PARAMETERS
 
         return {

@@ -124,7 +124,7 @@ class Touch:
     ends_m: Real | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the touch as a document of JSON types."""
+        """Return the touch and its estimate as a JSON document."""
         estimate = self.estimate
         contact_point = None if self.point_m is None else self.point_m.tolist()
         return {
@@ -311,7 +311,8 @@ class TouchAnalysis:
         """Return estimator and free motion of a model, computed at the first use."""
         key = (
             touch_model.beam, touch_model.damping, touch_model.tool_inertia_kg_m2,
-            touch_model.angle_delay_s, touch_model.torque_delay_s, touch_model.sensor_filter, rate_hz,
+            touch_model.angle_delay_s, touch_model.torque_delay_s, touch_model.sensor_filter,
+            rate_hz,
         )  # fmt: skip
         if key not in self._prepared:
             x_m = np.linspace(0.0, touch_model.beam.length_m, _ANTENNA_POINTS)
@@ -325,7 +326,7 @@ class TouchAnalysis:
 
 @dataclass(frozen=True, slots=True)
 class _PreparedModel:
-    """Estimator and free motion of one model, computed once for all touches."""
+    """Estimator of touches and free motion of one model, computed once for all touches."""
 
     estimator: TouchEstimator
     free: FreeBeam
@@ -349,7 +350,10 @@ def _check_samples(session: Session) -> float:
 
 
 def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> TouchModel:
-    """Return the identified model from a file, or the nominal model of a session."""
+    """Return the beam model with which the touches of a session are estimated.
+
+    It is the identified model in the file `model_path`, or else the nominal model of the session.
+    """
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
     stated_values: dict[str, Any] = {
@@ -372,7 +376,11 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
-    """Return the sensor's low-pass filter and the filter that averages its records."""
+    """Return the filters of the sensor, as a session states them.
+
+    These are its low-pass filter and, if stated, the filter that averages several sensor records in
+    each tick.
+    """
     filter_order, time_constant_s = max(
         enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1)
     )
@@ -395,7 +403,11 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
-    """Return the coefficients that yield the base shear from the wrench; None without them."""
+    """Return the factors of fx, fy, fz, tx, ty, tz that yield the shear force at the base.
+
+    The six values are the forces and torques of the sensor. Return None if the session states no
+    factors or only zeros.
+    """
     projection_text = session.metadata.get("shear_projection", "")
     if not projection_text:
         return None

@@ -73,8 +73,8 @@ def symbol_with_unit(quantity: str) -> str:
 
     Examples
     --------
-    >>> from analysis.campaigns.sentences import with_unit
-    >>> with_unit("zeta"), with_unit("frequency_hz_2")
+    >>> from analysis.campaigns.sentences import symbol_with_unit
+    >>> symbol_with_unit("zeta"), symbol_with_unit("frequency_hz_2")
     ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
     """
     symbol, _, display_unit = label(quantity)
@@ -137,7 +137,7 @@ def specimens(homogeneity: Homogeneity) -> list[str]:
 
 
 def title(text: str, homogeneity: Homogeneity) -> str:
-    """Return a title, with an addition if the values are pooled over several specimens.
+    """Return the title of a table or figure, with an addition for values of several specimens.
 
     Parameters
     ----------

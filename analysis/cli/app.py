@@ -45,7 +45,7 @@ DEFAULT_COMMAND: Final = "default"
 
 
 class DefaultCommandGroup(TyperGroup):
-    """Command group that runs a default command if the first argument is no command's name.
+    """Command group whose default command runs if the first argument names no command.
 
     Usage, help and errors of the default command are then those of a command without subcommands.
     """
@@ -372,7 +372,11 @@ def _check_campaign_options(option_names: Sequence[str], files: Sequence[Path]) 
 
 
 def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
-    """Raise a usage error for a campaign without Welch fits; warn of options without effect."""
+    """Check the options of an analysis by whole-record fits alone.
+
+    Raise a usage error for a campaign, which needs Welch fits. Otherwise print a warning if options
+    of the Welch fits are given, as these have no effect.
+    """
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
@@ -400,7 +404,7 @@ def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
 def _report_single_session(
     single_session_error: SingleSessionError, routes: Routes, outputs: Outputs
 ) -> int:
-    """Print the errors of the unusable files of a campaign, and report the only usable one."""
+    """Print the errors of a campaign's unusable files, and report its only usable session."""
     for failure in single_session_error.failures:
         print_error(failure.message)
     typer.echo(
