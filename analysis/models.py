@@ -204,13 +204,13 @@ class FrequencyResponseModel:
         self._tool_response = tool_inertia_kg_m2 * s * s
 
     def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
-        """Return the response in N·m/rad, shape (n,)."""
+        """Return the modelled torque per motor angle in N·m/rad at all frequencies, shape (n,)."""
         return self._grid.evaluate(self.beam, damping) + self._tool_response
 
     def evaluate_with_gradient(
         self, damping: Damping, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the response, shape (n,), and its derivatives by parameters, shape (k, n).
+        """Return torque per angle, shape (n,), and its derivatives by parameters, shape (k, n).
 
         Parameters
         ----------

@@ -233,7 +233,7 @@ class OnlineEstimator:
         self._last_selection: Selection | None = None
 
     def feed(self, new_samples: NDArray[np.void]) -> None:
-        """Append the next samples of the session.
+        """Append the next recorded samples of the running session.
 
         Parameters
         ----------

@@ -276,7 +276,7 @@ def descend(
 
 def _compute_step(
     model_hessian: NDArray[np.float64],
-    current: NormalEquations,
+    current_equations: NormalEquations,
     is_free: NDArray[np.bool_],
     damping: float,
     step_limits: tuple[NDArray[np.float64], NDArray[np.float64]],
@@ -287,7 +287,7 @@ def _compute_step(
     """
     smallest_step, largest_step = step_limits
     step = np.zeros(is_free.size)
-    curvatures = current.hessian.diagonal()
+    curvatures = current_equations.hessian.diagonal()
     damped_model = model_hessian + np.diag(
         damping * np.maximum(curvatures, _SMALLEST_CURVATURE * curvatures[is_free].max())
     )
@@ -295,7 +295,7 @@ def _compute_step(
     while free_indices.size:
         hessian_block = damped_model[free_indices[:, None], free_indices]
         step[free_indices] = 0.0
-        gradient = current.gradient[free_indices] + model_hessian[free_indices] @ step
+        gradient = current_equations.gradient[free_indices] + model_hessian[free_indices] @ step
         try:
             np.linalg.cholesky(hessian_block)
             free_step = np.linalg.solve(hessian_block, -gradient)
@@ -314,15 +314,17 @@ def _compute_step(
 def _update_second_part(
     second_estimate: NDArray[np.float64],
     step: NDArray[np.float64],
-    current: NormalEquations,
+    current_equations: NormalEquations,
     next_equations: NormalEquations,
 ) -> NDArray[np.float64]:
     """Return the second part of the Hessian, updated after a step by the secant rule of NL2SOL."""
-    gradient_change = next_equations.gradient - current.gradient
-    curvature = float(gradient_change @ step)
-    if curvature <= 0:
+    gradient_change = next_equations.gradient - current_equations.gradient
+    step_curvature = float(gradient_change @ step)
+    if step_curvature <= 0:
         return second_estimate
-    second_change = gradient_change - (current.hessian + next_equations.hessian) @ step / 2
+    second_change = (
+        gradient_change - (current_equations.hessian + next_equations.hessian) @ step / 2
+    )
     predicted_change = second_estimate @ step
     change_size = abs(float(step @ predicted_change))
     if change_size > 0:  # an estimate from a higher cost may be too large here
@@ -335,8 +337,9 @@ def _update_second_part(
     outer_update = np.outer(change_error, gradient_change)
     return (
         second_estimate
-        + (outer_update + outer_update.T) / curvature
-        - (float(change_error @ step) / curvature**2) * np.outer(gradient_change, gradient_change)
+        + (outer_update + outer_update.T) / step_curvature
+        - (float(change_error @ step) / step_curvature**2)
+        * np.outer(gradient_change, gradient_change)
     )
 
 

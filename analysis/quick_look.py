@@ -256,33 +256,38 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     try:
         estimate = _estimate_response(record, segments, last_hz)
         # For steps, multisines and narrow sweeps, the coherence would depend on the segments.
-        coherence = None
+        coherence_values = None
         if estimate is not None and welch_exclusion_reason(record, (FIRST_HZ, last_hz)) is None:
-            coherence, segments = _estimate_coherence(record, estimate, segments, last_hz)
+            coherence_values, segments = _estimate_coherence(record, estimate, segments, last_hz)
     except SpectralError as error:
         return None, _empty_coherence(), [str(error)]
     if estimate is None:
         return None, _empty_coherence(), []
-    undelayed = estimate.response.without_delays(
+    undelayed_response = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
     is_shown = (
-        estimate.excited & (undelayed.frequency_hz >= FIRST_HZ) & np.isfinite(undelayed.response)
+        estimate.excited
+        & (undelayed_response.frequency_hz >= FIRST_HZ)
+        & np.isfinite(undelayed_response.response)
     )
-    hz, shown_values = undelayed.frequency_hz[is_shown], undelayed.response[is_shown]
+    hz, shown_values = (
+        undelayed_response.frequency_hz[is_shown],
+        undelayed_response.response[is_shown],
+    )
     selected_bins = response_decimation(hz).extremes(np.abs(shown_values))
     response_document = {
         "frequency_hz": _round_digits(hz[selected_bins]),
         "magnitude": _round_digits(np.abs(shown_values[selected_bins])),
         "phase_rad": _round_digits(np.angle(shown_values[selected_bins])),
         "coherence": None
-        if coherence is None
-        else _round_digits(coherence[is_shown][selected_bins]),
+        if coherence_values is None
+        else _round_digits(coherence_values[is_shown][selected_bins]),
         "resolution_hz": round(resolution_hz, 4),
     }
-    if coherence is None or hz.size == 0:
+    if coherence_values is None or hz.size == 0:
         return response_document, _empty_coherence(), []
-    shown_coherence = coherence[is_shown]
+    shown_coherence = coherence_values[is_shown]
     incoherent_bands = _join_bins(
         hz, shown_coherence < LOW_COHERENCE, record.rate_hz / segments.segment_length
     )
@@ -434,12 +439,20 @@ def _compare_modes(
             unchanged_modes.append(f"mode {mode['mode']} {', '.join(change_texts)}")
     other_name = Path(other_document["file"]).stem
     if not compared_modes:
-        sentence = f"No mode can be compared with {other_name}."
+        comparison_sentence = f"No mode can be compared with {other_name}."
     elif changed_modes:
-        sentence = f"Significant change against {other_name}: {'; '.join(changed_modes)}."
+        comparison_sentence = (
+            f"Significant change against {other_name}: {'; '.join(changed_modes)}."
+        )
     else:
-        sentence = f"No significant change against {other_name} ({'; '.join(unchanged_modes)})."
-    return {"file": other_document["file"], "sentence": sentence, "modes": compared_modes}
+        comparison_sentence = (
+            f"No significant change against {other_name} ({'; '.join(unchanged_modes)})."
+        )
+    return {
+        "file": other_document["file"],
+        "sentence": comparison_sentence,
+        "modes": compared_modes,
+    }
 
 
 # Text

@@ -280,11 +280,13 @@ def stated_uniformity(session: Session) -> float:
     return uniformity_percent / 100
 
 
-def _invalid_value_error(session: Session, key: str, stated_value: float, rule: str) -> RecordError:
+def _invalid_value_error(
+    session: Session, key: str, stated_value: float, violated_rule: str
+) -> RecordError:
     """Return the error for an invalid number of the session's metadata, with the violated rule."""
     return RecordError(
-        f"{session.path}: {key} is {f'{stated_value:g} {unit_of(key)}'.rstrip()}, but {rule}; "
-        "correct the file's metadata."
+        f"{session.path}: {key} is {f'{stated_value:g} {unit_of(key)}'.rstrip()}, but "
+        f"{violated_rule}; correct the file's metadata."
     )
 
 
@@ -478,7 +480,9 @@ def check_fillable(
         )
 
 
-def unknown_fraction_message(channel_text: str, unknown: int, total: int) -> str | None:
+def unknown_fraction_message(
+    channel_text: str, unknown_samples: int, total_samples: int
+) -> str | None:
     """Return an error message if too many samples of a channel are unknown, or None.
 
     The limit is the fraction `MAX_UNKNOWN_FRACTION`.
@@ -487,20 +491,21 @@ def unknown_fraction_message(channel_text: str, unknown: int, total: int) -> str
     ----------
     channel_text : str
         Name of the channel in the message.
-    unknown, total : int
+    unknown_samples, total_samples : int
         Number of samples without a new value, and number of all samples.
     """
-    if unknown <= MAX_UNKNOWN_FRACTION * total:
+    if unknown_samples <= MAX_UNKNOWN_FRACTION * total_samples:
         return None
     return (
-        f"{unknown} of {total} samples ({100 * unknown / total:.2g} %) of {channel_text} are "
+        f"{unknown_samples} of {total_samples} samples "
+        f"({100 * unknown_samples / total_samples:.2g} %) of {channel_text} are "
         "missing or flagged, "
         f"more than the {100 * MAX_UNKNOWN_FRACTION:g} % that an analysis tolerates; record the "
         "session again."
     )
 
 
-def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
+def longest_run(run_mask: NDArray[np.bool_]) -> tuple[int, int]:
     """Return length and start index of the longest run of True; (0, 0) if no element is True.
 
     Examples
@@ -510,7 +515,7 @@ def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
     >>> longest_run(np.array([True, False, True, True]))
     (2, 2)
     """
-    run_edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    run_edges = np.diff(np.concatenate(([0], run_mask.astype(np.int8), [0])))
     run_starts, run_ends = np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
     if run_starts.size == 0:
         return 0, 0

@@ -248,10 +248,10 @@ class RecordResult:
             validity = self.whole.validity
         else:
             # The Welch fits differ, and the largest slope of the tip among them is used.
-            models = () if self.welch is None else self.welch.models
-            dampings = [model.fit.damping for model in models]
+            fitted_models = () if self.welch is None else self.welch.models
+            fitted_dampings = [model.fit.damping for model in fitted_models]
             validity = _record_validity(
-                self.record, *((self.record.beam, damping) for damping in dampings)
+                self.record, *((self.record.beam, damping) for damping in fitted_dampings)
             )
         object.__setattr__(self, "validity", validity)
 
@@ -267,7 +267,7 @@ class RecordResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the analyst."""
+        """Sentences on weaknesses of the record and, if there are Welch fits, of these."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 

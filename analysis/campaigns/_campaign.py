@@ -124,7 +124,7 @@ class CampaignResult:
 
     @property
     def trials(self) -> int:
-        """Number of sessions that were to be predicted from the others."""
+        """Number of sessions whose torque was to be predicted by models of the other sessions."""
         return len(self.sessions) if len(self.sessions) >= FEWEST_SESSIONS else 0
 
 

@@ -114,10 +114,10 @@ class Experiment:
         excitation_facts = {
             key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata
         }
-        label = metadata.get(LABEL_KEY, "").strip()
+        specimen_label = metadata.get(LABEL_KEY, "").strip()
         return cls(
             facts={
-                **({LABEL_KEY: label} if label else {}),
+                **({LABEL_KEY: specimen_label} if specimen_label else {}),
                 "beam_length_m": beam.length_m,
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
@@ -282,7 +282,7 @@ def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
 
 
 def differing_fact_keys(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
-    """Return the keys of the properties in which specimens differ."""
+    """Return the keys of the stated properties, such as the length, in which specimens differ."""
     first_facts = specimens[0].facts
     return tuple(
         key

@@ -35,18 +35,18 @@ def p_value_text(p_value: float) -> str:
     )
 
 
-def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
+def describe_tolerance(modal_model: PooledModal, estimate: TolerantEstimate) -> str:
     """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
-    largest_stated = modal.stated[-1]
+    largest_stated = modal_model.stated[-1]
     tolerance_text = f"{100 * largest_stated:g} % as the files state it"
-    if len(modal.stated) > 1:
-        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal.stated])
+    if len(modal_model.stated) > 1:
+        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal_model.stated])
         tolerance_text = (
             f"{100 * largest_stated:g} %, the largest of the {stated_texts} % that the files state"
         )
     basis_sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
-        f"{modal.sessions} sessions"
+        f"{modal_model.sessions} sessions"
     )
     if estimate.basis != "geometry":
         return (
@@ -63,17 +63,17 @@ def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
     )
 
 
-def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
+def describe_slope(pooled_order: PooledOrder, modal_model: PooledModal) -> str:
     """Describe an order of the damping as the slope of a loss over the visible modes.
 
     Parameters
     ----------
     pooled_order : PooledOrder
         Order estimated with a tolerance of the geometry.
-    modal : PooledModal
+    modal_model : PooledModal
         Modal model of all sessions, with the estimate `tolerant`.
     """
-    estimate = modal.tolerant
+    estimate = modal_model.tolerant
     assert estimate is not None
     status_counts = {
         f"“{status}”": session_count for status, session_count in pooled_order.alone.items()
@@ -85,7 +85,7 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
             "identifiable: "
             f"{pooled_order.reason}. {sessions_sentence}"
         )
-    shown_hz = [mode.frequency_hz for mode in modal.modes]
+    shown_hz = [mode.frequency_hz for mode in modal_model.modes]
     slope_sentence = loss_slope_sentence(
         pooled_order.order,
         pooled_order.value,
@@ -99,13 +99,13 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
 
 
 def describe_orders_if_exact(
-    freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
+    freest_fit: PooledEstimate, orders: Sequence[PooledOrder], modal_model: PooledModal | None
 ) -> list[str]:
     """Describe the orders of the damping on condition that the beam is exactly uniform.
 
     The list is empty if a uniform beam does not predict the modes.
     """
-    if modal is None or modal.uniform_beam.status == "refused":
+    if modal_model is None or modal_model.uniform_beam.status == "refused":
         return []
     orders_shown = []
     for order in orders:
@@ -132,7 +132,7 @@ def describe_orders_if_exact(
         )
     return (
         [
-            f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest.name}): "
+            f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest_fit.name}): "
             f"{'; '.join(orders_shown)}."
         ]
         if orders_shown
@@ -184,7 +184,9 @@ def _describe_mode_change(mode_change: ModeInSweeps) -> str:
 
 
 def recommend_sweeps(
-    sweeps: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
+    sweeps: OppositeSweeps | None,
+    modal_model: PooledModal | None,
+    sessions: Sequence[SessionAnalysis],
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
     if sweeps is not None and sweeps.changed:
@@ -195,7 +197,7 @@ def recommend_sweeps(
             "Then check clamp and temperature."
         ]
     sweep_directions = {session.experiment.rising for session in sessions}
-    is_beam_refused = modal is not None and modal.uniform_beam.status == "refused"
+    is_beam_refused = modal_model is not None and modal_model.uniform_beam.status == "refused"
     if sweeps is None and is_beam_refused and sweep_directions in ({True}, {False}):
         missing_direction = "falling" if True in sweep_directions else "rising"
         return [

@@ -201,7 +201,7 @@ def _reported_parameters(
 
 
 def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
-    """Return the reason against each doubtful order, also for the coefficient of the order."""
+    """Return a flag for each doubtful order and for its coefficient, by the parameter name."""
     return {
         order_name: order.reason
         for order in orders

@@ -229,16 +229,16 @@ def _mode_values(
 
 
 def _parameter_values(
-    sessions: Sequence[SessionAnalysis], freest: PooledEstimate
+    sessions: Sequence[SessionAnalysis], freest_fit: PooledEstimate
 ) -> Iterator[tuple[str, SessionValues]]:
     """Yield the estimates of each pooled parameter, one for each session."""
-    for parameter in freest.parameters:
+    for parameter in freest_fit.parameters:
         parameter_name = parameter.name
         session_values = (
             (session.name, estimate.parameters[parameter_name], estimate.std[parameter_name] or 0.0)
             for session in sessions
             for estimate in session.record_estimates
-            if estimate.name == freest.name and parameter_name in estimate.determined
+            if estimate.name == freest_fit.name and parameter_name in estimate.determined
         )
         yield parameter_name, _with_known_std(session_values)
 

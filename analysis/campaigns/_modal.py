@@ -81,7 +81,7 @@ class PooledModal(ModalEstimate):
 
     @property
     def leads(self) -> bool:
-        """Whether the modes of this model are reported, and not those of a uniform beam."""
+        """Whether the report has the modes of this modal model, and not those of a uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property

@@ -147,7 +147,11 @@ class PooledOrder:
     exact: PooledOrder | None = None
 
     def doubted(self, reason: str) -> PooledOrder:
-        """Return the order with a reason for doubt; unchanged if it already has a reason."""
+        """Return this order with a reason against its interpretation.
+
+        Its status becomes "open" if it has an interval. An order that already has a reason is
+        returned unchanged.
+        """
         if self.reason is not None:
             return self
         return replace(self, status="open" if self.interval else self.status, reason=reason)
@@ -231,7 +235,7 @@ def tolerant_pooled_order(
     order_status, doubt_reason = order_status_with_geometry_tolerance(
         order, estimate, refused=refused
     )
-    pooled = PooledOrder(
+    tolerant_order = PooledOrder(
         order=order,
         status=order_status,
         value=estimate.values[order] if doubt_reason is None else None,
@@ -242,11 +246,11 @@ def tolerant_pooled_order(
         exact=exact_order,
     )
     if exact_order.mixture and exact_order.reason is not None:
-        return replace(pooled.doubted(exact_order.reason), mixture=True)
+        return replace(tolerant_order.doubted(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
-        return pooled.doubted(_UNEXPLAINED_REASON)
+        return tolerant_order.doubted(_UNEXPLAINED_REASON)
     final_reason = effective_reason(order, refused=refused)
-    return pooled if final_reason is None else pooled.doubted(final_reason)
+    return tolerant_order if final_reason is None else tolerant_order.doubted(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
@@ -275,7 +279,7 @@ def _status_and_reason(
     verdicts: Sequence[Verdict],
     single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
-    """Return the status of one order of the damping, and the reason against reporting it."""
+    """Return the status of an order of the damping, and the reason against it or None."""
     structure = STRUCTURES[freest_fit.structure]
     usual_mode_count = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[
         0
@@ -321,6 +325,6 @@ def _excludes_one(order: PooledParameter, sessions: int) -> bool:
     return abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, sessions - 1) * order.std
 
 
-def _relative_width(interval: tuple[float, float]) -> float:
+def _relative_width(order_interval: tuple[float, float]) -> float:
     """Return the width of an interval as a fraction of the range of orders."""
-    return (interval[1] - interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
+    return (order_interval[1] - order_interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

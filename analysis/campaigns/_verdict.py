@@ -239,8 +239,10 @@ def campaign_verdict(
     )
     adequate_count = sum(verdict.adequate for verdict in verdicts)
     dissenting_sessions = _dissenting_sessions(sessions, lowest_bic_estimate)
-    advice_counts = Counter(advice for verdict in verdicts for advice in verdict.experiments)
-    advice = [
+    advice_counts = Counter(
+        common_advice for verdict in verdicts for common_advice in verdict.experiments
+    )
+    common_advice = [
         experiment
         for experiment, advice_count in advice_counts.most_common()
         if 2 * advice_count > len(verdicts)
@@ -276,14 +278,20 @@ def campaign_verdict(
             sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
             *(finding.sentence for finding in findings),
             *sentences.describe_dissent(
-                [(dissenter.file, dissenter.structure) for dissenter in dissenting_sessions],
+                [
+                    (dissenting_session.file, dissenting_session.structure)
+                    for dissenting_session in dissenting_sessions
+                ],
                 lowest_bic_estimate,
             ),
             *([] if homogeneity.mixed else [sentences.describe_scatter(freest_fit)]),
             *sentences.describe_prediction_errors(freest_fit, validation, len(sessions)),
             *sentences.lost_trials(lost_sessions, len(sessions)),
         ),
-        experiments=(*geometry.recommend_sweeps(sweep_comparison, modal_model, sessions), *advice),
+        experiments=(
+            *geometry.recommend_sweeps(sweep_comparison, modal_model, sessions),
+            *common_advice,
+        ),
     )
 
 

@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RandomEffects:
-    """Pooled estimate of k parameters over K sessions.
+    """Mean of k parameters over K sessions by the random-effects model, and its statistics.
 
     Attributes
     ----------
@@ -118,9 +118,9 @@ def random_effects(
 def _weighted_mean(
     estimates: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the mean weighted by inverse covariances, its covariance, and sum of squares.
+    """Return the mean weighted by inverse covariances, its covariance, and a sum of squares.
 
-    The sum is that of the squared deviations from the mean, weighted in the same way.
+    The sum of squares is that of the deviations from the mean, weighted in the same way.
     """
     precisions = np.linalg.inv(covariances)
     mean_covariance = np.linalg.inv(precisions.sum(axis=0))

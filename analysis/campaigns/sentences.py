@@ -258,12 +258,12 @@ def _extreme_sessions(
     return sorted_entries[0], sorted_entries[-1]
 
 
-def _mean_text(values: Sequence[float], scatter: Heterogeneity) -> str:
+def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
     """Format the mean of values with its unit, and enough digits to distinguish the groups."""
-    _, display_factor, display_unit = label(scatter.quantity)
-    digits = min(decimals(display_factor * max(scatter.between_std, 1e-300)), 9)
+    _, factor, display_unit = label(scatter.quantity)
+    digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
     separator = "·" if display_unit.startswith("10") else " "
-    return f"{display_factor * float(np.mean(values)):.{digits}f}{separator}{display_unit}".rstrip()
+    return f"{factor * float(np.mean(session_values)):.{digits}f}{separator}{display_unit}".rstrip()
 
 
 def _list_files(file_names: Sequence[str]) -> str:
@@ -295,7 +295,7 @@ _NEARLY_INTEGER_DISTANCE: Final = 0.05
 
 
 def describe_orders(
-    freest: PooledEstimate,
+    freest_fit: PooledEstimate,
     alpha: PooledOrder,
     lambda_: PooledOrder,
     validation: Sequence[LeftOutError],
@@ -306,7 +306,7 @@ def describe_orders(
 
     Parameters
     ----------
-    freest : PooledEstimate
+    freest_fit : PooledEstimate
         Pooled estimate of the freest structure.
     alpha, lambda_ : PooledOrder
         Orders of internal and external damping.
@@ -317,7 +317,7 @@ def describe_orders(
     dampings = f"{_order_clause(alpha)}{conjunction}{_order_clause(lambda_)}"
     sentence = f"{dampings[0].upper()}{dampings[1:]}."
     names_by_error: dict[str, list[str]] = {}
-    for structure_name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest.name)):
+    for structure_name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest_fit.name)):
         type_errors = [
             e.error for e in validation if e.method == "record" and e.name == structure_name
         ]
@@ -384,12 +384,12 @@ def _slope_clause(pooled_order: PooledOrder) -> str:
     return f"{loss_name} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
 
 
-def describe_structure(freest: PooledEstimate, lowest_bic_estimate: PooledEstimate) -> str:
+def describe_structure(freest_fit: PooledEstimate, lowest_bic_estimate: PooledEstimate) -> str:
     """Describe the damping structure of the reported parameters, and a simpler one.
 
     Parameters
     ----------
-    freest : PooledEstimate
+    freest_fit : PooledEstimate
         Estimate whose parameters are reported.
     lowest_bic_estimate : PooledEstimate
         Estimate of the lowest BIC.
@@ -397,19 +397,20 @@ def describe_structure(freest: PooledEstimate, lowest_bic_estimate: PooledEstima
     fixed_orders = [
         order_name
         for order_name in _ORDER_NAMES
-        if STRUCTURES[freest.structure].fixed.get(order_name) == 1.0
+        if STRUCTURES[freest_fit.structure].fixed.get(order_name) == 1.0
     ]
-    verb = "is" if len(fixed_orders) == 1 else "are"
+    order_verb = "is" if len(fixed_orders) == 1 else "are"
     consequence = (
-        f"; it assumes that {' and '.join(fixed_orders)} {verb} 1."
+        f"; it assumes that {' and '.join(fixed_orders)} {order_verb} 1."
         if fixed_orders
         else ", so its intervals hold for any simpler one, too."
     )
     structure_sentence = (
-        f"The numbers are those of type {freest.name}: {_describe_damping(freest.structure)}. "
+        f"The numbers are those of type {freest_fit.name}: "
+        f"{_describe_damping(freest_fit.structure)}. "
         f"It is the freest structure that the sessions determine{consequence}"
     )
-    if lowest_bic_estimate.name != freest.name:
+    if lowest_bic_estimate.name != freest_fit.name:
         structure_sentence += (
             f" Type {lowest_bic_estimate.name} has the lowest BIC "
             f"({_describe_damping(lowest_bic_estimate.structure)}); "
@@ -442,8 +443,8 @@ def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[st
 
 
 def describe_selection(
-    ranked: Sequence[PooledEstimate],
-    rivals: Sequence[PooledEstimate],
+    ranked_estimates: Sequence[PooledEstimate],
+    rival_estimates: Sequence[PooledEstimate],
     single_selections: Mapping[str, int],
     sessions: int,
 ) -> str:
@@ -451,26 +452,28 @@ def describe_selection(
 
     Parameters
     ----------
-    ranked : sequence of PooledEstimate
+    ranked_estimates : sequence of PooledEstimate
         Estimates of all structures, the lowest BIC first.
-    rivals : sequence of PooledEstimate
+    rival_estimates : sequence of PooledEstimate
         Estimates whose BIC is not distinguishable from the lowest.
     single_selections : mapping of str to int
         Number of sessions that select each structure by themselves.
     sessions : int
         Number of sessions.
     """
-    lowest_bic_estimate = ranked[0]
+    lowest_bic_estimate = ranked_estimates[0]
     bic_sentence = f"Lowest BIC: type {lowest_bic_estimate.name}."
-    if rivals:
-        rival_names = " or ".join(f"type {rival.name}" for rival in rivals)
+    if rival_estimates:
+        rival_names = " or ".join(f"type {rival.name}" for rival in rival_estimates)
         bic_sentence += (
             f" All sessions together do not distinguish it from {rival_names} (ΔBIC "
-            f"{rivals[0].bic - lowest_bic_estimate.bic:.1f}; 10 = decisive)."
+            f"{rival_estimates[0].bic - lowest_bic_estimate.bic:.1f}; 10 = decisive)."
         )
-    elif len(ranked) > 1:
-        bic_margin = ranked[1].bic - lowest_bic_estimate.bic
-        bic_sentence += f" Next: type {ranked[1].name}, ΔBIC {bic_margin:.3g} (10 = decisive)."
+    elif len(ranked_estimates) > 1:
+        bic_margin = ranked_estimates[1].bic - lowest_bic_estimate.bic
+        bic_sentence += (
+            f" Next: type {ranked_estimates[1].name}, ΔBIC {bic_margin:.3g} (10 = decisive)."
+        )
     selection_counts = {
         f"type {structure_name}": session_count
         for structure_name, session_count in single_selections.items()
@@ -478,41 +481,41 @@ def describe_selection(
     return f"{bic_sentence} {describe_single_sessions(selection_counts, sessions)}"
 
 
-def describe_residual(best: PooledEstimate, adequate: int, sessions: int) -> str:
+def describe_residual(pooled_estimate: PooledEstimate, adequate_count: int, sessions: int) -> str:
     """Describe whether the residual of a damping structure's fit is noise.
 
     Parameters
     ----------
-    best : PooledEstimate
+    pooled_estimate : PooledEstimate
         Pooled estimate of the structure.
-    adequate : int
+    adequate_count : int
         Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
-    if best.misfit > LARGEST_MISFIT:
+    if pooled_estimate.misfit > LARGEST_MISFIT:
         return (
-            f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
-            "beam, and standard deviations are meaningless."
+            f"Its residual is {pooled_estimate.misfit:.3g} times the noise: no structure fitted "
+            "describes the beam, and standard deviations are meaningless."
         )
-    return describe_noise_sessions(adequate, sessions)
+    return describe_noise_sessions(adequate_count, sessions)
 
 
-def describe_noise_sessions(adequate: int, sessions: int) -> str:
+def describe_noise_sessions(adequate_count: int, sessions: int) -> str:
     """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
-    adequate : int
+    adequate_count : int
         Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
-    if adequate == sessions:
+    if adequate_count == sessions:
         return "The residual is noise in every session: the model suffices for these records."
     return (
-        f"The residual is noise in {adequate} of {sessions} sessions; in the others something is "
-        "unexplained."
+        f"The residual is noise in {adequate_count} of {sessions} sessions; in the others "
+        "something is unexplained."
     )
 
 
@@ -653,14 +656,16 @@ def _bias_clause(parameter_bias: ParameterBias) -> str:
     )
 
 
-def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
+def describe_dissent(
+    sessions: Sequence[tuple[str, str]], lowest_bic_estimate: PooledEstimate
+) -> list[str]:
     """List the sessions that alone exclude the damping structure selected by all together.
 
     Parameters
     ----------
     sessions : sequence of tuple
         File of each such session, and the structure that it selects.
-    best : PooledEstimate
+    lowest_bic_estimate : PooledEstimate
         Estimate of the structure that all sessions select together.
     """
     if not sessions:
@@ -674,34 +679,36 @@ def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) 
         else ""
     )
     return [
-        f"Type {best.name} is excluded by {len(sessions)} single "
+        f"Type {lowest_bic_estimate.name} is excluded by {len(sessions)} single "
         f"session{'s' if len(sessions) > 1 else ''}: "
         f"{session_texts}{more_text}. Check their reports (analyze --each) before relying on the "
         "mean."
     ]
 
 
-def describe_scatter(best: PooledEstimate) -> str:
+def describe_scatter(pooled_estimate: PooledEstimate) -> str:
     """Describe whether any parameter varies significantly between the sessions.
 
     The level of the test gives one false alarm in a hundred campaigns.
     """
-    significance_level = _SIGNIFICANCE_LEVEL / max(len(best.parameters), 1)
+    significance_level = _SIGNIFICANCE_LEVEL / max(len(pooled_estimate.parameters), 1)
     varying_labels = [
         label(parameter.name)[0]
-        for parameter in best.parameters
+        for parameter in pooled_estimate.parameters
         if parameter.chance < significance_level
     ]
     if not varying_labels:
-        lowest_p_value = min((parameter.chance for parameter in best.parameters), default=1.0)
+        lowest_p_value = min(
+            (parameter.chance for parameter in pooled_estimate.parameters), default=1.0
+        )
         tau_remark = (
             "; the τ above zero are within chance"
-            if any(parameter.between_std > 0 for parameter in best.parameters)
+            if any(parameter.between_std > 0 for parameter in pooled_estimate.parameters)
             else ""
         )
         return (
             "No significant between-session variance (Cochran's Q, lowest p of "
-            f"{len(best.parameters)}: {probability(lowest_p_value)}{tau_remark})."
+            f"{len(pooled_estimate.parameters)}: {probability(lowest_p_value)}{tau_remark})."
         )
     return (
         f"Between-session variance in {', '.join(varying_labels)} (Cochran's Q): something changes "
@@ -712,13 +719,13 @@ def describe_scatter(best: PooledEstimate) -> str:
 
 
 def describe_prediction_errors(
-    best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
+    pooled_estimate: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
 ) -> list[str]:
     """Describe how well a damping structure predicts a session from the other sessions.
 
     Parameters
     ----------
-    best : PooledEstimate
+    pooled_estimate : PooledEstimate
         Estimate of the structure.
     validation : sequence of LeftOutError
         Errors of sessions predicted from the others.
@@ -728,7 +735,7 @@ def describe_prediction_errors(
     structure_errors = [
         left_out
         for left_out in validation
-        if left_out.method == "record" and left_out.name == best.name
+        if left_out.method == "record" and left_out.name == pooled_estimate.name
     ]
     own_errors = [
         left_out.own_error for left_out in structure_errors if left_out.own_error is not None
@@ -753,43 +760,47 @@ def describe_prediction_errors(
     ]
 
 
-def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
+def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
-    lost : sequence of LostTrial
+    lost_sessions : sequence of LostTrial
         Sessions that were not predicted.
     requested : int
         Number of sessions that were to be predicted.
     """
-    if not lost:
+    if not lost_sessions:
         return []
     reasons_text = "; ".join(
-        f"{trial.path.name}: {trial.reason}" for trial in lost[:_MOST_FILES_LISTED]
+        f"{lost_trial.path.name}: {lost_trial.reason}"
+        for lost_trial in lost_sessions[:_MOST_FILES_LISTED]
     )
     more_text = (
-        f"; and {len(lost) - _MOST_FILES_LISTED} more" if len(lost) > _MOST_FILES_LISTED else ""
+        f"; and {len(lost_sessions) - _MOST_FILES_LISTED} more"
+        if len(lost_sessions) > _MOST_FILES_LISTED
+        else ""
     )
     return [
-        f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
-        f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
-        f"{'was' if len(lost) == 1 else 'were'} not ({reasons_text}{more_text}). Prediction errors "
-        "are averaged over those predicted."
+        f"Of {requested} sessions to be predicted from the others, "
+        f"{requested - len(lost_sessions)} "
+        f"{'was' if requested - len(lost_sessions) == 1 else 'were'} and {len(lost_sessions)} "
+        f"{'was' if len(lost_sessions) == 1 else 'were'} not ({reasons_text}{more_text}). "
+        "Prediction errors are averaged over those predicted."
     ]
 
 
-def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
+def describe_single_sessions(conclusion_counts: Mapping[str, int], sessions: int) -> str:
     """State how many sessions by themselves reach each conclusion.
 
     Parameters
     ----------
-    counts : mapping of str to int
+    conclusion_counts : mapping of str to int
         Number of sessions by their conclusion, the most common first.
     sessions : int
         Number of sessions.
     """
-    (first_conclusion, first_count), *other_conclusions = counts.items()
+    (first_conclusion, first_count), *other_conclusions = conclusion_counts.items()
     other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in other_conclusions)
     return f"Single sessions: {first_conclusion} in {first_count} of {sessions}{other_texts}."
 

@@ -318,7 +318,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
     with _suppress_dask_messages():
         try:
             _check_scheduler(address)
-            client = distributed.Client(
+            dask_client = distributed.Client(
                 address, timeout=_CONNECTION_TIMEOUT_S, set_as_default=False
             )
         except (OSError, ValueError) as error:
@@ -328,10 +328,10 @@ def dask_cluster(address: str) -> Iterator[Workers]:
                 "'dask scheduler' and its workers with 'dask worker ADDRESS', or leave --dask out."
             ) from error
         try:
-            _check_workers(client, address)
-            yield _DaskWorkers(client, address)
+            _check_workers(dask_client, address)
+            yield _DaskWorkers(dask_client, address)
         finally:
-            client.close()
+            dask_client.close()
 
 
 @contextmanager

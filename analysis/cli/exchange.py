@@ -333,13 +333,15 @@ def export_model_command(
     )
 
     def run() -> None:
-        with progress_bar() as progress:
-            progress_task = progress.add_task("", total=None)
+        with progress_bar() as step_progress:
+            progress_task = step_progress.add_task("", total=None)
             linear_model = export_model(
                 source,
                 target,
                 model_options,
-                lambda step: progress.update(progress_task, description=f"{source.name}: {step}"),
+                lambda step: step_progress.update(
+                    progress_task, description=f"{source.name}: {step}"
+                ),
             )
         for summary_line in _model_lines(linear_model, source, target):
             typer.echo(summary_line)
@@ -427,7 +429,7 @@ _RATE_RANGE_HZ: Final = (1.0, 1e6)
 
 
 def _exit_code(run_command: Callable[[], None]) -> int:
-    """Run a function and return the exit code; print an error in one or two sentences."""
+    """Run a command's function, print its error if it raises one, and return the exit code."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError

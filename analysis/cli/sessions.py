@@ -163,15 +163,17 @@ def session_command(
 
 
 def _print_tables(
-    console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
+    console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, summary_table
 
-    welch_results = [result for result in results if result.welch is not None]
+    welch_results = [
+        record_result for record_result in record_results if record_result.welch is not None
+    ]
     if single or not welch_results:
-        for result in results:
-            console.print(result_text(result, verbose=verbose))
+        for record_result in record_results:
+            console.print(result_text(record_result, verbose=verbose))
     else:
         console.print(summary_table(welch_results))
         console.print("")
@@ -181,7 +183,7 @@ def _analyse_all(
     files: Sequence[Path],
     folders: Sequence[Path],
     routes: Routes,
-    rerun: Path | None,
+    rerun_file: Path | None,
     outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report each file; return results, error messages by file, and exit code."""
@@ -197,17 +199,19 @@ def _analyse_all(
     record_results: list[RecordResult] = []
     error_messages: dict[str, str] = {}
     exit_code = 0
-    with progress_bar() as progress:
-        print_message = partial(print_readable, progress.console)
-        step_count = _count_steps(routes, rerun)
-        progress_task = progress.add_task("", total=len(files) * step_count)
+    with progress_bar() as file_progress:
+        print_message = partial(print_readable, file_progress.console)
+        step_count = _count_steps(routes, rerun_file)
+        progress_task = file_progress.add_task("", total=len(files) * step_count)
         for file_number, (session_file, report_folder) in enumerate(
             zip(files, folders, strict=True), start=1
         ):
 
             def on_step(done: str, name: str = session_file.name) -> None:
                 step_weight = _STEPS_PER_FIGURE if done.startswith("figure") else 1
-                progress.update(progress_task, advance=step_weight, description=f"{name}: {done}")
+                file_progress.update(
+                    progress_task, advance=step_weight, description=f"{name}: {done}"
+                )
 
             try:
                 record_results.append(
@@ -215,7 +219,7 @@ def _analyse_all(
                         session_file,
                         report_folder,
                         routes,
-                        rerun,
+                        rerun_file,
                         on_step,
                         print_message,
                         overwrite=outputs.overwrite,
@@ -227,7 +231,7 @@ def _analyse_all(
             ) as error:  # fmt: skip
                 exit_code = max(exit_code, 2 if isinstance(error, SettingsError) else 1)
                 error_messages[str(session_file)] = error_text = _error_message(session_file, error)
-                progress.update(progress_task, completed=file_number * step_count)
+                file_progress.update(progress_task, completed=file_number * step_count)
                 print_message(f"Error: {error_text}")
     return record_results, error_messages, exit_code
 
@@ -243,14 +247,14 @@ def _error_message(session_file: Path, error: Exception) -> str:
     return str(error)
 
 
-def _count_steps(routes: Routes, rerun: Path | None) -> int:
+def _count_steps(routes: Routes, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
     from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import welch_figure_names
 
     figure_names = welch_figure_names(paper=routes.paper, whole_record=routes.whole_record)
     figure_count = (
-        len(figure_names) + routes.whole_record * len(RECORD_FIGURES) + (rerun is not None)
+        len(figure_names) + routes.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
     )
     step_count = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
     return step_count + _STEPS_PER_FIGURE * figure_count
@@ -260,7 +264,7 @@ def _analyse_file(
     session_file: Path,
     report_folder: Path,
     routes: Routes,
-    rerun: Path | None,
+    rerun_file: Path | None,
     on_step: Callable[[str], None],
     print_message: Callable[[str], None],
     *,
@@ -277,10 +281,10 @@ def _analyse_file(
     )  # fmt: skip
     with new_folder(report_folder, overwrite=overwrite) as partial_folder:
         write_report(file_result, partial_folder, on_step, formats=routes.figures)
-    if rerun is not None:
+    if rerun_file is not None:
         from analysis.report import write_rerun_file
 
-        write_rerun_file(file_result, rerun)
+        write_rerun_file(file_result, rerun_file)
         on_step("figure for Rerun")
     return file_result
 

@@ -126,12 +126,12 @@ def _analyse_sessions(
     touched_sessions: list[TouchedSession] = []
     error_messages: dict[str, str] = {}
     touch_analysis = TouchAnalysis(model_file)
-    with progress_bar() as progress:
-        progress_task = progress.add_task("", total=len(files))
+    with progress_bar() as file_progress:
+        progress_task = file_progress.add_task("", total=len(files))
         for file_number, session_file in enumerate(files):
 
             def on_step(step: str, name: str = session_file.name) -> None:
-                progress.update(progress_task, description=f"{name}: {step}")
+                file_progress.update(progress_task, description=f"{name}: {step}")
 
             try:
                 touched_sessions.append(touch_analysis.session(session_file, on_step))
@@ -140,6 +140,6 @@ def _analyse_sessions(
                     str(error) or f"{session_file}: not enough memory; close other programs."
                 )
                 error_messages[str(session_file)] = error_text
-                print_readable(progress.console, f"Error: {error_text}")
-            progress.update(progress_task, completed=file_number + 1)
+                print_readable(file_progress.console, f"Error: {error_text}")
+            file_progress.update(progress_task, completed=file_number + 1)
     return touched_sessions, error_messages

@@ -156,7 +156,7 @@ def _parse_weightings(option_text: str) -> tuple[str, ...]:
 
 
 def _split_list(list_text: str) -> tuple[str, ...]:
-    """Return the names in a comma-separated list, each once, in their order."""
+    """Return the different names in a comma-separated list, in their order."""
     return tuple(
         dict.fromkeys(
             list_entry.strip() for list_entry in list_text.split(",") if list_entry.strip()

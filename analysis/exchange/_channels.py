@@ -124,15 +124,15 @@ def stated_unit(unit: str) -> str:
     return unit_name if unit_count == 1.0 else f"{unit_count!r} {unit_name}"
 
 
-def unit_in_brackets(name: str) -> str | None:
+def unit_in_brackets(channel_name: str) -> str | None:
     """Return the unit in brackets after a name, as in ``Angle [deg]``; None without one."""
-    bracket_match = _BRACKETS_PATTERN.search(name)
+    bracket_match = _BRACKETS_PATTERN.search(channel_name)
     return canonical_unit(bracket_match[1]) if bracket_match else None
 
 
-def unit_in_suffix(name: str) -> str | None:
+def unit_in_suffix(channel_name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
-    _, underscore, last_word = name.strip().rpartition("_")
+    _, underscore, last_word = channel_name.strip().rpartition("_")
     return _NAME_SUFFIXES.get(last_word) if underscore else None
 
 

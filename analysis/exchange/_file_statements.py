@@ -196,22 +196,24 @@ class FileStatements:
                 "--time",
             )
 
-    def _check_times(self, times: FileTimes, rate_hz: float) -> None:
+    def _check_times(self, file_times: FileTimes, rate_hz: float) -> None:
         """Compare the rate stated by the user with the times in the file."""
-        finite_times = times.values[np.isfinite(times.values)]
+        finite_times = file_times.values[np.isfinite(file_times.values)]
         if len(finite_times) < 2:
             return
-        if len(finite_times) < len(times.values):
-            row_number = int(np.argmin(np.isfinite(times.values))) + 1
+        if len(finite_times) < len(file_times.values):
+            row_number = int(np.argmin(np.isfinite(file_times.values))) + 1
             self.report_contradiction(
-                f"the times '{printable(times.name, 60)}' are missing from sample {row_number} on, "
-                f"in {len(times.values) - len(finite_times)} samples, so that these may be none",
+                f"the times '{printable(file_times.name, 60)}' are missing from sample "
+                f"{row_number} on, "
+                f"in {len(file_times.values) - len(finite_times)} samples, so that these may be "
+                "none",
                 "repair or remove their lines",
             )
             return
-        units_s = _TIME_UNITS_S if times.unit_s is None else (times.unit_s,)
+        units_s = _TIME_UNITS_S if file_times.unit_s is None else (file_times.unit_s,)
         time_steps = np.diff(finite_times)
-        times_name = f"'{printable(times.name, 60)}'"
+        times_name = f"'{printable(file_times.name, 60)}'"
         if (time_steps < 0.0).any():
             row_number = int(np.argmax(time_steps < 0.0)) + 2
             if (time_steps < 0.0).all():
@@ -236,30 +238,34 @@ class FileStatements:
             )
             return
         mean_step = float(finite_times[-1] - finite_times[0]) / (len(finite_times) - 1)
-        if mean_step == 0.0 or (times.name == "#1" and mean_step == 1.0):
+        if mean_step == 0.0 or (file_times.name == "#1" and mean_step == 1.0):
             return  # the values are constant or sample numbers
         best_unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * mean_step * unit)))
-        tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(finite_times[-1] - finite_times[0])
+        rate_tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(
+            finite_times[-1] - finite_times[0]
+        )
         missing_ticks = 0
         file_rate_hz = 1 / (mean_step * best_unit_s)
         try:
-            file_timebase = timebase_from_stamps(self.path, times.name, finite_times * best_unit_s)
+            file_timebase = timebase_from_stamps(
+                self.path, file_times.name, finite_times * best_unit_s
+            )
         except ExchangeError:
             pass
         else:
             file_rate_hz, missing_ticks = file_timebase.rate_hz, file_timebase.missing
-            tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(finite_times)
+            rate_tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(finite_times)
         if missing_ticks:
             self.report_contradiction(
                 f"the times {times_name} have gaps of {missing_ticks} samples in all, and a record "
                 "without gaps was stated",
-                f"give --time '{times.name}:UNIT' instead of --rate-hz",
+                f"give --time '{file_times.name}:UNIT' instead of --rate-hz",
             )
-        elif abs(file_rate_hz / rate_hz - 1) > tolerance:
+        elif abs(file_rate_hz / rate_hz - 1) > rate_tolerance:
             self.report_contradiction(
                 f"the times {times_name} show {file_rate_hz:.6g} Hz, and {rate_hz:.6g} Hz was "
                 "stated",
-                f"give --time '{times.name}:UNIT' instead of --rate-hz",
+                f"give --time '{file_times.name}:UNIT' instead of --rate-hz",
             )
 
     def align(
@@ -357,7 +363,7 @@ class FileStatements:
     def _report_shift(
         self,
         statement: str,
-        skips: Mapping[str, int],
+        skipped_samples: Mapping[str, int],
         delays_s: Mapping[str, float],
         rate_hz: float,
     ) -> None:
@@ -376,7 +382,9 @@ class FileStatements:
                     "leave this channel out: no analysis needs it",
                 )
         skips_text = ", ".join(
-            f"{skip_count} of '{name}'" for name, skip_count in skips.items() if skip_count
+            f"{skip_count} of '{name}'"
+            for name, skip_count in skipped_samples.items()
+            if skip_count
         )
         delays_text = ", ".join(
             f"{delay_s:.6g} s of '{name}'"
@@ -396,7 +404,10 @@ record."""
 
 
 def _time_text(time_ns: int) -> str:
-    """Format a time in nanoseconds as a date, or in seconds if it is relative to the record."""
+    """Format a start time in nanoseconds.
+
+    It is shown as a date if it counts from 1970, and in seconds if it is an offset.
+    """
     if abs(time_ns) < _EARLIEST_DATE_NS:
         return f"{time_ns / 1e9:.9g} s"
     return str(np.datetime64(time_ns, "ns")).rstrip("0").rstrip(".")

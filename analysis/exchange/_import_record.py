@@ -147,8 +147,10 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     """
     channel_names = list(dict.fromkeys(choice.channel for choice in plan.choices))
     file_format, channels = read_source(source, channel_names)
-    remarks = dict.fromkeys(channel.remark for channel in channels.values() if channel.remark)
-    statements = FileStatements(source, plan, [*remarks])
+    channel_remarks = dict.fromkeys(
+        channel.remark for channel in channels.values() if channel.remark
+    )
+    statements = FileStatements(source, plan, [*channel_remarks])
     statements.check_scales(channels)
     statements.check_units(channels)
     timebase = statements.timebase(channels)
@@ -170,13 +172,13 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
             f"The time stamps lie up to {timebase.jitter:.2g} periods from equidistant ones."
         )
     warnings += _describe_missing_samples(channel_titles, status_bits, first_sample, ticks)
-    anomaly = torque_anomaly(
+    anomaly_text = torque_anomaly(
         _interpolate_gaps(ticks, si_columns["angle_rad"]),
         _interpolate_gaps(ticks, si_columns["coupling_torque_nm"]),
         timebase.rate_hz,
         plan.specimen,
     )
-    warnings += [anomaly] if anomaly else []
+    warnings += [anomaly_text] if anomaly_text else []
     status_bits[is_after_gap] |= np.uint32(Status.AFTER_LOST)
     start_utc_ns, start_warning = _session_start(source, int(ticks[-1]) / timebase.rate_hz)
     warnings += [start_warning] if start_warning else []
@@ -246,7 +248,7 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
 def _si_columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the fields of the samples in SI units, including values that are not finite."""
+    """Return the channels of the record in SI units, including values that are not finite."""
     si_columns = {}
     with np.errstate(over="ignore"):
         for field_name, choice in plan.channels.items():
@@ -375,7 +377,7 @@ _STALE_FLAGS: Final = {
 
 
 def hold_last_values(
-    path: Path, channel_names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
+    path: Path, channel_names: Mapping[str, str], si_columns: Mapping[str, NDArray[np.float64]]
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
     """Replace values that are not finite by the last finite value, and flag them as stale.
 
@@ -384,7 +386,9 @@ def hold_last_values(
     `first_sample` of initial samples that are left out because no finite value precedes them. Raise
     ExchangeError if too many values are not finite, or if the field of such a value has no flag.
     """
-    bad = {field_name: ~np.isfinite(field_values) for field_name, field_values in columns.items()}
+    bad = {
+        field_name: ~np.isfinite(field_values) for field_name, field_values in si_columns.items()
+    }
     for field_name, is_bad in bad.items():
         bad_count = int(is_bad.sum())
         if bad_count and field_name not in _STALE_FLAGS:
@@ -405,7 +409,7 @@ def hold_last_values(
     first_sample = max(int(np.argmin(is_bad)) for is_bad in bad.values())
     filled_columns = {
         field_name: _hold_last(field_values, bad[field_name])[first_sample:]
-        for field_name, field_values in columns.items()
+        for field_name, field_values in si_columns.items()
     }
     status_bits = np.zeros(len(next(iter(filled_columns.values()))), dtype=np.uint32)
     for field_name, stale_flag in _STALE_FLAGS.items():

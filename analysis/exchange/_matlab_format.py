@@ -48,19 +48,22 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     with path.open("rb") as stream:
         first_bytes = stream.read(max(_HDF5_OFFSETS) + len(_HDF5_MAGIC))
     if any(
-        first_bytes[offset : offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC for offset in _HDF5_OFFSETS
+        first_bytes[magic_offset : magic_offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC
+        for magic_offset in _HDF5_OFFSETS
     ):
         return _read_hdf5(path, names)
     return _read_mat(path, names)
 
 
-def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def _read_mat(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file of version 4 to 7."""
     from scipy.io import loadmat, whosmat
 
     try:
         with bounded_memory():
-            return _read_channels(path, names, whosmat(path), partial(loadmat, spmatrix=False))
+            return _read_channels(
+                path, channel_names, whosmat(path), partial(loadmat, spmatrix=False)
+            )
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # scipy raises many types on a damaged file
@@ -77,26 +80,30 @@ def _read_channels(
     load_variables: Callable[..., Mapping[str, Any]],
 ) -> dict[str, SourceChannel]:
     """Load the requested variables after checking their listed sizes, and return the channels."""
-    shapes = {channel_name: variable_shape for channel_name, variable_shape, _ in variable_list}
+    shape_by_name = {
+        channel_name: variable_shape for channel_name, variable_shape, _ in variable_list
+    }
     variables = {
-        channel_name: _split_element(_split_name(channel_name, shapes)[0])[0]
+        channel_name: _split_element(_split_name(channel_name, shape_by_name)[0])[0]
         for channel_name in channel_names
     }
     for channel_name, variable_name in variables.items():
-        if variable_name not in shapes:
-            raise no_such_channel_error(path, channel_name, shapes)
+        if variable_name not in shape_by_name:
+            raise no_such_channel_error(path, channel_name, shape_by_name)
         check_samples(
-            path, f"The variable '{variable_name}'", max(shapes[variable_name], default=0)
+            path, f"The variable '{variable_name}'", max(shape_by_name[variable_name], default=0)
         )
     time_variables = {
-        n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES
+        n
+        for n in shape_by_name
+        if states_time(n) and max(shape_by_name[n], default=0) <= MAX_SAMPLES
     }
     file_variables = load_variables(
         path, variable_names=sorted(time_variables | set(variables.values()))
     )
     loaded_variables = {
         channel_name: file_variables[channel_name]
-        for channel_name in shapes
+        for channel_name in shape_by_name
         if channel_name in file_variables
     }
 
@@ -185,9 +192,9 @@ def _find_value(path: Path, name: str, variables: Mapping[str, Any]) -> Any:  # 
     variable, field_names, _ = _split_name(name, variables)
     found_value: Any = None
     parent_name = ""
-    for depth, name_component in enumerate((variable, *field_names)):
+    for component_index, name_component in enumerate((variable, *field_names)):
         key, element_index = _split_element(name_component)
-        if depth:
+        if component_index:
             dtype = getattr(found_value, "dtype", None)
             if dtype is None or dtype.names is None:
                 raise ExchangeError(
@@ -212,7 +219,7 @@ def _find_value(path: Path, name: str, variables: Mapping[str, Any]) -> Any:  # 
             raise no_such_channel_error(path, name, variables)
         else:
             found_value = variables[key]
-        parent_name = f"{parent_name}.{name_component}" if depth else name_component
+        parent_name = f"{parent_name}.{name_component}" if component_index else name_component
         if element_index is not None:
             element_count = getattr(found_value, "size", 0)
             if not 0 <= element_index < element_count:
@@ -227,43 +234,52 @@ _OBJECT_TYPES: Final = ("MatlabOpaque", "MatlabObject", "MatlabFunction")
 """Types by which scipy represents MATLAB objects that it cannot read."""
 
 
-def _vector_or_column(path: Path, name: str, array: Any, column_index: int | None) -> NDArray[Any]:  # noqa: ANN401
+def _vector_or_column(
+    path: Path,
+    channel_name: str,
+    array: Any,  # noqa: ANN401
+    column_index: int | None,
+) -> NDArray[Any]:
     """Return an array as a vector of floats, or one column of it; raise if it is neither."""
     array_shape = getattr(array, "shape", None)
     if type(array).__name__ in _OBJECT_TYPES:
         raise ExchangeError(
-            f"{path}: '{name}' is an object of MATLAB (timeseries, table, datetime or the like); "
-            "save its values as vectors, such as t = x.Time; angle = x.Data."
+            f"{path}: '{channel_name}' is an object of MATLAB (timeseries, table, datetime or the "
+            "like); save its values as vectors, such as t = x.Time; angle = x.Data."
         )
     dtype_names = getattr(getattr(array, "dtype", None), "names", None)
     if dtype_names:
-        field_names = ", ".join(f"{name}.{field_name}" for field_name in dtype_names[:12])
+        field_names = ", ".join(f"{channel_name}.{field_name}" for field_name in dtype_names[:12])
         raise ExchangeError(
-            f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
+            f"{path}: '{channel_name}' is a struct; choose one of its fields: {field_names}."
         )
     if array_shape is None or getattr(array, "dtype", None) is None or hasattr(array, "tocoo"):
-        raise ExchangeError(f"{path}: '{name}' is not a full array of numbers; save it as one.")
-    check_samples(path, f"'{name}'", max(array_shape, default=0))
+        raise ExchangeError(
+            f"{path}: '{channel_name}' is not a full array of numbers; save it as one."
+        )
+    check_samples(path, f"'{channel_name}'", max(array_shape, default=0))
     if column_index is None:
         if array.size != max(array_shape, default=0):
             shape_text = "×".join(map(str, array_shape))
             raise ExchangeError(
-                f"{path}: '{name}' is a matrix of {shape_text}; name one of its columns, such as "
-                f"{name}#1."
+                f"{path}: '{channel_name}' is a matrix of {shape_text}; name one of its columns, "
+                f"such as {channel_name}#1."
             )
-        return real_vector(path, name, array.reshape(-1))
+        return real_vector(path, channel_name, array.reshape(-1))
     if array.ndim != 2 or column_index >= array.shape[1]:
         shape_text = "×".join(map(str, array_shape))
-        raise ExchangeError(f"{path}: '{name}' is not a column of it, its size is {shape_text}.")
+        raise ExchangeError(
+            f"{path}: '{channel_name}' is not a column of it, its size is {shape_text}."
+        )
     if array.shape[0] < array.shape[1]:
         raise ExchangeError(
-            f"{path}: '{name}' has {array.shape[0]} values, fewer than there are columns "
+            f"{path}: '{channel_name}' has {array.shape[0]} values, fewer than there are columns "
             f"({array.shape[1]}); channels are columns: save the matrix transposed."
         )
-    return real_vector(path, name, array[:, column_index])
+    return real_vector(path, channel_name, array[:, column_index])
 
 
-def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def _read_hdf5(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file of version 7.3, which is an HDF5 file."""
     try:
         import h5py
@@ -273,8 +289,11 @@ def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             "package h5py."
         ) from error
     try:
-        with bounded_memory(), h5py.File(path, "r") as file:
-            return {name: _read_hdf5_channel(path, file, name, names, h5py) for name in names}
+        with bounded_memory(), h5py.File(path, "r") as hdf5_file:
+            return {
+                channel_name: _read_hdf5_channel(path, hdf5_file, channel_name, channel_names, h5py)
+                for channel_name in channel_names
+            }
     except (ExchangeError, MemoryError):
         raise
     except Exception as error:  # h5py raises many types on a damaged file
@@ -293,53 +312,55 @@ _NUMERIC_CLASSES: Final = (
 
 def _read_hdf5_channel(
     path: Path,
-    file: Any,  # noqa: ANN401
-    name: str,
-    names: Sequence[str],
+    hdf5_file: Any,  # noqa: ANN401
+    channel_name: str,
+    channel_names: Sequence[str],
     h5py: Any,  # noqa: ANN401
 ) -> SourceChannel:
     """Return one channel of a MATLAB file of version 7.3."""
 
     def names_in(parent: str) -> Sequence[str]:
         """Return the names of the members of a group of the file."""
-        group = file[parent.replace(".", "/")] if parent else file
+        group = hdf5_file[parent.replace(".", "/")] if parent else hdf5_file
         return list(group) if isinstance(group, h5py.Group) else ()
 
-    channel_values = _read_hdf5_vector(path, file, name, h5py)
+    channel_values = _read_hdf5_vector(path, hdf5_file, channel_name, h5py)
     rate_hz, file_times = stated_times(
-        name,
-        names,
+        channel_name,
+        channel_names,
         len(channel_values),
         names_in,
-        lambda other: _read_hdf5_vector(path, file, other, h5py),
+        lambda other: _read_hdf5_vector(path, hdf5_file, other, h5py),
     )
     return SourceChannel(channel_values, rate_hz=rate_hz, times=file_times)
 
 
-def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
-    """Return the values of one vector of a MATLAB file of version 7.3."""
-    variable_names = list(file)  # only names, as a link may lead into another file
-    variable, path_names, column_index = _split_name(name, variable_names)
-    dataset = file
+def _read_hdf5_vector(path: Path, hdf5_file: Any, channel_name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
+    """Return the values of the named vector of a MATLAB file of version 7.3."""
+    variable_names = list(hdf5_file)  # only names, as a link may lead into another file
+    variable, path_names, column_index = _split_name(channel_name, variable_names)
+    dataset = hdf5_file
     for name_component in (variable, *path_names):
         link = _hdf5_link(dataset, name_component, h5py)
         if link is None:
             raise no_such_channel_error(
                 path,
-                name,
+                channel_name,
                 (member_name for member_name in variable_names if not member_name.startswith("#")),
             )
         if not isinstance(link, h5py.HardLink):
-            raise _external_data_error(path, name)
+            raise _external_data_error(path, channel_name)
         dataset = dataset[name_component]
     if not isinstance(dataset, h5py.Dataset):
-        field_names = ", ".join(f"{name}.{member_name}" for member_name in list(dataset)[:12])
+        field_names = ", ".join(
+            f"{channel_name}.{member_name}" for member_name in list(dataset)[:12]
+        )
         raise ExchangeError(
-            f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
+            f"{path}: '{channel_name}' is a struct; choose one of its fields: {field_names}."
         )
     if dataset.is_virtual or dataset.external:
-        raise _external_data_error(path, name)
-    check_samples(path, f"'{name}'", max(dataset.shape or (), default=0))
+        raise _external_data_error(path, channel_name)
+    check_samples(path, f"'{channel_name}'", max(dataset.shape or (), default=0))
     matlab_class = dataset.attrs.get("MATLAB_class", b"double")
     matlab_class = (
         matlab_class.decode("ascii", "replace")
@@ -352,19 +373,19 @@ def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[An
         or "MATLAB_empty" in dataset.attrs
     ):
         raise ExchangeError(
-            f"{path}: '{name}' holds no numbers but is of MATLAB's class {matlab_class}, a struct "
-            "array or "
+            f"{path}: '{channel_name}' holds no numbers but is of MATLAB's class {matlab_class}, a "
+            "struct array or "
             "empty; save the values of one record as vectors, such as angle = log(1).angle."
         )
     # HDF5 stores dimensions in the reverse order, so that MATLAB's columns are its rows.
-    return _vector_or_column(path, name, dataset[()].T, column_index)
+    return _vector_or_column(path, channel_name, dataset[()].T, column_index)
 
 
-def _hdf5_link(group: Any, name: str, h5py: Any) -> object:  # noqa: ANN401
+def _hdf5_link(hdf5_group: Any, member_name: str, h5py: Any) -> object:  # noqa: ANN401
     """Return the link to a member of a group, not followed; None without such a member."""
-    if not isinstance(group, h5py.Group) or "/" in name or name in ("", "."):
+    if not isinstance(hdf5_group, h5py.Group) or "/" in member_name or member_name in ("", "."):
         return None
-    return group.get(name, getlink=True)
+    return hdf5_group.get(member_name, getlink=True)
 
 
 def _external_data_error(path: Path, name: str) -> ExchangeError:

@@ -334,9 +334,9 @@ def not_in_time_error(path: Path, name: str) -> ExchangeError:
     )
 
 
-def missing_library_error(path: Path, library: str) -> ExchangeError:
+def missing_library_error(path: Path, library_name: str) -> ExchangeError:
     """Return the error for a library that is not installed."""
     return ExchangeError(
-        f"{path}: needs the package {library}, which is not installed; install all packages for "
-        "import and export with `pip install 'rigd[exchange]'`."
+        f"{path}: needs the package {library_name}, which is not installed; install all packages "
+        "for import and export with `pip install 'rigd[exchange]'`."
     )

@@ -49,7 +49,7 @@ class ExportColumn:
 
 @dataclass(frozen=True, slots=True)
 class ExportTable:
-    """Table for export: columns over a common axis.
+    """Table to be exported: columns of values over a common axis of times or frequencies.
 
     Attributes
     ----------

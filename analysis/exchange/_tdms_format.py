@@ -197,11 +197,11 @@ def _drop_relative_starts(channels: dict[str, SourceChannel]) -> dict[str, Sourc
     }
 
 
-def _unapplied_scale(levels: Sequence[Mapping[str, Any]]) -> str:
+def _unapplied_scale(property_levels: Sequence[Mapping[str, Any]]) -> str:
     """Return the types of scales stated in the properties that npTDMS does not apply."""
     from nptdms.scaling import get_scaling
 
-    for properties in levels:
+    for properties in property_levels:
         scale_types = [
             str(property_value)
             for key, property_value in properties.items()

@@ -123,9 +123,14 @@ def _check_set_count(path: Path) -> None:
 
 
 def _source_channel(
-    path: Path, name: str, data_set: Mapping[str, Any], stamps: NDArray[np.float64], *, timed: bool
+    path: Path,
+    name: str,
+    data_set: Mapping[str, Any],
+    set_abscissae: NDArray[np.float64],
+    *,
+    timed: bool,
 ) -> SourceChannel:
-    """Return one channel of a data set with the given abscissae `stamps`.
+    """Return one channel of a data set with the given abscissae `set_abscissae`.
 
     `timed` states whether the user requests the abscissae as the channel of times.
     """
@@ -143,14 +148,14 @@ def _source_channel(
     unit_s = time_unit_s(abscissa_unit)
     is_time = unit_s is not None or data_set["abscissa_spec_data_type"] == _TIME_CODE
     is_even = data_set["abscissa_spacing"] == 1
-    start_s = float(stamps[0]) * (unit_s or 1.0) if len(stamps) else math.nan
+    start_s = float(set_abscissae[0]) * (unit_s or 1.0) if len(set_abscissae) else math.nan
     unit_label = _label_text(data_set, "ordinate_axis_units_lab")
     return SourceChannel(
         real_vector(path, name, set_values),
         unit_label=unit_label or stated_unit_of(_label_text(data_set, "ordinate_axis_lab")),
         rate_hz=_even_rate_hz(data_set, unit_s or 1.0) if is_time and not timed else None,
         start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
-        times=FileTimes(ABSCISSA, stamps, unit_s)
+        times=FileTimes(ABSCISSA, set_abscissae, unit_s)
         if is_time and not is_even and not timed
         else None,
     )
@@ -224,30 +229,36 @@ _ABSCISSA_TYPES: Final = {18: "frequency", 19: "rpm", 20: "order"}
 """Names of abscissa types that are not times, by their codes."""
 
 
-def _common_times(path: Path, channels: Mapping[str, SourceChannel], times: Sequence[Any]) -> Any:  # noqa: ANN401
+def _common_times(
+    path: Path, channels: Mapping[str, SourceChannel], abscissae_of_sets: Sequence[Any]
+) -> Any:  # noqa: ANN401
     """Return the abscissae of the first channel.
 
     Raise ExchangeError if the abscissae of another channel have other increments, or are shifted
     although both channels state the same start or none.
     """
     channel_names = list(channels)
-    for channel_name, set_times in zip(channel_names, times, strict=True):
+    for channel_name, set_times in zip(channel_names, abscissae_of_sets, strict=True):
         set_start, first_start = (
             channels[channel_name].start_ns,
             channels[channel_names[0]].start_ns,
         )
-        sample_count = min(len(set_times), len(times[0]))
-        step_differences = np.diff(set_times[:sample_count]) - np.diff(times[0][:sample_count])
-        mean_step = np.median(np.diff(times[0])) if len(times[0]) > 1 else 0.0
+        sample_count = min(len(set_times), len(abscissae_of_sets[0]))
+        step_differences = np.diff(set_times[:sample_count]) - np.diff(
+            abscissae_of_sets[0][:sample_count]
+        )
+        mean_step = (
+            np.median(np.diff(abscissae_of_sets[0])) if len(abscissae_of_sets[0]) > 1 else 0.0
+        )
         step_differs = bool(np.abs(step_differences).max(initial=0.0) > _STEP_TOLERANCE * mean_step)
-        if not np.array_equal(set_times, times[0]) and (
+        if not np.array_equal(set_times, abscissae_of_sets[0]) and (
             step_differs or set_start is None or first_start == set_start
         ):
             raise ExchangeError(
                 f"{path}: '{channel_name}' has other times than '{channel_names[0]}'; choose "
                 "channels that were sampled together."
             )
-    return times[0]
+    return abscissae_of_sets[0]
 
 
 # Writing
@@ -454,9 +465,11 @@ def _identification_lines(table: ExportTable, column: ExportColumn) -> tuple[str
     )
 
 
-def _axis_line(axis_type: int, exponents: tuple[int, int], axis_title: str, axis_unit: str) -> str:
+def _axis_line(
+    axis_type: int, unit_exponents: tuple[int, int], axis_title: str, axis_unit: str
+) -> str:
     """Return the line of a header that describes an axis."""
-    length_exponent, force_exponent = exponents
+    length_exponent, force_exponent = unit_exponents
     return (
         f"{axis_type:10d}{length_exponent:5d}{force_exponent:5d}{0:5d} "
         f"{axis_title or 'NONE':20.20} {axis_unit or 'NONE':20.20}"
