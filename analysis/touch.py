@@ -308,7 +308,7 @@ class TouchAnalysis:
         )
 
     def _prepare_model(self, touch_model: TouchModel, rate_hz: float) -> _PreparedModel:
-        """Return estimator and free motion of a model, computed at the first use."""
+        """Return touch estimator and free motion of a beam model, computed at the first use."""
         key = (
             touch_model.beam, touch_model.damping, touch_model.tool_inertia_kg_m2,
             touch_model.angle_delay_s, touch_model.torque_delay_s, touch_model.sensor_filter,

@@ -468,7 +468,10 @@ def _pooled_parameter(
 
 
 def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[float, float]:
-    """Return an interval of a parameter from the centre and half width of its coordinate."""
+    """Return an interval of a parameter from the mean and half width of its coordinate.
+
+    The coordinate is the parameter or its logarithm (see `_coordinate`).
+    """
     if name in LOGARITHMIC_PARAMETERS:
         return math.exp(mean - half_width), math.exp(mean + half_width)
     return mean - half_width, mean + half_width

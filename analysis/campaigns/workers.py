@@ -157,7 +157,7 @@ class Workers:
     def _run_until_process_ends(
         self,
         task_queue: deque[int],
-        submit: Callable[[int], Future[Result]],
+        submit_task: Callable[[int], Future[Result]],
         store_result: Callable[[int, Result], None],
     ) -> list[int]:
         """Run queued tasks until a worker process ends.
@@ -173,7 +173,7 @@ class Workers:
                 task_queue and not interrupted_tasks and len(in_progress) != self._most_in_progress
             ):
                 try:
-                    in_progress[submit(task_queue[0])] = task_queue[0]
+                    in_progress[submit_task(task_queue[0])] = task_queue[0]
                 except BrokenExecutor:
                     if not in_progress:  # an idle process has ended
                         self._replace_executor()
