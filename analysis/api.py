@@ -165,10 +165,10 @@ def fit(
         raise ValueError('Give names in a list, if only one: ["VI"] and not "VI".')
     from analysis.models import STRUCTURES
 
-    unknown = [name for name in types or () if name not in STRUCTURES]
-    if unknown:
+    unknown_types = [type_name for type_name in types or () if type_name not in STRUCTURES]
+    if unknown_types:
         raise ValueError(
-            f"There is no model type {', '.join(map(repr, unknown))}; choose from "
+            f"There is no model type {', '.join(map(repr, unknown_types))}; choose from "
             f"{', '.join(STRUCTURES)}."
         )
     if method == "record":
@@ -177,7 +177,7 @@ def fit(
 
         return fit_record(
             Measurement.of_record(record),
-            [STRUCTURES[name] for name in types or STRUCTURES],
+            [STRUCTURES[type_name] for type_name in types or STRUCTURES],
             fixed=fixed,
             band_hz=record_band_hz(record, band_hz),
         )
@@ -224,8 +224,8 @@ def select(
     """
     from analysis.results import whole_record
 
-    whole = whole_record(record, tuple(fixed), band_hz)
-    return replace(whole.selection, verdict=whole.verdict)
+    record_fits = whole_record(record, tuple(fixed), band_hz)
+    return replace(record_fits.selection, verdict=record_fits.verdict)
 
 
 def campaign(

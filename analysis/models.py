@@ -110,25 +110,29 @@ class Structure:
         """Whether the structure has external damping (of the environment)."""
         return "gamma" in self.free
 
-    def has(self, name: str) -> bool:
+    def has(self, parameter_name: str) -> bool:
         """Return whether the structure has the kind of damping to which a parameter belongs.
 
-        The result is True for a parameter of beam or rig.
+        The kinds are internal and external damping. The result is True for a parameter of beam or
+        rig.
 
         Parameters
         ----------
-        name : str
+        parameter_name : str
             Name of a damping parameter (`PARAMETERS`), or of a parameter of beam or rig.
         """
-        if name in ("zeta", "alpha"):
+        if parameter_name in ("zeta", "alpha"):
             return self.internal
-        if name in ("gamma", "lambda"):
+        if parameter_name in ("gamma", "lambda"):
             return self.external
         return True
 
-    def damping(self, values: Mapping[Parameter, float]) -> Damping:
-        """Return the damping with given values of the free parameters, and the fixed values."""
-        values_by_name = {**self.fixed, **{name: values[name] for name in self.free}}
+    def damping(self, free_values: Mapping[Parameter, float]) -> Damping:
+        """Return the damping with given free parameters, and the structure's fixed ones."""
+        values_by_name = {
+            **self.fixed,
+            **{parameter_name: free_values[parameter_name] for parameter_name in self.free},
+        }
         return Damping(
             zeta=values_by_name["zeta"],
             alpha=values_by_name["alpha"],
@@ -137,10 +141,10 @@ class Structure:
         )
 
 
-def _structure(name: str, fixed: dict[Parameter, float]) -> Structure:
+def _structure(name: str, fixed_values: dict[Parameter, float]) -> Structure:
     """Return a damping structure with given fixed parameters; the other ones are free."""
-    free = tuple(p for p in PARAMETERS if p not in fixed)
-    return Structure(name, free, MappingProxyType(fixed))
+    free_names = tuple(p for p in PARAMETERS if p not in fixed_values)
+    return Structure(name, free_names, MappingProxyType(fixed_values))
 
 
 STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
@@ -200,13 +204,13 @@ class FrequencyResponseModel:
         self._tool_response = tool_inertia_kg_m2 * s * s
 
     def evaluate(self, damping: Damping) -> NDArray[np.complex128]:
-        """Return the response in N·m/rad, shape (n,)."""
+        """Return the modelled torque per motor angle in N·m/rad at all frequencies, shape (n,)."""
         return self._grid.evaluate(self.beam, damping) + self._tool_response
 
     def evaluate_with_gradient(
         self, damping: Damping, wrt: Sequence[str]
     ) -> tuple[NDArray[np.complex128], NDArray[np.complex128]]:
-        """Return the response, shape (n,), and its derivatives by parameters, shape (k, n).
+        """Return torque per angle, shape (n,), and its derivatives by parameters, shape (k, n).
 
         Parameters
         ----------
@@ -264,23 +268,23 @@ def weights(omega_rad_s: NDArray[np.float64], weighting: Weighting) -> NDArray[n
     >>> print(weights(2 * np.pi * np.array([1.0, 2.0, 4.0]), "omega").round(3))
     [0.571 0.286 0.143]
     """
-    name = weighting_name(weighting)
+    shown_name = weighting_name(weighting)
     if callable(weighting):
         p = np.asarray(weighting(omega_rad_s), dtype=np.float64)
         if p.shape != omega_rad_s.shape:
             raise WeightingError(
-                f"The weighting {name} gave values of shape {p.shape} for {omega_rad_s.shape} "
-                "frequencies; it must give one value for each."
+                f"The weighting {shown_name} gave values of shape {p.shape} for "
+                f"{omega_rad_s.shape} frequencies; it must give one value for each."
             )
     else:
         p = omega_rad_s ** _exponent(weighting)
-    total = float(p.sum())
-    if not (math.isfinite(total) and total > 0 and float(p.min()) >= 0):
+    weight_sum = float(p.sum())
+    if not (math.isfinite(weight_sum) and weight_sum > 0 and float(p.min()) >= 0):
         raise WeightingError(
-            f"The weighting {name} must be finite, not negative and not all zero over "
+            f"The weighting {shown_name} must be finite, not negative and not all zero over "
             f"{float(omega_rad_s.min()):g} to {float(omega_rad_s.max()):g} rad/s."
         )
-    return p / total
+    return p / weight_sum
 
 
 def weighting_name(weighting: Weighting) -> str:
@@ -309,12 +313,12 @@ def _exponent(weighting: str) -> float:
         return 0.0
     if weighting == "omega":
         return -1.0
-    base, separator, power = weighting.partition("^")
+    base_name, separator, power_text = weighting.partition("^")
     try:
-        exponent = float(power)
+        exponent = float(power_text)
     except ValueError:
         exponent = math.nan
-    if base != "omega" or not separator or not abs(exponent) <= _LARGEST_EXPONENT:
+    if base_name != "omega" or not separator or not abs(exponent) <= _LARGEST_EXPONENT:
         raise WeightingError(
             f"There is no weighting {weighting!r}; choose const, omega (which is 1/omega) or "
             f"omega^K with a number K from -{_LARGEST_EXPONENT} to {_LARGEST_EXPONENT}, such as "
@@ -419,17 +423,19 @@ class WelchSettings:
         >>> WelchSettings().segmentation(rate_hz=500)
         Segmentation(segment_length=8633, overlap=1295, nfft=80000)
         """
-        scale, paper = rate_hz / PAPER_RATE_HZ, Segmentation()
-        length, overlap, nfft = self.segment_length, self.overlap, self.nfft
-        if overlap is None:
-            overlap = round(
-                paper.overlap * scale if length is None else PAPER_OVERLAP_FRACTION * length
+        rate_ratio, paper_lengths = rate_hz / PAPER_RATE_HZ, Segmentation()
+        segment_length, overlap_samples, fft_length = self.segment_length, self.overlap, self.nfft
+        if overlap_samples is None:
+            overlap_samples = round(
+                paper_lengths.overlap * rate_ratio
+                if segment_length is None
+                else PAPER_OVERLAP_FRACTION * segment_length
             )
-        if length is None:
-            length = round(paper.segment_length * scale)
-        if nfft is None:
-            nfft = max(round(paper.nfft * scale), length)
-        return Segmentation(length, overlap, nfft)
+        if segment_length is None:
+            segment_length = round(paper_lengths.segment_length * rate_ratio)
+        if fft_length is None:
+            fft_length = max(round(paper_lengths.nfft * rate_ratio), segment_length)
+        return Segmentation(segment_length, overlap_samples, fft_length)
 
 
 # Unknowns of a fit to a frequency response
@@ -481,23 +487,29 @@ class DampingUnknowns:
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Lower and upper bounds of the unknowns, each of shape (k,)."""
-        ranges = [
-            ORDER_RANGE if name in ("alpha", "lambda") else tuple(map(math.log, SIZE_RANGE))
-            for name in self.structure.free
+        unknown_ranges = [
+            ORDER_RANGE
+            if parameter_name in ("alpha", "lambda")
+            else tuple(map(math.log, SIZE_RANGE))
+            for parameter_name in self.structure.free
         ]
-        return np.array([low for low, _ in ranges]), np.array([high for _, high in ranges])
+        return np.array([low for low, _ in unknown_ranges]), np.array(
+            [upper_bound for _, upper_bound in unknown_ranges]
+        )
 
     def parameters(self, x: NDArray[np.float64]) -> dict[Parameter, float]:
         """Return the four damping parameters for unknowns `x`, shape (k,)."""
-        free: dict[Parameter, float] = dict(zip(self.structure.free, map(float, x), strict=True))
-        parameters = {**self.structure.fixed, **free}
+        free_unknowns: dict[Parameter, float] = dict(
+            zip(self.structure.free, map(float, x), strict=True)
+        )
+        parameters = {**self.structure.fixed, **free_unknowns}
         if self.structure.internal:
             parameters["zeta"] = math.exp(
-                free["zeta"] - parameters["alpha"] * self.ln_internal_rad_s
+                free_unknowns["zeta"] - parameters["alpha"] * self.ln_internal_rad_s
             )
         if self.structure.external:
             parameters["gamma"] = math.exp(
-                free["gamma"]
+                free_unknowns["gamma"]
                 + self.ln_external_unit
                 - parameters["lambda"] * self.ln_external_rad_s
             )
@@ -514,13 +526,17 @@ class DampingUnknowns:
         damping at the reference frequency is constant.
         """
         parameters = self.parameters(x)
-        indices = {name: i for i, name in enumerate(self.structure.free)}
-        derivative = np.eye(len(indices))
+        unknown_indices = {name: i for i, name in enumerate(self.structure.free)}
+        derivative_matrix = np.eye(len(unknown_indices))
         ln_rad_s = {"alpha": self.ln_internal_rad_s, "lambda": self.ln_external_rad_s}
         for order, coefficient in COEFFICIENT_OF.items():
-            if coefficient in indices:
-                derivative[indices[coefficient], indices[coefficient]] = parameters[coefficient]
-                if order in indices:
+            if coefficient in unknown_indices:
+                derivative_matrix[unknown_indices[coefficient], unknown_indices[coefficient]] = (
+                    parameters[coefficient]
+                )
+                if order in unknown_indices:
                     coefficient_slope = -parameters[coefficient] * ln_rad_s[order]
-                    derivative[indices[coefficient], indices[order]] = coefficient_slope
-        return derivative
+                    derivative_matrix[unknown_indices[coefficient], unknown_indices[order]] = (
+                        coefficient_slope
+                    )
+        return derivative_matrix

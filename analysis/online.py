@@ -93,7 +93,10 @@ class OnlineEstimate:
 
     @property
     def doubt(self) -> str | None:
-        """Reason against all estimates; None if at least one has no flag."""
+        """Reason to doubt all estimates, or None if at least one has no flag.
+
+        Without estimates it is the problem that prevented them.
+        """
         headline = self.headline
         if headline is None:
             return self.problem
@@ -101,16 +104,16 @@ class OnlineEstimate:
             *headline.parameters.values(),
             *(
                 reported_value
-                for mode in headline.modes
-                for reported_value in (mode.frequency_hz, mode.damping_ratio)
+                for reported_mode in headline.modes
+                for reported_value in (reported_mode.frequency_hz, reported_mode.damping_ratio)
             ),
         ]
-        flags = [reported_value.flag for reported_value in reported_values]
-        return None if None in flags else flags[0]
+        value_flags = [reported_value.flag for reported_value in reported_values]
+        return None if None in value_flags else value_flags[0]
 
     @property
     def predicting(self) -> RecordFit | None:
-        """Fit with which the next excitation is planned; None without a fit.
+        """Fit from which the next excitation is planned; None without a fit.
 
         It has internal and external damping. A damping that is insignificant, or whose order is not
         identifiable (so that it may be a stiffness or an inertia), has order 1.
@@ -122,8 +125,10 @@ class OnlineEstimate:
         if headline is None or analysis is None:
             return None
         fit = headline.with_both
-        flagged = {name for name in COEFFICIENT_OF if name in headline.flags}
-        if not flagged or fit is not headline.fit:
+        flagged_orders = {
+            order_name for order_name in COEFFICIENT_OF if order_name in headline.flags
+        }
+        if not flagged_orders or fit is not headline.fit:
             return fit
         return next(
             (
@@ -136,16 +141,16 @@ class OnlineEstimate:
 
     @property
     def plant(self) -> Plant | None:
-        """Plant with which the next excitation is planned; None without a fit.
+        """Model of beam and rig from which the next excitation is planned; None without a fit.
 
-        It is the plant of the fit `predicting`. If a uniform beam does not predict the modal
-        constants, each mode has its own measured stiffness.
+        It is that of the fit `predicting`. If a uniform beam does not predict the modal constants,
+        each mode has its own measured stiffness.
         """
         headline, fit = self.headline, self.predicting
         if headline is None or fit is None:
             return None
-        test = headline.uniform_beam
-        if headline.modal is None or test is None or test.status == "passed":
+        beam_test = headline.uniform_beam
+        if headline.modal is None or beam_test is None or beam_test.status == "passed":
             return fit.plant
         return headline.modal.plant_with_modal_frequencies(fit.plant)
 
@@ -154,7 +159,7 @@ class OnlineEstimate:
         from analysis.identify import headline_json
         from analysis.results import finite
 
-        content: dict[str, Any] = {
+        json_content: dict[str, Any] = {
             "tick": self.tick,
             "duration_s": self.duration_s,
             "whole": self.whole,
@@ -167,25 +172,25 @@ class OnlineEstimate:
         }
         headline, fit, plant = self.headline, self.predicting, self.plant
         if headline and fit and plant and self.analysis:
-            content |= headline_json(None, headline, self.orders, self.findings, self.validity)
-            content |= {
+            json_content |= headline_json(None, headline, self.orders, self.findings, self.validity)
+            json_content |= {
                 "predicting": fit.structure.name,
                 "plant": asdict(plant),
                 "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
                 "noise": _noise_spectrum(self.analysis),
             }
-            del content["file"]
-        return dict(finite(content))
+            del json_content["file"]
+        return dict(finite(json_content))
 
 
 def _noise_spectrum(analysis: RecordAnalysis) -> dict[str, Any]:
-    """Return the noise spectrum, interpolated at a few frequencies, as a JSON document."""
+    """Return frequencies in Hz and the noise spectrum in (N·m)²/Hz there, as a JSON document."""
     import numpy as np
 
     hz = analysis.frequency_hz
     points_hz = np.geomspace(hz[0], hz[-1], _NOISE_POINTS)
-    levels = np.exp(np.interp(points_hz, hz, np.log(analysis.noise_nm2_per_hz)))
-    return {"frequency_hz": points_hz.tolist(), "nm2_per_hz": levels.tolist()}
+    noise_levels = np.exp(np.interp(points_hz, hz, np.log(analysis.noise_nm2_per_hz)))
+    return {"frequency_hz": points_hz.tolist(), "nm2_per_hz": noise_levels.tolist()}
 
 
 class OnlineEstimator:
@@ -227,22 +232,24 @@ class OnlineEstimator:
         self._sample_count = 0
         self._last_selection: Selection | None = None
 
-    def feed(self, samples: NDArray[np.void]) -> None:
-        """Append the next samples of the session.
+    def feed(self, new_samples: NDArray[np.void]) -> None:
+        """Append the next recorded samples of the running session.
 
         Parameters
         ----------
-        samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
+        new_samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
             Samples in the order of their ticks.
         """
         from analysis.record import MAX_SAMPLES, RECORD_FIELDS
 
         if self._sample_count <= MAX_SAMPLES:  # with more samples, `record` raises an error
-            fields = samples[list(RECORD_FIELDS)]
+            record_fields = new_samples[list(RECORD_FIELDS)]
             self._blocks.append(
-                fields.astype([(name, fields.dtype[name]) for name in RECORD_FIELDS])
+                record_fields.astype(
+                    [(field_name, record_fields.dtype[field_name]) for field_name in RECORD_FIELDS]
+                )
             )
-            self._sample_count += len(samples)
+            self._sample_count += len(new_samples)
 
     def record(self, up_to_tick: int | None = None) -> Record:
         """Return the record of the samples so far, as `analysis.load` returns it for a file.
@@ -263,10 +270,10 @@ class OnlineEstimator:
 
         if len(self._blocks) > 1:
             self._blocks = [np.concatenate(self._blocks)]
-        samples = self._blocks[0] if self._blocks else np.zeros(0, [("tick", "<u4")])
+        past_samples = self._blocks[0] if self._blocks else np.zeros(0, [("tick", "<u4")])
         if up_to_tick is not None:
-            samples = samples[: np.searchsorted(samples["tick"], max(up_to_tick, 0))]
-        end = int(samples["tick"][-1]) + 1 if len(samples) else 0
+            past_samples = past_samples[: np.searchsorted(past_samples["tick"], max(up_to_tick, 0))]
+        end = int(past_samples["tick"][-1]) + 1 if len(past_samples) else 0
         # Segments after the last sample are still to come, and do not count as cut short.
         past_segments = segments_until(self._segments, end)
         if not end or ("sweep" in self._segments and "sweep" not in past_segments):
@@ -274,7 +281,7 @@ class OnlineEstimator:
         return record_of(
             Session(
                 path=self._path,
-                samples=samples,
+                samples=past_samples,
                 start_utc_ns=0,
                 metadata=self._metadata,
                 segments=past_segments,
@@ -311,38 +318,40 @@ class OnlineEstimator:
         from analysis.validity import record_validity
 
         started_s = time.monotonic()
-        tick, duration_s = up_to_tick or 0, 0.0
+        end_tick, duration_s = up_to_tick or 0, 0.0
         try:
             record = self.record(up_to_tick)
-            tick = round((record.time_s[-1]) * record.rate_hz) + 1
+            end_tick = round((record.time_s[-1]) * record.rate_hz) + 1
             duration_s = record.time_s.size / record.rate_hz
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
-            orders: tuple[OrderVerdict, ...] = ()
+            order_verdicts: tuple[OrderVerdict, ...] = ()
             if whole:
                 last_selection = self._last_selection if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=last_selection)
                 self._last_selection = selection
                 headline, analysis = selection.headline, selection.analysis
                 findings = selection.verdict.findings
-                orders = (selection.verdict.alpha, selection.verdict.lambda_)
+                order_verdicts = (selection.verdict.alpha, selection.verdict.lambda_)
             else:
                 headline, findings, analysis = fit_freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
             # A running session receives the reason and continues, as later samples may suffice.
             is_expected = isinstance(error, SessionError | RecordError | MeasurementError)
-            problem = f"The record so far cannot be fitted ({error!r})."
-            problem = str(error).removeprefix(f"{self._path}: ") if is_expected else problem
+            problem_text = f"The record so far cannot be fitted ({error!r})."
+            problem_text = (
+                str(error).removeprefix(f"{self._path}: ") if is_expected else problem_text
+            )
             took_s = time.monotonic() - started_s
-            return OnlineEstimate(tick, duration_s, whole, took_s, problem=problem)
+            return OnlineEstimate(end_tick, duration_s, whole, took_s, problem=problem_text)
         has_modes = bool(headline.visible_modes)
         plant = headline.fit.plant
         return OnlineEstimate(
-            tick=tick,
+            tick=end_tick,
             duration_s=duration_s,
             whole=whole,
             took_s=time.monotonic() - started_s,
             headline=headline if has_modes else None,
-            orders=orders if has_modes else (),
+            orders=order_verdicts if has_modes else (),
             findings=findings
             if has_modes
             else tuple(finding for finding in findings if finding.kind in _FINDINGS_WITHOUT_MODES),
@@ -358,12 +367,12 @@ class OnlineEstimator:
 # The program
 
 
-def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
+def serve(stream_start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
     """Fit a session's samples from a stream, and write the estimates to standard output.
 
     Parameters
     ----------
-    start : StreamStart
+    stream_start : StreamStart
         Metadata and segments of the session, and the interval of estimates.
     frames : iterator
         Samples and requests, from `rigd.session.online_fit.read_frames`.
@@ -373,55 +382,59 @@ def serve(start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateReques
     SessionError
         The stream is broken.
     """
-    fit = OnlineEstimator(start.metadata, start.segments)
-    received: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
-    received = queue.SimpleQueue()
+    online_estimator = OnlineEstimator(stream_start.metadata, stream_start.segments)
+    frame_queue: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
+    frame_queue = queue.SimpleQueue()
 
     def receive_frames() -> None:
         """Put all frames of the stream into the queue, then an error or None."""
         # This runs in a thread of its own, so that the sender never waits for the fit.
         end = None
         try:
-            for frame in frames:
-                received.put(frame)
+            for stream_frame in frames:
+                frame_queue.put(stream_frame)
         except SessionError as error:
             end = error
-        received.put(end)
+        frame_queue.put(end)
 
     threading.Thread(target=receive_frames, daemon=True).start()
-    due_s = None if start.every_s is None else time.monotonic() + start.every_s
-    number = 0
+    due_s = None if stream_start.every_s is None else time.monotonic() + stream_start.every_s
+    estimate_count = 0
     while True:
         try:
-            frame = received.get(
+            stream_frame = frame_queue.get(
                 timeout=None if due_s is None else max(due_s - time.monotonic(), 0)
             )
         except queue.Empty:
             # All samples received so far are in the estimate.
-            assert start.every_s is not None
-            due_s = time.monotonic() + start.every_s
-            _write_estimate(fit, EstimateRequest(number, _TICK_BEYOND_ALL, whole=False))
-            number += 1
+            assert stream_start.every_s is not None
+            due_s = time.monotonic() + stream_start.every_s
+            _write_estimate(
+                online_estimator, EstimateRequest(estimate_count, _TICK_BEYOND_ALL, whole=False)
+            )
+            estimate_count += 1
             continue
-        if frame is None:
+        if stream_frame is None:
             return
-        if isinstance(frame, SessionError):
-            raise frame
-        if isinstance(frame, EstimateRequest):
-            _write_estimate(fit, frame)
+        if isinstance(stream_frame, SessionError):
+            raise stream_frame
+        if isinstance(stream_frame, EstimateRequest):
+            _write_estimate(online_estimator, stream_frame)
         else:
-            fit.feed(frame)
+            online_estimator.feed(stream_frame)
 
 
 _TICK_BEYOND_ALL: Final = 1 << 32
 """Tick beyond all ticks of a session, for an estimate from all samples."""
 
 
-def _write_estimate(fit: OnlineEstimator, request: EstimateRequest) -> None:
+def _write_estimate(online_estimator: OnlineEstimator, request: EstimateRequest) -> None:
     """Write the requested estimate as a line of JSON to standard output."""
-    estimate = fit.estimate(request.tick, whole=request.whole, from_last=request.from_last)
-    line = json.dumps({"id": request.id, **estimate.as_json()}, allow_nan=False)
-    sys.stdout.write(line + "\n")
+    online_estimate = online_estimator.estimate(
+        request.tick, whole=request.whole, from_last=request.from_last
+    )
+    json_line = json.dumps({"id": request.id, **online_estimate.as_json()}, allow_nan=False)
+    sys.stdout.write(json_line + "\n")
     sys.stdout.flush()
 
 
@@ -429,18 +442,18 @@ def main() -> None:
     """Read a session's samples from standard input, and write estimates to standard output."""
     # Ctrl-C stops the session safely. This program ends with the stream.
     ignore()
-    parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
-    begin_background(parser)
+    argument_parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
+    begin_background(argument_parser)
     try:
         # With `sys.stdin`, the interpreter would wait for the reading thread at its end, and abort.
-        stream = open(0, "rb", closefd=False)  # noqa: SIM115
-        start = read_start(stream)
-        if start.every_s is None:
+        sample_stream = open(0, "rb", closefd=False)  # noqa: SIM115
+        stream_start = read_start(sample_stream)
+        if stream_start.every_s is None:
             os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
         else:
             give_way()  # estimates at intervals are not awaited
         with suppress(BrokenPipeError):  # the reader of the estimates has ended
-            serve(start, read_frames(stream))
+            serve(stream_start, read_frames(sample_stream))
     except SessionError as error:
         sys.exit(f"Error: {error}")
 

@@ -56,8 +56,8 @@ class NormalEquations:
 
         The scales are the square roots of the diagonal of the Hessian.
         """
-        scale = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
-        return self.hessian / np.outer(scale, scale), scale
+        scales = np.sqrt(np.maximum(np.diag(self.hessian), np.finfo(float).tiny))
+        return self.hessian / np.outer(scales, scales), scales
 
     def held(
         self, x: NDArray[np.float64], lower: NDArray[np.float64], upper: NDArray[np.float64]
@@ -141,7 +141,7 @@ class Box:
     """Upper bounds, shape (k,)."""
 
     def limits(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return infinite limits of a step, because `end` clips the step."""
+        """Return infinite limits for the change of each unknown, because `end` clips the step."""
         return np.full(x.size, -np.inf), np.full(x.size, np.inf)
 
     def end(self, x: NDArray[np.float64], step: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -207,86 +207,104 @@ def descend(
         number of evaluations, because other descents explain the data better.
     """
     x = np.clip(start, region.lower, region.upper)
-    current = problem(x)
-    evaluations = 1
-    uses_second = second_part is not None
-    second_estimate = np.zeros_like(current.hessian) if second_part is None else second_part
+    current_equations = problem(x)
+    evaluation_count = 1
+    has_second_part = second_part is not None
+    second_estimate = (
+        np.zeros_like(current_equations.hessian) if second_part is None else second_part
+    )
     damping, damping_growth = _FIRST_DAMPING, 2.0
-    while evaluations < max_evaluations:
-        held = current.held(x, region.lower, region.upper)
-        free = ~held & (current.hessian.diagonal() > 0)
-        if not free.any():
+    while evaluation_count < max_evaluations:
+        is_held = current_equations.held(x, region.lower, region.upper)
+        is_free = ~is_held & (current_equations.hessian.diagonal() > 0)
+        if not is_free.any():
             break
-        if hopeless is not None and evaluations >= hopeless[0] and current.cost > hopeless[1]:
+        if (
+            hopeless is not None
+            and evaluation_count >= hopeless[0]
+            and current_equations.cost > hopeless[1]
+        ):
             break
-        limits = region.limits(x)
-        model = current.hessian + second_estimate if uses_second else current.hessian
-        step = _compute_step(model, current, free, damping, limits)
+        step_limits = region.limits(x)
+        model_hessian = (
+            current_equations.hessian + second_estimate
+            if has_second_part
+            else current_equations.hessian
+        )
+        step = _compute_step(model_hessian, current_equations, is_free, damping, step_limits)
         if step is None:  # not convex
-            uses_second, model = False, current.hessian
-            step = _compute_step(model, current, free, damping, limits)
+            has_second_part, model_hessian = False, current_equations.hessian
+            step = _compute_step(model_hessian, current_equations, is_free, damping, step_limits)
         if step is None:
             break
-        trial = region.end(x, step)
-        step = trial - x  # the prediction is for the step after clipping
-        predicted = -float(step @ (2 * current.gradient + model @ step))
+        trial_point = region.end(x, step)
+        step = trial_point - x  # the prediction is for the step after clipping
+        predicted_reduction = -float(step @ (2 * current_equations.gradient + model_hessian @ step))
         if float(np.abs(step).max()) < _SHORTEST_STEP * (1 + float(np.abs(x).max())):
             break
-        if 0 <= predicted < relative_tolerance * current.cost and damping < 1:
+        if 0 <= predicted_reduction < relative_tolerance * current_equations.cost and damping < 1:
             break
-        next_equations = problem(trial)
-        evaluations += 1
-        reduction = current.cost - next_equations.cost
-        if reduction > 0:
-            gauss_newton_prediction = -float(step @ (2 * current.gradient + current.hessian @ step))
-            second_part_effect = float(step @ second_estimate @ step)
-            uses_second = abs(reduction - (gauss_newton_prediction - second_part_effect)) <= abs(
-                reduction - gauss_newton_prediction
+        next_equations = problem(trial_point)
+        evaluation_count += 1
+        cost_reduction = current_equations.cost - next_equations.cost
+        if cost_reduction > 0:
+            gauss_newton_prediction = -float(
+                step @ (2 * current_equations.gradient + current_equations.hessian @ step)
             )
-            second_estimate = _update_second_part(second_estimate, step, current, next_equations)
-            prediction_ratio = reduction / predicted if predicted > 0 else 0.0
+            second_part_effect = float(step @ second_estimate @ step)
+            has_second_part = abs(
+                cost_reduction - (gauss_newton_prediction - second_part_effect)
+            ) <= abs(cost_reduction - gauss_newton_prediction)
+            second_estimate = _update_second_part(
+                second_estimate, step, current_equations, next_equations
+            )
+            prediction_ratio = (
+                cost_reduction / predicted_reduction if predicted_reduction > 0 else 0.0
+            )
             damping *= max(_SMALLEST_DAMPING_FACTOR, 1 - (2 * prediction_ratio - 1) ** 3)
             damping_growth = 2.0
-            x, current = trial, next_equations
-        elif uses_second:
-            uses_second = False
+            x, current_equations = trial_point, next_equations
+        elif has_second_part:
+            has_second_part = False
         else:
             damping *= damping_growth
             damping_growth *= 2
             if damping > _LARGEST_DAMPING:
                 break
-    return Minimum(x, current, evaluations, second_estimate)
+    return Minimum(x, current_equations, evaluation_count, second_estimate)
 
 
 def _compute_step(
-    model: NDArray[np.float64],
-    current: NormalEquations,
-    free: NDArray[np.bool_],
+    model_hessian: NDArray[np.float64],
+    current_equations: NormalEquations,
+    is_free: NDArray[np.bool_],
     damping: float,
-    limits: tuple[NDArray[np.float64], NDArray[np.float64]],
+    step_limits: tuple[NDArray[np.float64], NDArray[np.float64]],
 ) -> NDArray[np.float64] | None:
     """Return the step to the minimum of a damped quadratic model, (k,); None if not convex.
 
     An unknown that would exceed its limit is set to the limit, and the others are optimised again.
     """
-    smallest, largest = limits
-    step = np.zeros(free.size)
-    curvature = current.hessian.diagonal()
-    damped_model = model + np.diag(
-        damping * np.maximum(curvature, _SMALLEST_CURVATURE * curvature[free].max())
+    smallest_step, largest_step = step_limits
+    step = np.zeros(is_free.size)
+    curvatures = current_equations.hessian.diagonal()
+    damped_model = model_hessian + np.diag(
+        damping * np.maximum(curvatures, _SMALLEST_CURVATURE * curvatures[is_free].max())
     )
-    free_indices = np.flatnonzero(free)
+    free_indices = np.flatnonzero(is_free)
     while free_indices.size:
-        block = damped_model[free_indices[:, None], free_indices]
+        hessian_block = damped_model[free_indices[:, None], free_indices]
         step[free_indices] = 0.0
-        gradient = current.gradient[free_indices] + model[free_indices] @ step
+        gradient = current_equations.gradient[free_indices] + model_hessian[free_indices] @ step
         try:
-            np.linalg.cholesky(block)
-            solution = np.linalg.solve(block, -gradient)
+            np.linalg.cholesky(hessian_block)
+            free_step = np.linalg.solve(hessian_block, -gradient)
         except np.linalg.LinAlgError:
             return None
-        step[free_indices] = np.clip(solution, smallest[free_indices], largest[free_indices])
-        is_limited = step[free_indices] != solution
+        step[free_indices] = np.clip(
+            free_step, smallest_step[free_indices], largest_step[free_indices]
+        )
+        is_limited = step[free_indices] != free_step
         if not is_limited.any():
             break
         free_indices = free_indices[~is_limited]
@@ -296,26 +314,32 @@ def _compute_step(
 def _update_second_part(
     second_estimate: NDArray[np.float64],
     step: NDArray[np.float64],
-    current: NormalEquations,
+    current_equations: NormalEquations,
     next_equations: NormalEquations,
 ) -> NDArray[np.float64]:
     """Return the second part of the Hessian, updated after a step by the secant rule of NL2SOL."""
-    gradient_change = next_equations.gradient - current.gradient
-    curvature = float(gradient_change @ step)
-    if curvature <= 0:
+    gradient_change = next_equations.gradient - current_equations.gradient
+    step_curvature = float(gradient_change @ step)
+    if step_curvature <= 0:
         return second_estimate
-    second_change = gradient_change - (current.hessian + next_equations.hessian) @ step / 2
+    second_change = (
+        gradient_change - (current_equations.hessian + next_equations.hessian) @ step / 2
+    )
     predicted_change = second_estimate @ step
-    size = abs(float(step @ predicted_change))
-    if size > 0:  # an estimate from a higher cost may be too large here
-        overlap = min(1.0, abs(float(step @ second_change)) / size)
-        second_estimate, predicted_change = overlap * second_estimate, overlap * predicted_change
-    error = second_change - predicted_change
-    update = np.outer(error, gradient_change)
+    change_size = abs(float(step @ predicted_change))
+    if change_size > 0:  # an estimate from a higher cost may be too large here
+        overlap_factor = min(1.0, abs(float(step @ second_change)) / change_size)
+        second_estimate, predicted_change = (
+            overlap_factor * second_estimate,
+            overlap_factor * predicted_change,
+        )
+    change_error = second_change - predicted_change
+    outer_update = np.outer(change_error, gradient_change)
     return (
         second_estimate
-        + (update + update.T) / curvature
-        - (float(error @ step) / curvature**2) * np.outer(gradient_change, gradient_change)
+        + (outer_update + outer_update.T) / step_curvature
+        - (float(change_error @ step) / step_curvature**2)
+        * np.outer(gradient_change, gradient_change)
     )
 
 

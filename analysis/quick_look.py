@@ -96,41 +96,41 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     from analysis.results import finite
 
     started_s = time.monotonic()
-    modes: list[dict[str, Any]] = []
-    response, coherence, model = None, _empty_coherence(), None
+    mode_documents: list[dict[str, Any]] = []
+    response_document, coherence_document, model_document = None, _empty_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
-    flags: list[str] = []
+    quality_flags: list[str] = []
     validity = Validity()
     comparison = None
     try:
         record = load_record(path)
     except RecordError as error:
-        flags.append(_remove_file_name(str(error), path))
+        quality_flags.append(_remove_file_name(str(error), path))
     else:
         metadata = record.metadata
         specimen, excitation = metadata.get("specimen", ""), metadata.get("excitation", "")
         session_id = metadata.get("id", path.stem)
         start_utc_ns = _parse_integer(metadata.get("start_utc_ns", ""))
-        flags += record.warnings
+        quality_flags += record.warnings
         headline, validity, remarks = _fit_headline(record)
-        modes = (
+        mode_documents = (
             []
             if headline is None
             else [_mode_document(reported_mode) for reported_mode in headline.modes]
         )
-        flags += remarks
-        response, coherence, remarks = _response_document(record)
-        flags += remarks
-        if headline is not None and response is not None:
-            model = _model_document(headline, record, response["frequency_hz"])
+        quality_flags += remarks
+        response_document, coherence_document, remarks = _response_document(record)
+        quality_flags += remarks
+        if headline is not None and response_document is not None:
+            model_document = _model_document(headline, record, response_document["frequency_hz"])
     last_quick_look_document = (
         _stored_quick_look(last)
         if last is not None
         else _last_quick_look(path, specimen, start_utc_ns)
     )
-    if last_quick_look_document is not None and any(mode["shown"] for mode in modes):
-        comparison = _compare_modes(modes, last_quick_look_document)
-    document = {
+    if last_quick_look_document is not None and any(mode["shown"] for mode in mode_documents):
+        comparison = _compare_modes(mode_documents, last_quick_look_document)
+    quick_look_document = {
         "version": QUICK_LOOK_VERSION,
         "file": path.name,
         "session_id": session_id,
@@ -139,33 +139,40 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         "took_s": round(time.monotonic() - started_s, 2),
         "specimen": specimen,
         "excitation": excitation,
-        "modes": modes,
+        "modes": mode_documents,
         "validity": validity.as_json(),
-        "coherence": coherence,
-        "flags": flags,
+        "coherence": coherence_document,
+        "flags": quality_flags,
         "against_last": comparison,
-        "response": response,
-        "model": model,
+        "response": response_document,
+        "model": model_document,
     }
-    document["text"] = list(_text_lines(document))
-    return dict(finite(document))
+    quick_look_document["text"] = list(_text_lines(quick_look_document))
+    return dict(finite(quick_look_document))
 
 
 def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]:
-    """Fit a record; return the estimates (or None), their validity, and remarks."""
+    """Fit a record; return its reported estimates, their validity, and remarks.
+
+    The estimates are None if the record is not fitted.
+    """
     from analysis.identify import Measurement, MeasurementError, fit_freest_alone
     from analysis.results import whole_record
     from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
 
     sentences = []
-    length_s = record.time_s.size / record.rate_hz
+    duration_s = record.time_s.size / record.rate_hz
     headline: Headline
     findings: tuple[Finding, ...]
     try:
-        if length_s <= _LONGEST_FULL_ANALYSIS_S:
-            whole = whole_record(record)
-            headline, findings, validity = whole.headline, whole.verdict.findings, whole.validity
+        if duration_s <= _LONGEST_FULL_ANALYSIS_S:
+            whole_fits = whole_record(record)
+            headline, findings, validity = (
+                whole_fits.headline,
+                whole_fits.verdict.findings,
+                whole_fits.validity,
+            )
         else:
             headline, findings, _ = fit_freest_alone(
                 Measurement.of_record(record), record_band_hz(record)
@@ -173,7 +180,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             model = headline.fit.plant.beam, headline.fit.plant.damping
             validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
             sentences.append(
-                f"The record is long ({length_s:.0f} s): type {headline.name} alone was fitted; "
+                f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "
                 "not tried. analyze tries them."
             )
@@ -189,7 +196,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
 
 
 def _mode_document(mode: ReportedMode) -> dict[str, Any]:
-    """Return a mode as part of the JSON document."""
+    """Return one mode (frequency, damping ratio, visibility) as a section of the JSON document."""
     return {
         "mode": mode.number,
         "frequency_hz": mode.frequency_hz.as_json(),
@@ -216,24 +223,25 @@ def _model_document(
 
     if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    shown = ShownModel.of(headline, record)
-    peaks_hz = [mode.frequency_hz for mode in shown.modes]
-    band = shown.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
-    magnitude, limits = np.abs(band.response), band.magnitude_limits()
-    selected = response_decimation(band.frequency_hz).extremes(magnitude)
+    shown_model = ShownModel.of(headline, record)
+    peaks_hz = [mode.frequency_hz for mode in shown_model.modes]
+    response_band = shown_model.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
+    magnitude, magnitude_limits = np.abs(response_band.response), response_band.magnitude_limits()
+    selected_bins = response_decimation(response_band.frequency_hz).extremes(magnitude)
     return {
-        "frequency_hz": _round_digits(band.frequency_hz[selected]),
-        "magnitude": _round_digits(magnitude[selected]),
-        "magnitude_low_95": _round_digits(limits[0][selected]),
-        "magnitude_high_95": _round_digits(limits[1][selected]),
-        "phase_rad": _round_digits(np.angle(band.response[selected])),
+        "frequency_hz": _round_digits(response_band.frequency_hz[selected_bins]),
+        "magnitude": _round_digits(magnitude[selected_bins]),
+        "magnitude_low_95": _round_digits(magnitude_limits[0][selected_bins]),
+        "magnitude_high_95": _round_digits(magnitude_limits[1][selected_bins]),
+        "phase_rad": _round_digits(np.angle(response_band.response[selected_bins])),
     }
 
 
 def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str, Any], list[str]]:
     """Return response and coherence at the excited frequencies, and remarks.
 
-    The estimates are those of the live view.
+    The first two are sections of the JSON document; the response is None if it cannot be estimated.
+    The estimates are those of the live view of a running session.
     """
     import numpy as np
 
@@ -248,34 +256,47 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     try:
         estimate = _estimate_response(record, segments, last_hz)
         # For steps, multisines and narrow sweeps, the coherence would depend on the segments.
-        coherence = None
+        coherence_values = None
         if estimate is not None and welch_exclusion_reason(record, (FIRST_HZ, last_hz)) is None:
-            coherence, segments = _estimate_coherence(record, estimate, segments, last_hz)
+            coherence_values, segments = _estimate_coherence(record, estimate, segments, last_hz)
     except SpectralError as error:
         return None, _empty_coherence(), [str(error)]
     if estimate is None:
         return None, _empty_coherence(), []
-    undelayed = estimate.response.without_delays(
+    undelayed_response = estimate.response.without_delays(
         input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
     )
-    shown = (
-        estimate.excited & (undelayed.frequency_hz >= FIRST_HZ) & np.isfinite(undelayed.response)
+    is_shown = (
+        estimate.excited
+        & (undelayed_response.frequency_hz >= FIRST_HZ)
+        & np.isfinite(undelayed_response.response)
     )
-    hz, values = undelayed.frequency_hz[shown], undelayed.response[shown]
-    selected = response_decimation(hz).extremes(np.abs(values))
-    response = {
-        "frequency_hz": _round_digits(hz[selected]),
-        "magnitude": _round_digits(np.abs(values[selected])),
-        "phase_rad": _round_digits(np.angle(values[selected])),
-        "coherence": None if coherence is None else _round_digits(coherence[shown][selected]),
+    hz, shown_values = (
+        undelayed_response.frequency_hz[is_shown],
+        undelayed_response.response[is_shown],
+    )
+    selected_bins = response_decimation(hz).extremes(np.abs(shown_values))
+    response_document = {
+        "frequency_hz": _round_digits(hz[selected_bins]),
+        "magnitude": _round_digits(np.abs(shown_values[selected_bins])),
+        "phase_rad": _round_digits(np.angle(shown_values[selected_bins])),
+        "coherence": None
+        if coherence_values is None
+        else _round_digits(coherence_values[is_shown][selected_bins]),
         "resolution_hz": round(resolution_hz, 4),
     }
-    if coherence is None or hz.size == 0:
-        return response, _empty_coherence(), []
-    coherent = coherence[shown]
-    low = _join_bins(hz, coherent < LOW_COHERENCE, record.rate_hz / segments.segment_length)
-    bands = [[round(edge, 3) for edge in band] for band in low]
-    return response, {"mean": round(float(coherent.mean()), 4), "low_bands": bands}, []
+    if coherence_values is None or hz.size == 0:
+        return response_document, _empty_coherence(), []
+    shown_coherence = coherence_values[is_shown]
+    incoherent_bands = _join_bins(
+        hz, shown_coherence < LOW_COHERENCE, record.rate_hz / segments.segment_length
+    )
+    low_bands = [[round(band_edge, 3) for band_edge in band] for band in incoherent_bands]
+    return (
+        response_document,
+        {"mean": round(float(shown_coherence.mean()), 4), "low_bands": low_bands},
+        [],
+    )
 
 
 def _estimate_response(
@@ -287,41 +308,45 @@ def _estimate_response(
     from rigd.spectral import RunningResponse
 
     sweep_range, rest_rad = record.first_sweep, record.rest_angle_rad or 0.0
-    running = RunningResponse(
+    running_response = RunningResponse(
         record.rate_hz, record.first_sweep_samples, last_hz=last_hz, segmentation=segments
     )
-    running.feed(
+    running_response.feed(
         np.arange(record.first_sweep_samples),
         record.reference_rad[sweep_range] - rest_rad,
         record.angle_rad[sweep_range] - rest_rad,
         record.torque_nm[sweep_range],
     )
-    return running.estimate()
+    return running_response.estimate()
 
 
 def _estimate_coherence(
     record: Record, estimate: RunningEstimate, segments: Segmentation, last_hz: float
 ) -> tuple[Real | None, Segmentation]:
-    """Return the coherence, from shorter segments if there is only one, and these segments."""
+    """Return the coherence of a record, and the segments by which it is estimated.
+
+    If `segments` give only one segment, which has no coherence, shorter ones are used. The
+    coherence is None if these do not give an estimate either.
+    """
     from rigd.spectral import PAPER_OVERLAP_FRACTION, PAPER_SEGMENTS, segment_lengths
 
     if estimate.response.coherence is None:
-        length, overlap = segment_lengths(
+        segment_length, overlap_samples = segment_lengths(
             record.first_sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
         )
-        segments = replace(segments, segment_length=length, overlap=overlap)
-        shorter = _estimate_response(record, segments, last_hz)
-        return None if shorter is None else shorter.response.coherence, segments
+        segments = replace(segments, segment_length=segment_length, overlap=overlap_samples)
+        shorter_estimate = _estimate_response(record, segments, last_hz)
+        return None if shorter_estimate is None else shorter_estimate.response.coherence, segments
     return estimate.response.coherence, segments
 
 
 def _join_bins(
     frequency_hz: Real, is_selected: NDArray[np.bool_], resolution_hz: float
 ) -> Iterator[tuple[float, float]]:
-    """Yield the frequency bands that the selected bins form.
+    """Yield the frequency bands, as first and last frequency in Hz, that the selected bins form.
 
-    Bins nearer than a tenth of their frequency belong to one band. A band narrower than the
-    resolution of the segments is omitted.
+    Bins nearer than a tenth of their frequency belong to one band. A band narrower than
+    `resolution_hz`, the resolution of the segments, is omitted.
     """
     import numpy as np
 
@@ -342,13 +367,16 @@ def _empty_coherence() -> dict[str, Any]:
 # Against the last session
 
 
-def _stored_quick_look(last: Path) -> dict[str, Any]:
-    """Return the stored quick look of a session; raise if it has none."""
-    quick_look = read_quick_look(quick_look_path(last))
+def _stored_quick_look(session_path: Path) -> dict[str, Any]:
+    """Return the stored quick look of a session file as a JSON document.
+
+    Raise QuickLookError if the session has none.
+    """
+    quick_look = read_quick_look(quick_look_path(session_path))
     if quick_look is None:
         raise QuickLookError(
-            f"--last {last}: there is no readable quick look beside it; make one with "
-            f"python -m analysis.quick_look {last}."
+            f"--last {session_path}: there is no readable quick look beside it; make one with "
+            f"python -m analysis.quick_look {session_path}."
         )
     return quick_look
 
@@ -368,47 +396,63 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
 def _compare_modes(
     modes: list[dict[str, Any]], other_document: Mapping[str, Any]
 ) -> dict[str, Any]:
-    """Compare the modes of a session with those of an earlier one, if visible in both."""
+    """Compare the modes of a session with those of an earlier one, if visible in both.
+
+    Return the comparison as a section of the JSON document.
+    """
     other_modes = {mode["mode"]: mode for mode in other_document["modes"] if mode["shown"]}
-    compared, changed, unchanged = [], [], []
+    compared_modes, changed_modes, unchanged_modes = [], [], []
     for mode in modes:
-        other = other_modes.get(mode["mode"])
-        if other is None or not mode["shown"]:
+        other_mode = other_modes.get(mode["mode"])
+        if other_mode is None or not mode["shown"]:
             continue
-        hz, damping = mode["frequency_hz"], mode["damping_ratio"]
-        change_hz = hz["value"] - other["frequency_hz"]["value"]
-        other_damping_ratio = other["damping_ratio"]["value"]
-        percent = (
-            100 * (damping["value"] / other_damping_ratio - 1) if other_damping_ratio else math.nan
+        hz, damping_text = mode["frequency_hz"], mode["damping_ratio"]
+        change_hz = hz["value"] - other_mode["frequency_hz"]["value"]
+        other_damping_ratio = other_mode["damping_ratio"]["value"]
+        change_percent = (
+            100 * (damping_text["value"] / other_damping_ratio - 1)
+            if other_damping_ratio
+            else math.nan
         )
-        significant = [
-            change_between(other[name], mode[name]).significant is True for name in _MODE_QUANTITIES
+        is_significant = [
+            change_between(other_mode[other_name], mode[other_name]).significant is True
+            for other_name in _MODE_QUANTITIES
         ]
-        compared.append(
+        compared_modes.append(
             {
                 "mode": mode["mode"],
                 "frequency_hz_change": change_hz,
-                "damping_ratio_change_percent": percent,
-                "significant": any(significant),
+                "damping_ratio_change_percent": change_percent,
+                "significant": any(is_significant),
             }
         )
-        digits = decimals(hz["std"]) if hz["std"] else 4
-        texts = (f"{change_hz:+.{digits}f} Hz", f"damping {percent:+.2g} %")
+        decimal_digits = decimals(hz["std"]) if hz["std"] else 4
+        change_texts = (f"{change_hz:+.{decimal_digits}f} Hz", f"damping {change_percent:+.2g} %")
         significant_texts = [
-            text for text, differs in zip(texts, significant, strict=True) if differs
+            change_text
+            for change_text, is_different in zip(change_texts, is_significant, strict=True)
+            if is_different
         ]
         if significant_texts:
-            changed.append(f"mode {mode['mode']} {', '.join(significant_texts)}")
+            changed_modes.append(f"mode {mode['mode']} {', '.join(significant_texts)}")
         else:
-            unchanged.append(f"mode {mode['mode']} {', '.join(texts)}")
-    name = Path(other_document["file"]).stem
-    if not compared:
-        sentence = f"No mode can be compared with {name}."
-    elif changed:
-        sentence = f"Significant change against {name}: {'; '.join(changed)}."
+            unchanged_modes.append(f"mode {mode['mode']} {', '.join(change_texts)}")
+    other_name = Path(other_document["file"]).stem
+    if not compared_modes:
+        comparison_sentence = f"No mode can be compared with {other_name}."
+    elif changed_modes:
+        comparison_sentence = (
+            f"Significant change against {other_name}: {'; '.join(changed_modes)}."
+        )
     else:
-        sentence = f"No significant change against {name} ({'; '.join(unchanged)})."
-    return {"file": other_document["file"], "sentence": sentence, "modes": compared}
+        comparison_sentence = (
+            f"No significant change against {other_name} ({'; '.join(unchanged_modes)})."
+        )
+    return {
+        "file": other_document["file"],
+        "sentence": comparison_sentence,
+        "modes": compared_modes,
+    }
 
 
 # Text
@@ -418,43 +462,48 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of text that show a quick look in a terminal."""
     from rigd.view.frequency_charts import LOW_COHERENCE
 
-    specimen = f" ({document['specimen']})" if document["specimen"] else ""
+    specimen_text = f" ({document['specimen']})" if document["specimen"] else ""
     # The intervals do not include scale of the torque, length and density of the beam.
-    yield f"Quick look at {document['session_id']}{specimen}; ± 95 %, statistical only:"
-    shown = [mode for mode in document["modes"] if mode["shown"]]
-    for mode in shown:
+    yield f"Quick look at {document['session_id']}{specimen_text}; ± 95 %, statistical only:"
+    shown_modes = [mode for mode in document["modes"] if mode["shown"]]
+    for mode in shown_modes:
         yield f"  {mode_line(mode)}"
-    if shown:
+    if shown_modes:
         validity = Validity.of_document(document.get("validity"))
         yield f"  {validity.sentence}"
         if validity.uniform_beam is not None:
             yield f"  {validity.uniform_beam.sentence}"
     doubts = dict.fromkeys(
-        flag for mode in shown for name in _MODE_QUANTITIES if (flag := mode[name]["flag"])
+        value_flag
+        for mode in shown_modes
+        for quantity in _MODE_QUANTITIES
+        if (value_flag := mode[quantity]["flag"])
     )
     yield from (f"  doubtful: {doubt_text}" for doubt_text in doubts)
     hidden_modes = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
     if hidden_modes:
-        noun = "mode" if len(hidden_modes) == 1 else "modes"
-        yield f"  not visible in this record: {noun} {listed(hidden_modes)}"
+        mode_noun = "mode" if len(hidden_modes) == 1 else "modes"
+        yield f"  not visible in this record: {mode_noun} {listed(hidden_modes)}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
-        bands = ", ".join(f"{first:.3g} to {last:.3g}" for first, last in coherence["low_bands"])
-        low = f", below {LOW_COHERENCE:g} from {bands} Hz" if bands else ""
-        yield f"  mean coherence {coherence['mean']:.2f}{low}"
-    yield from (f"  {flag}" for flag in document["flags"])
+        bands_text = ", ".join(
+            f"{first_hz:.3g} to {last_hz:.3g}" for first_hz, last_hz in coherence["low_bands"]
+        )
+        low_text = f", below {LOW_COHERENCE:g} from {bands_text} Hz" if bands_text else ""
+        yield f"  mean coherence {coherence['mean']:.2f}{low_text}"
+    yield from (f"  {value_flag}" for value_flag in document["flags"])
     if document["against_last"] is not None:
         yield f"  {document['against_last']['sentence']}"
 
 
-def _round_digits(values: Real) -> list[float]:
+def _round_digits(numbers: Real) -> list[float]:
     """Return values rounded to six digits, which is finer than the accuracy of an estimate."""
-    return [float(f"{value:.6g}") for value in values]
+    return [float(f"{number:.6g}") for number in numbers]
 
 
-def _parse_integer(text: str) -> int:
+def _parse_integer(number_text: str) -> int:
     """Return the integer in a text, or 0 if it is none."""
-    return int(text) if text.isascii() and text.isdigit() else 0
+    return int(number_text) if number_text.isascii() and number_text.isdigit() else 0
 
 
 def _remove_file_name(sentence: str, path: Path) -> str:
@@ -487,22 +536,28 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
     QuickLookError
         The file cannot be written, or its name belongs to another file.
     """
-    target = quick_look_path(path)
-    existing = read_quick_look(target)
-    if existing is not None and existing["made_utc_ns"] > document["made_utc_ns"]:
-        return target
-    temporary_file = target.with_name(f".{target.name}.{os.getpid()}")
+    quick_look_file = quick_look_path(path)
+    existing_document = read_quick_look(quick_look_file)
+    if existing_document is not None and existing_document["made_utc_ns"] > document["made_utc_ns"]:
+        return quick_look_file
+    temporary_file = quick_look_file.with_name(f".{quick_look_file.name}.{os.getpid()}")
     try:
-        if existing is None and target.exists() and target.stat().st_size > 0:
-            raise QuickLookError(f"{target} is not a quick look of this version; move it away.")
+        if (
+            existing_document is None
+            and quick_look_file.exists()
+            and quick_look_file.stat().st_size > 0
+        ):
+            raise QuickLookError(
+                f"{quick_look_file} is not a quick look of this version; move it away."
+            )
         temporary_file.write_text(json.dumps(document, allow_nan=False), "utf-8")
-        temporary_file.replace(target)
+        temporary_file.replace(quick_look_file)
     except OSError as error:
-        raise QuickLookError(f"{target} cannot be written ({error.strerror}).") from None
+        raise QuickLookError(f"{quick_look_file} cannot be written ({error.strerror}).") from None
     finally:
         with suppress(OSError):
             temporary_file.unlink(missing_ok=True)
-    return target
+    return quick_look_file
 
 
 # The program
@@ -511,23 +566,25 @@ def write_quick_look(document: Mapping[str, Any], path: Path) -> Path:
 def main() -> None:
     """Write and print the quick look of the session that the command line names."""
     raise_on_signals(signal.SIGINT)
-    parser = argparse.ArgumentParser(prog="python -m analysis.quick_look", description=__doc__)
-    parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")
-    parser.add_argument(
+    argument_parser = argparse.ArgumentParser(
+        prog="python -m analysis.quick_look", description=__doc__
+    )
+    argument_parser.add_argument("file", type=Path, metavar="FILE", help="Session file.")
+    argument_parser.add_argument(
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
-    arguments = begin_background(parser)
+    parsed_arguments = begin_background(argument_parser)
     # The priority is not the lowest one, because other programs may never pause.
     with suppress(OSError):
         os.nice(_NICENESS)
     try:
-        document = make_quick_look(arguments.file, arguments.last)
-        write_quick_look(document, arguments.file)
+        quick_look_document = make_quick_look(parsed_arguments.file, parsed_arguments.last)
+        write_quick_look(quick_look_document, parsed_arguments.file)
     except (SessionError, QuickLookError) as error:
         sys.exit(f"Error: {error}")
     except KeyboardInterrupt:
         sys.exit(130)
-    sys.stdout.write("\n".join(document["text"]) + "\n")
+    sys.stdout.write("\n".join(quick_look_document["text"]) + "\n")
 
 
 if __name__ == "__main__":

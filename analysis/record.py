@@ -258,46 +258,52 @@ def record_of(session: Session) -> Record:
     ticks = samples["tick"].astype(np.int64)
     check_span(path, ticks)
     check_clock(path, ticks, samples["t_ns"], rate_hz)
-    for field in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
-        check_finite(path, field, samples[field], ticks)
+    for field_name in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
+        check_finite(path, field_name, samples[field_name], ticks)
     check_sensor(path, samples["coupling_torque_nm"])
 
     first_tick = int(ticks[0])
-    index = ticks - first_tick
-    length = int(index[-1]) + 1
-    sweep, unrecorded_ticks = _sweep_range(session, first_tick, length)
-    status = np.zeros(length, dtype=np.uint32)  # bits of `Status`; 0 where a tick is missing
-    status[index] = samples["status"]
-    missing = np.ones(length, dtype=bool)
-    missing[index] = False
-    stale_angle = (status & Status.ANGLE_STALE) != 0
-    stale_torque = (status & Status.WRENCH_STALE) != 0
-    for channel, unknown in (
-        ("angle", missing | stale_angle),
-        ("torque", missing | stale_torque),
+    tick_indices = ticks - first_tick
+    tick_count = int(tick_indices[-1]) + 1
+    sweep, unrecorded_ticks = _sweep_range(session, first_tick, tick_count)
+    status_bits = np.zeros(
+        tick_count, dtype=np.uint32
+    )  # bits of `Status`; 0 where a tick is missing
+    status_bits[tick_indices] = samples["status"]
+    is_missing = np.ones(tick_count, dtype=bool)
+    is_missing[tick_indices] = False
+    is_angle_stale = (status_bits & Status.ANGLE_STALE) != 0
+    is_torque_stale = (status_bits & Status.WRENCH_STALE) != 0
+    for channel_name, is_unknown in (
+        ("angle", is_missing | is_angle_stale),
+        ("torque", is_missing | is_torque_stale),
     ):
-        check_fillable(path, channel, unknown[sweep], first_tick + sweep.start, rate_hz)
+        check_fillable(path, channel_name, is_unknown[sweep], first_tick + sweep.start, rate_hz)
 
     gaps = Gaps(
-        missing_ticks=int(missing.sum()),
-        longest_gap_ticks=longest_run(missing)[0],
-        sweep_missing_ticks=int(missing[sweep].sum()),
-        sweep_stale_angles=int(stale_angle[sweep].sum()),
-        sweep_stale_torques=int(stale_torque[sweep].sum()),
+        missing_ticks=int(is_missing.sum()),
+        longest_gap_ticks=longest_run(is_missing)[0],
+        sweep_missing_ticks=int(is_missing[sweep].sum()),
+        sweep_stale_angles=int(is_angle_stale[sweep].sum()),
+        sweep_stale_torques=int(is_torque_stale[sweep].sum()),
     )
-    flags = _flag_counts(status[sweep])
-    metadata, unread = readable_texts(session.metadata, "keys of the metadata")
+    flag_counts = _flag_counts(status_bits[sweep])
+    metadata, unread_metadata = readable_texts(session.metadata, "keys of the metadata")
     outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
     return Record(
         path=path,
-        time_s=(first_tick + np.arange(length)) / rate_hz,
-        reference_rad=_fill_grid(samples["angle_reference_rad"], index, missing),
-        angle_rad=_fill_grid(samples["angle_rad"], index, missing | stale_angle),
-        torque_nm=_fill_grid(samples["coupling_torque_nm"], index, missing | stale_torque),
-        angle_known=~(missing | stale_angle),
-        torque_known=~(missing | stale_torque | ((status & Status.WRENCH_SATURATED) != 0)),
+        time_s=(first_tick + np.arange(tick_count)) / rate_hz,
+        reference_rad=_fill_grid(samples["angle_reference_rad"], tick_indices, is_missing),
+        angle_rad=_fill_grid(samples["angle_rad"], tick_indices, is_missing | is_angle_stale),
+        torque_nm=_fill_grid(
+            samples["coupling_torque_nm"], tick_indices, is_missing | is_torque_stale
+        ),
+        angle_known=~(is_missing | is_angle_stale),
+        torque_known=~(
+            is_missing | is_torque_stale | ((status_bits & Status.WRENCH_SATURATED) != 0)
+        ),
         rate_hz=rate_hz,
-        beam=stated_beam(session, rate_hz, length),
+        beam=stated_beam(session, rate_hz, tick_count),
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
@@ -310,68 +316,83 @@ def record_of(session: Session) -> Record:
         there=_first_sweep_range(session, first_tick, sweep),
         rest_angle_rad=_rest_angle(session, ticks),
         gaps=gaps,
-        flags=flags,
+        flags=flag_counts,
         warnings=(
-            *_describe_faults(gaps, flags, unrecorded_ticks, outcome, rate_hz, sweep),
-            *(f"Of the file: {sentence}." for sentence in (*unread, *unread_outcome)),
+            *_describe_faults(gaps, flag_counts, unrecorded_ticks, outcome, rate_hz, sweep),
+            *(
+                f"Of the file: {fault_sentence}."
+                for fault_sentence in (*unread_metadata, *unread_outcome)
+            ),
         ),
         metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
     )
 
 
-def _sweep_range(session: Session, first_tick: int, length: int) -> tuple[slice, int]:
+def _sweep_range(session: Session, first_tick: int, tick_count: int) -> tuple[slice, int]:
     """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
     if "sweep" not in session.segments:
-        return slice(0, length), 0
-    planned_first, end = session.segments["sweep"]
-    start = max(planned_first - first_tick, 0)
-    stop = min(end - first_tick, length)
-    if stop <= start:
+        return slice(0, tick_count), 0
+    first_sweep_tick, end_sweep_tick = session.segments["sweep"]
+    first_index = max(first_sweep_tick - first_tick, 0)
+    end_index = min(end_sweep_tick - first_tick, tick_count)
+    if end_index <= first_index:
         raise RecordError(
-            f"{session.path}: segment 'sweep' covers ticks {planned_first} to {end - 1}, but the "
-            "record "
-            f"holds ticks {first_tick} to {first_tick + length - 1}, so nothing of the sweep was "
-            "recorded."
+            f"{session.path}: segment 'sweep' covers ticks {first_sweep_tick} to "
+            f"{end_sweep_tick - 1}, but the record "
+            f"holds ticks {first_tick} to {first_tick + tick_count - 1}, so nothing of the sweep "
+            "was recorded."
         )
-    return slice(start, stop), (end - planned_first) - (stop - start)
+    return slice(first_index, end_index), (end_sweep_tick - first_sweep_tick) - (
+        end_index - first_index
+    )
 
 
 def _first_sweep_range(session: Session, first_tick: int, sweep: slice) -> slice | None:
     """Return the range of the first of two sweeps; None if there is only one sweep."""
-    planned_first, end = session.segments.get("there", (0, 0))
-    start, stop = max(planned_first - first_tick, sweep.start), min(end - first_tick, sweep.stop)
-    return slice(start, stop) if stop > start else None
+    segment_first_tick, segment_end_tick = session.segments.get("there", (0, 0))
+    first_index, end_index = (
+        max(segment_first_tick - first_tick, sweep.start),
+        min(segment_end_tick - first_tick, sweep.stop),
+    )
+    return slice(first_index, end_index) if end_index > first_index else None
 
 
 def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
     """Return the median angle in rad over the segment ``rest``; None without this segment."""
-    first_tick, end = session.segments.get("rest", (0, 0))
-    at_rest = (ticks >= first_tick) & (ticks < end)
-    return float(np.median(session.samples["angle_rad"][at_rest])) if at_rest.any() else None
+    first_tick, end_tick = session.segments.get("rest", (0, 0))
+    is_at_rest = (ticks >= first_tick) & (ticks < end_tick)
+    return float(np.median(session.samples["angle_rad"][is_at_rest])) if is_at_rest.any() else None
 
 
-def _flag_counts(status: NDArray[np.uint32]) -> dict[str, int]:
+def _flag_counts(status_bits: NDArray[np.uint32]) -> dict[str, int]:
     """Return the number of samples with each flag that occurs."""
-    counts = {meaning: int(np.count_nonzero(status & flag)) for flag, meaning in _REPORTED_FLAGS}
-    return {meaning: count for meaning, count in counts.items() if count}
+    counts = {
+        meaning: int(np.count_nonzero(status_bits & status_flag))
+        for status_flag, meaning in _REPORTED_FLAGS
+    }
+    return {meaning: sample_count for meaning, sample_count in counts.items() if sample_count}
 
 
 def _fill_grid(
-    values: NDArray[np.float64], index: NDArray[np.int64], unknown: NDArray[np.bool_]
+    sample_values: NDArray[np.float64],
+    tick_indices: NDArray[np.int64],
+    is_unknown: NDArray[np.bool_],
 ) -> NDArray[np.float64]:
     """Return values on the whole grid, with linear interpolation of unknown ones."""
-    grid_values = np.zeros(len(unknown))
-    grid_values[index] = values
-    if unknown.any() and not unknown.all():
-        known = np.flatnonzero(~unknown)
-        grid_values[unknown] = np.interp(np.flatnonzero(unknown), known, grid_values[known])
+    grid_values = np.zeros(len(is_unknown))
+    grid_values[tick_indices] = sample_values
+    if is_unknown.any() and not is_unknown.all():
+        known_indices = np.flatnonzero(~is_unknown)
+        grid_values[is_unknown] = np.interp(
+            np.flatnonzero(is_unknown), known_indices, grid_values[known_indices]
+        )
     return grid_values
 
 
 def _describe_faults(
     gaps: Gaps,
-    flags: Mapping[str, int],
+    flag_counts: Mapping[str, int],
     unrecorded_ticks: int,
     outcome: Mapping[str, str],
     rate_hz: float,
@@ -379,12 +400,12 @@ def _describe_faults(
 ) -> tuple[str, ...]:
     """Return sentences on an incomplete session, missing samples and flags."""
     sentences = []
-    ending = outcome.get("outcome", "unknown")
-    if ending in ("stopped", "fault"):
-        reason = outcome.get("reason")
+    outcome_text = outcome.get("outcome", "unknown")
+    if outcome_text in ("stopped", "fault"):
+        stop_reason = outcome.get("reason")
         sentences.append(
-            f"The session's outcome is '{ending}', not 'complete'"
-            + (f": {reason}" if reason else ".")
+            f"The session's outcome is '{outcome_text}', not 'complete'"
+            + (f": {stop_reason}" if stop_reason else ".")
         )
     elif "recovered_from" in outcome:
         sentences.append(
@@ -406,13 +427,17 @@ def _describe_faults(
             f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
             f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
         )
-    for channel, count in (
+    for channel_name, sample_count in (
         ("angle", gaps.sweep_stale_angles),
         ("torque", gaps.sweep_stale_torques),
     ):
-        if count:
-            sentences.append(f"{count} stale values of the {channel} {_UNKNOWN_SAMPLES_TEXT}")
-    for flag, consequence in _FLAG_CONSEQUENCES:
-        if flag in flags:
-            sentences.append(f"{flags[flag]} samples of the sweep: {flag}. {consequence}")
+        if sample_count:
+            sentences.append(
+                f"{sample_count} stale values of the {channel_name} {_UNKNOWN_SAMPLES_TEXT}"
+            )
+    for flag_name, flag_consequence in _FLAG_CONSEQUENCES:
+        if flag_name in flag_counts:
+            sentences.append(
+                f"{flag_counts[flag_name]} samples of the sweep: {flag_name}. {flag_consequence}"
+            )
     return tuple(sentences)

@@ -90,24 +90,27 @@ def stated_beam(session: Session, rate_hz: float, ticks: int) -> Beam:
     RecordError
         A value, or the frequency of the first mode that follows, is impossible.
     """
-    values = []
-    for key, (low, high) in _BEAM_RANGES.items():
-        value = session.number(key)
-        if not value > 0.0:
-            raise _invalid_value_error(session, key, value, "must be positive")
-        if not low <= value <= high:
+    beam_values = []
+    for key, (low, upper_limit) in _BEAM_RANGES.items():
+        beam_value = session.number(key)
+        if not beam_value > 0.0:
+            raise _invalid_value_error(session, key, beam_value, "must be positive")
+        if not low <= beam_value <= upper_limit:
             raise _invalid_value_error(
-                session, key, value, f"must lie between {low:g} and {high:g}"
+                session, key, beam_value, f"must lie between {low:g} and {upper_limit:g}"
             )
-        values.append(value)
-    length_m, density, stiffness = values
-    beam = Beam(length_m=length_m, density_kg_per_m=density, bending_stiffness_n_m2=stiffness)
+        beam_values.append(beam_value)
+    length_m, density_kg_per_m, stiffness_n_m2 = beam_values
+    beam = Beam(
+        length_m=length_m, density_kg_per_m=density_kg_per_m, bending_stiffness_n_m2=stiffness_n_m2
+    )
     first_hz, lowest_hz = first_mode_hz(beam), _LEAST_MODE_PERIODS * rate_hz / ticks
     if not lowest_hz < first_hz < rate_hz / 2:
         raise RecordError(
-            f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m {density:g} "
-            f"kg/m and beam_bending_stiffness_n_m2 {stiffness:g} N·m² the first mode would be at "
-            f"{first_hz:.3g} Hz, which {ticks / rate_hz:.3g} s at {rate_hz:g} Hz cannot show; "
+            f"{session.path}: with beam_length_m {length_m:g} m, beam_density_kg_per_m "
+            f"{density_kg_per_m:g} "
+            f"kg/m and beam_bending_stiffness_n_m2 {stiffness_n_m2:g} N·m² the first mode would be "
+            f"at {first_hz:.3g} Hz, which {ticks / rate_hz:.3g} s at {rate_hz:g} Hz cannot show; "
             + (
                 "record longer, or correct the file's metadata if these are wrong."
                 if first_hz <= lowest_hz
@@ -132,7 +135,7 @@ def first_mode_hz(beam: Beam) -> float:
 
 
 def stated_tool_inertia_kg_m2(session: Session) -> float:
-    """Return the inertia between torque sensor and beam in kg·m², 0 if not stated.
+    """Return the moment of inertia between torque sensor and beam in kg·m², 0 if not stated.
 
     Raises
     ------
@@ -178,10 +181,12 @@ def _stated_in_range(session: Session, key: str, low: float, high: float) -> flo
     """Return a number in the metadata, or None if not stated; raise if it is outside a range."""
     if key not in session.metadata:
         return None
-    value = session.number(key)
-    if not low <= value <= high:
-        raise _invalid_value_error(session, key, value, f"must lie between {low:g} and {high:g}")
-    return value
+    stated_number = session.number(key)
+    if not low <= stated_number <= high:
+        raise _invalid_value_error(
+            session, key, stated_number, f"must lie between {low:g} and {high:g}"
+        )
+    return stated_number
 
 
 def stated_delay_s(session: Session, key: str) -> float:
@@ -217,15 +222,15 @@ def stated_torque_filter_s(session: Session) -> tuple[float, float]:
         The corner frequency is not positive, or the order is neither 1 nor 2.
     """
     corner_hz = session.number("torque_filter_hz", math.inf)
-    order = session.number("torque_filter_order", 1.0)
+    filter_order = session.number("torque_filter_order", 1.0)
     if not corner_hz > 0.0:
         raise _invalid_value_error(session, "torque_filter_hz", corner_hz, "must be positive")
-    if order not in (1.0, 2.0):
+    if filter_order not in (1.0, 2.0):
         raise _invalid_value_error(
-            session, "torque_filter_order", order, "must be 1 or 2 (Butterworth)"
+            session, "torque_filter_order", filter_order, "must be 1 or 2 (Butterworth)"
         )
-    constant_s = 1 / (2 * math.pi * corner_hz)
-    return (constant_s, 0.0) if order == 1.0 else (0.0, constant_s)
+    time_constant_s = 1 / (2 * math.pi * corner_hz)
+    return (time_constant_s, 0.0) if filter_order == 1.0 else (0.0, time_constant_s)
 
 
 SCALE_QUANTITIES: Final = ("torque_scale", "length", "density")
@@ -245,16 +250,16 @@ def stated_uncertainty(session: Session) -> dict[str, float]:
     RecordError
         An uncertainty is negative, or so large that the value would be unknown.
     """
-    stated = {}
-    for name in UNCERTAIN_QUANTITIES:
-        key = f"uncertainty_{name}_percent"
-        percent = session.number(key, 0.0)
-        if not 0.0 <= percent <= MAX_UNCERTAINTY_PERCENT:
-            rule = f"must lie between 0 and {MAX_UNCERTAINTY_PERCENT:g}"
-            raise _invalid_value_error(session, key, percent, rule)
-        if percent:
-            stated[name] = percent / 100
-    return stated
+    uncertainties = {}
+    for quantity in UNCERTAIN_QUANTITIES:
+        key = f"uncertainty_{quantity}_percent"
+        uncertainty_percent = session.number(key, 0.0)
+        if not 0.0 <= uncertainty_percent <= MAX_UNCERTAINTY_PERCENT:
+            range_rule = f"must lie between 0 and {MAX_UNCERTAINTY_PERCENT:g}"
+            raise _invalid_value_error(session, key, uncertainty_percent, range_rule)
+        if uncertainty_percent:
+            uncertainties[quantity] = uncertainty_percent / 100
+    return uncertainties
 
 
 def stated_uniformity(session: Session) -> float:
@@ -268,18 +273,20 @@ def stated_uniformity(session: Session) -> float:
         The value is negative, or larger than a model of a uniform beam allows.
     """
     key = "uniformity_percent"
-    percent = session.number(key, _DEFAULT_UNIFORMITY_PERCENT)
-    if not 0.0 <= percent <= MAX_UNIFORMITY_PERCENT:
-        rule = f"must lie between 0 and {MAX_UNIFORMITY_PERCENT:g}"
-        raise _invalid_value_error(session, key, percent, rule)
-    return percent / 100
+    uniformity_percent = session.number(key, _DEFAULT_UNIFORMITY_PERCENT)
+    if not 0.0 <= uniformity_percent <= MAX_UNIFORMITY_PERCENT:
+        range_rule = f"must lie between 0 and {MAX_UNIFORMITY_PERCENT:g}"
+        raise _invalid_value_error(session, key, uniformity_percent, range_rule)
+    return uniformity_percent / 100
 
 
-def _invalid_value_error(session: Session, key: str, value: float, rule: str) -> RecordError:
-    """Return the error for an invalid value in the metadata."""
+def _invalid_value_error(
+    session: Session, key: str, stated_value: float, violated_rule: str
+) -> RecordError:
+    """Return the error for an invalid number of the session's metadata, with the violated rule."""
     return RecordError(
-        f"{session.path}: {key} is {f'{value:g} {unit_of(key)}'.rstrip()}, but {rule}; correct the "
-        "file's metadata."
+        f"{session.path}: {key} is {f'{stated_value:g} {unit_of(key)}'.rstrip()}, but "
+        f"{violated_rule}; correct the file's metadata."
     )
 
 
@@ -321,16 +328,16 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
     RecordError
         The span is unusable.
     """
-    span = int(ticks[-1] - ticks[0]) + 1
-    if span > MAX_TICKS_PER_SAMPLE * len(ticks):
+    tick_span = int(ticks[-1] - ticks[0]) + 1
+    if tick_span > MAX_TICKS_PER_SAMPLE * len(ticks):
         raise RecordError(
-            f"{path}: only {len(ticks)} of the {span} ticks from {ticks[0]} to {ticks[-1]} have a "
-            "sample, too few to analyse; record the session again."
+            f"{path}: only {len(ticks)} of the {tick_span} ticks from {ticks[0]} to {ticks[-1]} "
+            "have a sample, too few to analyse; record the session again."
         )
-    if span > MAX_TICKS:
+    if tick_span > MAX_TICKS:
         raise RecordError(
-            f"{path}: the record spans {span} ticks, and no more than {MAX_TICKS} fit into the "
-            "memory that an analysis may take; record shorter sessions, which can be analysed "
+            f"{path}: the record spans {tick_span} ticks, and no more than {MAX_TICKS} fit into "
+            "the memory that an analysis may take; record shorter sessions, which can be analysed "
             "together."
         )
 
@@ -359,13 +366,15 @@ def check_clock(
     if len(ticks) < 2:
         return
     # The values are compared, because a difference of values from a file may overflow.
-    not_increasing = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
-    if not_increasing.size:
-        index = int(not_increasing[0])
+    bad_indices = np.flatnonzero(t_ns[1:] <= t_ns[:-1])
+    if bad_indices.size:
+        first_bad_index = int(bad_indices[0])
         raise RecordError(
-            f"{path}: the time stamp t_ns goes from {t_ns[index]} ns at tick {ticks[index]} to "
-            f"{t_ns[index + 1]} ns at tick {ticks[index + 1]}, but time must go forward; it does "
-            f"not at {not_increasing.size} of {len(ticks)} samples. Correct the program that wrote "
+            f"{path}: the time stamp t_ns goes from {t_ns[first_bad_index]} ns at tick "
+            f"{ticks[first_bad_index]} to "
+            f"{t_ns[first_bad_index + 1]} ns at tick {ticks[first_bad_index + 1]}, but time must "
+            "go forward; it does "
+            f"not at {bad_indices.size} of {len(ticks)} samples. Correct the program that wrote "
             "the file."
         )
     elapsed_ns = max(int(t_ns[-1]) - int(t_ns[0]), 1)
@@ -398,20 +407,20 @@ def check_finite(
     RecordError
         Some values are not finite or implausible.
     """
-    too_large = np.flatnonzero(np.abs(values) > MAX_ABSOLUTE_VALUE)
-    not_finite = np.flatnonzero(~np.isfinite(values))
-    if not_finite.size:
+    too_large_indices = np.flatnonzero(np.abs(values) > MAX_ABSOLUTE_VALUE)
+    not_finite_indices = np.flatnonzero(~np.isfinite(values))
+    if not_finite_indices.size:
         raise RecordError(
-            f"{path}: {field} is {values[not_finite[0]]} at tick {ticks[not_finite[0]]} and not "
-            "finite in "
-            f"{not_finite.size} of {len(values)} samples; such a record cannot be analysed."
+            f"{path}: {field} is {values[not_finite_indices[0]]} at tick "
+            f"{ticks[not_finite_indices[0]]} and not finite in "
+            f"{not_finite_indices.size} of {len(values)} samples; such a record cannot be analysed."
         )
-    if too_large.size:
+    if too_large_indices.size:
         raise RecordError(
-            f"{path}: {field} is {values[too_large[0]]:g} at tick {ticks[too_large[0]]} and beyond "
-            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large.size} of {len(values)} samples; no rig has "
-            "such values; "
-            "correct the program that wrote the file."
+            f"{path}: {field} is {values[too_large_indices[0]]:g} at tick "
+            f"{ticks[too_large_indices[0]]} and beyond "
+            f"±{MAX_ABSOLUTE_VALUE:g} in {too_large_indices.size} of {len(values)} samples; no rig "
+            "has such values; correct the program that wrote the file."
         )
 
 
@@ -457,21 +466,23 @@ def check_fillable(
     rate_hz : float
         Sampling rate.
     """
-    problem = unknown_fraction_message(
+    fraction_message = unknown_fraction_message(
         f"the {channel} in the sweep", int(unknown.sum()), len(unknown)
     )
-    if problem:
-        raise RecordError(f"{path}: {problem}")
-    gap_ticks, start = longest_run(unknown)
+    if fraction_message:
+        raise RecordError(f"{path}: {fraction_message}")
+    gap_ticks, gap_start = longest_run(unknown)
     if gap_ticks > MAX_GAP_S * rate_hz:
         raise RecordError(
             f"{path}: {gap_ticks} ticks of the {channel} in a row are missing or stale from tick "
-            f"{first_tick + start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than the "
+            f"{first_tick + gap_start} on ({1e3 * gap_ticks / rate_hz:.0f} ms), longer than the "
             f"{1e3 * MAX_GAP_S:g} ms that are interpolated; record the session again."
         )
 
 
-def unknown_fraction_message(channel_text: str, unknown: int, total: int) -> str | None:
+def unknown_fraction_message(
+    channel_text: str, unknown_samples: int, total_samples: int
+) -> str | None:
     """Return an error message if too many samples of a channel are unknown, or None.
 
     The limit is the fraction `MAX_UNKNOWN_FRACTION`.
@@ -480,20 +491,21 @@ def unknown_fraction_message(channel_text: str, unknown: int, total: int) -> str
     ----------
     channel_text : str
         Name of the channel in the message.
-    unknown, total : int
+    unknown_samples, total_samples : int
         Number of samples without a new value, and number of all samples.
     """
-    if unknown <= MAX_UNKNOWN_FRACTION * total:
+    if unknown_samples <= MAX_UNKNOWN_FRACTION * total_samples:
         return None
     return (
-        f"{unknown} of {total} samples ({100 * unknown / total:.2g} %) of {channel_text} are "
+        f"{unknown_samples} of {total_samples} samples "
+        f"({100 * unknown_samples / total_samples:.2g} %) of {channel_text} are "
         "missing or flagged, "
         f"more than the {100 * MAX_UNKNOWN_FRACTION:g} % that an analysis tolerates; record the "
         "session again."
     )
 
 
-def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
+def longest_run(run_mask: NDArray[np.bool_]) -> tuple[int, int]:
     """Return length and start index of the longest run of True; (0, 0) if no element is True.
 
     Examples
@@ -503,9 +515,9 @@ def longest_run(mask: NDArray[np.bool_]) -> tuple[int, int]:
     >>> longest_run(np.array([True, False, True, True]))
     (2, 2)
     """
-    edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    starts, ends = np.flatnonzero(edges == 1), np.flatnonzero(edges == -1)
-    if starts.size == 0:
+    run_edges = np.diff(np.concatenate(([0], run_mask.astype(np.int8), [0])))
+    run_starts, run_ends = np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
+    if run_starts.size == 0:
         return 0, 0
-    longest = int(np.argmax(ends - starts))
-    return int(ends[longest] - starts[longest]), int(starts[longest])
+    longest_index = int(np.argmax(run_ends - run_starts))
+    return int(run_ends[longest_index] - run_starts[longest_index]), int(run_starts[longest_index])

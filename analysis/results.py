@@ -93,8 +93,8 @@ class WholeRecord:
     def __post_init__(self) -> None:
         plant = self.fit.plant
         validity = _record_validity(self.record, (plant.beam, plant.damping))
-        if (test := self.headline.uniform_beam) is not None:
-            validity = replace(validity, uniform_beam=test.summary)
+        if (beam_test := self.headline.uniform_beam) is not None:
+            validity = replace(validity, uniform_beam=beam_test.summary)
         object.__setattr__(self, "validity", validity)
 
     @property
@@ -104,18 +104,21 @@ class WholeRecord:
 
     @property
     def fits(self) -> Mapping[str, RecordFit]:
-        """Fits by their names in tables, the lowest BIC first."""
+        """Fits of all damping structures by the structure's name, the lowest BIC first."""
         return {candidate.name: candidate.fit for candidate in self.selection.candidates}
 
     @property
     def delta_bic(self) -> Mapping[str, float]:
-        """Difference of each fit's BIC from the lowest BIC, by the name of the fit."""
-        best, *_ = self.selection.candidates
-        return {candidate.name: candidate.bic - best.bic for candidate in self.selection.candidates}
+        """Difference of each fit's BIC from the lowest BIC, by the name of its structure."""
+        best_candidate, *_ = self.selection.candidates
+        return {
+            candidate.name: candidate.bic - best_candidate.bic
+            for candidate in self.selection.candidates
+        }
 
     @property
     def headline(self) -> Headline:
-        """Reported estimates, which follow from one of `fits`."""
+        """Reported estimates (modes, parameters, loss factors), which follow from one of `fits`."""
         return self.selection.headline
 
     @property
@@ -125,8 +128,10 @@ class WholeRecord:
         The second sentence states the validity of the estimates.
         """
         verdict = self.selection.verdict
-        first, others = verdict.sentences[:1], verdict.sentences[1:]
-        return replace(verdict, sentences=(*first, self.validity.sentence, *others))
+        first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
+        return replace(
+            verdict, sentences=(*first_sentence, self.validity.sentence, *other_sentences)
+        )
 
     @property
     def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
@@ -145,7 +150,7 @@ class WholeRecord:
 
     @property
     def withheld(self) -> frozenset[str]:
-        """Orders of the reported fit whose estimates have a flag against them."""
+        """Orders of the reported fit that are not to be reported: their estimate has a flag."""
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
@@ -161,28 +166,34 @@ class WholeRecord:
         return with_scale_uncertainty(self.headline.parameters, self.record.uncertainty)
 
     def headline_json(self) -> dict[str, Any]:
-        """Return the reported estimates as the content of a JSON document."""
+        """Return the reported estimates of the record as the content of a JSON document."""
         from analysis.identify import headline_json
         from analysis.record_checks import SCALE_QUANTITIES
 
-        file, findings = str(self.record.path), self.verdict.findings
-        content = headline_json(file, self.headline, self.orders, findings, self.validity)
-        exact = content["exact_geometry"]  # None if the parameters assume it
-        (content if exact is None else exact)["covariance"] = self._covariance_json()
+        file_name, findings = str(self.record.path), self.verdict.findings
+        json_content = headline_json(file_name, self.headline, self.orders, findings, self.validity)
+        exact_geometry = json_content["exact_geometry"]  # None if the parameters assume it
+        (json_content if exact_geometry is None else exact_geometry)["covariance"] = (
+            self._covariance_json()
+        )
         return {
-            **content,
+            **json_content,
             "scale_uncertainty": {
-                name: value
-                for name, value in self.record.uncertainty.items()
-                if name in SCALE_QUANTITIES
+                parameter_name: relative_std
+                for parameter_name, relative_std in self.record.uncertainty.items()
+                if parameter_name in SCALE_QUANTITIES
             },
             "combined": {
-                name: reported_value.as_json() for name, reported_value in self.combined.items()
+                parameter_name: reported_value.as_json()
+                for parameter_name, reported_value in self.combined.items()
             },
         }
 
     def _covariance_json(self) -> dict[str, Any]:
-        """Return names and covariance matrix of the fit; ``ln_`` marks a logarithm."""
+        """Return the parameter names of the fit and their covariance matrix, as JSON values.
+
+        The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
+        """
         from analysis.identify import LOGARITHMIC_PARAMETERS
 
         return {
@@ -199,9 +210,16 @@ class WholeRecord:
 
         These have a flag for an exactly uniform beam, or belong to absent damping.
         """
-        exact = (self.headline.exact or self.headline).parameters
-        flagged = {name for name in _ORDER_NAMES & exact.keys() if exact[name].flag is not None}
-        return frozenset(flagged | {order.order for order in self.orders if order.value is None})
+        exact_parameters = (self.headline.exact or self.headline).parameters
+        flagged_orders = {
+            order_name
+            for order_name in _ORDER_NAMES & exact_parameters.keys()
+            if exact_parameters[order_name].flag is not None
+        }
+        return frozenset(
+            flagged_orders
+            | {order_verdict.order for order_verdict in self.orders if order_verdict.value is None}
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -230,10 +248,10 @@ class RecordResult:
             validity = self.whole.validity
         else:
             # The Welch fits differ, and the largest slope of the tip among them is used.
-            models = () if self.welch is None else self.welch.models
-            dampings = [model.fit.damping for model in models]
+            fitted_models = () if self.welch is None else self.welch.models
+            fitted_dampings = [model.fit.damping for model in fitted_models]
             validity = _record_validity(
-                self.record, *((self.record.beam, damping) for damping in dampings)
+                self.record, *((self.record.beam, damping) for damping in fitted_dampings)
             )
         object.__setattr__(self, "validity", validity)
 
@@ -249,7 +267,7 @@ class RecordResult:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Warnings for the analyst."""
+        """Sentences on weaknesses of the record and, if there are Welch fits, of these."""
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
@@ -323,25 +341,25 @@ def record_result(
     on_step("read")
     if not routes.paper:
         check_record_band(record, routes.band_hz)
-    welch, omission_remark = None, None
+    welch_results, omission_remark = None, None
     if routes.paper:
-        welch, omission_remark = welch_analysis(
+        welch_results, omission_remark = welch_analysis(
             record, routes.settings, routes.band_hz,
             optional=routes.whole_record, on_step=on_step,
         )  # fmt: skip
     if omission_remark:
         warn(f"{path}: {omission_remark}")
         record = _add_warnings(record, (omission_remark,))
-    whole = None
+    whole_fits = None
     if routes.whole_record:
         on_step("whole record")
         try:
-            whole = whole_record(record, routes.fixed, routes.band_hz)
+            whole_fits = whole_record(record, routes.fixed, routes.band_hz)
         except MeasurementError as error:
-            if welch is None:
+            if welch_results is None:
                 raise
             warn(f"{error} Only the Welch fits were run.")
-    return RecordResult(record, whole, welch)
+    return RecordResult(record, whole_fits, welch_results)
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:
@@ -362,7 +380,7 @@ def _add_warnings(record: Record, warnings: tuple[str, ...]) -> Record:
     return replace(record, warnings=(*record.warnings, *warnings)) if warnings else record
 
 
-def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
+def finite(json_value: Any) -> Any:  # noqa: ANN401 - any JSON value
     """Return a copy of a JSON value with null for non-finite numbers, and without NumPy types.
 
     A trailing underscore, which distinguishes an attribute from a Python keyword (``lambda_``), is
@@ -370,14 +388,18 @@ def finite(value: Any) -> Any:  # noqa: ANN401 - any JSON value
     """
     from numpy import generic
 
-    def copy_value(value: Any) -> Any:  # noqa: ANN401
+    def copy_value(json_value: Any) -> Any:  # noqa: ANN401
         """Return a copy of one value, recursively."""
-        if isinstance(value, dict):
-            return {str(key).rstrip("_"): copy_value(item) for key, item in value.items()}
-        if isinstance(value, list | tuple):
-            return [copy_value(item) for item in value]
-        if isinstance(value, generic):
-            value = value.item()
-        return None if isinstance(value, float) and not math.isfinite(value) else value
+        if isinstance(json_value, dict):
+            return {
+                str(key).rstrip("_"): copy_value(json_item) for key, json_item in json_value.items()
+            }
+        if isinstance(json_value, list | tuple):
+            return [copy_value(json_item) for json_item in json_value]
+        if isinstance(json_value, generic):
+            json_value = json_value.item()
+        return (
+            None if isinstance(json_value, float) and not math.isfinite(json_value) else json_value
+        )
 
-    return copy_value(value)
+    return copy_value(json_value)

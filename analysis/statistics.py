@@ -68,9 +68,9 @@ def chi_square_deviate(value: float, degrees_of_freedom: float) -> float:
 
     a, x = degrees_of_freedom / 2, max(value / 2, np.finfo(float).tiny)
     in_upper_tail = x > a
-    tail = float((chdtrc if in_upper_tail else chdtr)(2 * a, 2 * x))
-    if tail > _SMALLEST_TAIL:
-        log_tail = np.log(tail)
+    tail_probability = float((chdtrc if in_upper_tail else chdtr)(2 * a, 2 * x))
+    if tail_probability > _SMALLEST_TAIL:
+        log_tail = np.log(tail_probability)
     elif in_upper_tail:
         # Leading terms of the incomplete gamma functions far from their middle, summed as geometric
         # series (NIST DLMF 8.11.2 and 8.11.4): the deviate is off by less than 1e-4 there.

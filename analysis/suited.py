@@ -128,14 +128,14 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
     requested_hz : tuple of float, optional
         Requested band, in Hz.
     """
-    sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
+    remark_sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
-        sentences = (*sentences, _TWO_SWEEPS_REMARK)
+        remark_sentences = (*remark_sentences, _TWO_SWEEPS_REMARK)
     _, last_hz = record_band_hz(record, requested_hz)
     if requested_hz is not None or last_hz == RECORD_BAND_HZ[1]:
-        return sentences
+        return remark_sentences
     return (
-        *sentences,
+        *remark_sentences,
         f"Fits end at {last_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the record's rate of "
         f"{record.rate_hz:g} Hz, instead of {RECORD_BAND_HZ[1]:g} Hz.",
     )
@@ -180,15 +180,15 @@ def welch_analysis(
     from analysis.paper import FrequencyResponseError, SettingsError, analyse
 
     optional = optional and settings.are_from_paper
-    reason = welch_exclusion_reason(record, requested_hz) if optional else None
-    if reason is None:
+    exclusion_reason = welch_exclusion_reason(record, requested_hz) if optional else None
+    if exclusion_reason is None:
         try:
             return analyse(record, welch_settings(record, settings, requested_hz), on_step), None
         except FrequencyResponseError as error:
             if not optional or isinstance(error, SettingsError):
                 raise
-            reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
-    return None, f"{WELCH_OMITTED_TEXT}{reason}."
+            exclusion_reason = str(error).removeprefix(f"{record.path}: ").removesuffix(".")
+    return None, f"{WELCH_OMITTED_TEXT}{exclusion_reason}."
 
 
 def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> str | None:
@@ -207,8 +207,8 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
     if excitation in _WELCH_EXCLUSIONS:
         paper_segmentation = WelchSettings().segmentation(record.rate_hz)
         is_long_enough = record.sweep_samples >= paper_segmentation.segment_length
-        option = "--method welch" if is_long_enough else "--method welch --frf fft"
-        return f"{_WELCH_EXCLUSIONS[excitation]} ({option} makes them nevertheless)"
+        method_options = "--method welch" if is_long_enough else "--method welch --frf fft"
+        return f"{_WELCH_EXCLUSIONS[excitation]} ({method_options} makes them nevertheless)"
     planned_s = _metadata_number(record, "duration_s")
     swept_s = record.first_sweep_samples / record.rate_hz
     if requested_hz is not None or planned_s is None or swept_s >= _COMPLETE_FRACTION * planned_s:
@@ -223,7 +223,7 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
     )
 
 
-def _reached_frequency_hz(record: Record, fraction: float) -> float | None:
+def _reached_frequency_hz(record: Record, duration_fraction: float) -> float | None:
     """Return the frequency in Hz that a rising sweep reaches after a fraction of its duration.
 
     Return None if the sweep does not rise, or its ends are not stated.
@@ -231,7 +231,7 @@ def _reached_frequency_hz(record: Record, fraction: float) -> float | None:
     start_hz, stop_hz = _metadata_number(record, "start_hz"), _metadata_number(record, "stop_hz")
     if start_hz is None or stop_hz is None or stop_hz <= start_hz:
         return None
-    return start_hz + fraction * (stop_hz - start_hz)
+    return start_hz + duration_fraction * (stop_hz - start_hz)
 
 
 def _metadata_number(record: Record, key: str) -> float | None:

@@ -124,15 +124,15 @@ class Touch:
     ends_m: Real | None = None
 
     def as_dict(self) -> dict[str, Any]:
-        """Return the touch as a document of JSON types."""
+        """Return the touch and its estimate as a JSON document."""
         estimate = self.estimate
-        point = None if self.point_m is None else self.point_m.tolist()
+        contact_point = None if self.point_m is None else self.point_m.tolist()
         return {
             "number": self.number,
             "tick": self.tick,
             "angle_rad": self.angle_rad,
             **({} if estimate is None else estimate.as_dict(self.start_s)),
-            "point_m": point,
+            "point_m": contact_point,
             "chi2_per_degree": None if estimate is None else estimate.chi2_per_degree,
         }
 
@@ -210,103 +210,123 @@ class TouchAnalysis:
         session = read_session(path)
         samples = session.samples
         rate_hz = _check_samples(session)
-        model = _touch_model(session, rate_hz, self._model)
-        shear = _shear_projection(session)
+        touch_model = _touch_model(session, rate_hz, self._model)
+        shear_coefficients = _shear_projection(session)
         warnings = []
-        if shear is None:
+        if shear_coefficients is None:
             warnings.append(
                 "The file states no shear_projection: the touches are estimated by the torque "
                 "alone, which tells little of the instant and the point."
             )
         marked_ticks = samples["tick"][(samples["status"] & Status.TOUCHED) != 0].tolist()
         contact_ticks = round(CONTACT_S * rate_hz)
-        free_from = [0, *(tick + contact_ticks for tick in marked_ticks)]
-        source, detected = "loop", list(zip(marked_ticks, free_from, strict=False))
+        free_ticks = [0, *(detection_tick + contact_ticks for detection_tick in marked_ticks)]
+        detection_source, detected_ticks = "loop", list(zip(marked_ticks, free_ticks, strict=False))
         if not marked_ticks:
             on_step("looking for touches")
-            source, detected = "record", _detect_touches(session, model, rate_hz, shear)
-            if len(detected) > _MOST_TOUCHES:
+            detection_source, detected_ticks = (
+                "record",
+                _detect_touches(session, touch_model, rate_hz, shear_coefficients),
+            )
+            if len(detected_ticks) > _MOST_TOUCHES:
                 warnings.append(
                     f"More than {_MOST_TOUCHES} touches were found, of which the first are shown: "
                     "the model does not fit the record. Take an identified one (--model)."
                 )
-                detected = detected[:_MOST_TOUCHES]
+                detected_ticks = detected_ticks[:_MOST_TOUCHES]
         touches = []
-        for number, (tick, free_from) in enumerate(detected, start=1):
-            on_step(f"touch {number} of {len(detected)}")
-            touch_samples = around_touch(samples, tick, rate_hz, free_from)
-            touches.append(self._estimate_touch(touch_samples, number, tick, model, rate_hz, shear))
+        for touch_number, (detection_tick, free_ticks) in enumerate(detected_ticks, start=1):
+            on_step(f"touch {touch_number} of {len(detected_ticks)}")
+            touch_samples = around_touch(samples, detection_tick, rate_hz, free_ticks)
+            touches.append(
+                self._estimate_touch(
+                    touch_samples,
+                    touch_number,
+                    detection_tick,
+                    touch_model,
+                    rate_hz,
+                    shear_coefficients,
+                )
+            )
         warnings += _describe_doubts(touches)
         validity = record_validity(
             readable_texts(session.metadata, "keys of the metadata")[0],
-            samples["angle_rad"], rate_hz, (model.beam, model.damping),
+            samples["angle_rad"], rate_hz, (touch_model.beam, touch_model.damping),
         )  # fmt: skip
         return TouchedSession(
-            path, tuple(touches), source, model, rate_hz, shear is not None, tuple(warnings),
-            validity,
+            path, tuple(touches), detection_source, touch_model, rate_hz,
+            shear_coefficients is not None, tuple(warnings), validity,
         )  # fmt: skip
 
     def _estimate_touch(
         self,
         touch_samples: NDArray[np.void],
-        number: int,
-        tick: int,
-        model: TouchModel,
+        touch_number: int,
+        detection_tick: int,
+        touch_model: TouchModel,
         rate_hz: float,
-        shear: Sequence[float] | None,
+        shear_coefficients: Sequence[float] | None,
     ) -> Touch:
         """Return a touch with its estimate from the samples around its detection."""
         start_s = int(touch_samples["tick"][0]) / rate_hz
-        record = touch_record(touch_samples, tick, rate_hz, shear)
-        time_s = record.detected / rate_hz
-        after_s = (record.angle_rad.size - 1 - record.detected) / rate_hz
-        angles_rad = record.angle_rad
+        samples_record = touch_record(touch_samples, detection_tick, rate_hz, shear_coefficients)
+        time_s = samples_record.detected / rate_hz
+        after_s = (samples_record.angle_rad.size - 1 - samples_record.detected) / rate_hz
+        angles_rad = samples_record.angle_rad
         if time_s < _LEAST_BEFORE_S or after_s < _LEAST_AFTER_S:
-            return Touch(number, tick, time_s, float(angles_rad[record.detected]), start_s)
-        prepared = self._prepare_model(model, rate_hz)
-        estimate = prepared.estimator.estimate(record)
-        if estimate.time_s is not None:
-            time_s = estimate.time_s.value
+            return Touch(
+                touch_number,
+                detection_tick,
+                time_s,
+                float(angles_rad[samples_record.detected]),
+                start_s,
+            )
+        prepared_model = self._prepare_model(touch_model, rate_hz)
+        touch_estimate = prepared_model.estimator.estimate(samples_record)
+        if touch_estimate.time_s is not None:
+            time_s = touch_estimate.time_s.value
         angle_rad = float(np.interp(time_s, np.arange(angles_rad.size) / rate_hz, angles_rad))
-        x_m = prepared.free.x_m
-        deflection_m = _free_deflection_m(prepared.free, record, time_s)
-        point = ends = None
-        if estimate.x_m is not None:
-            positions_m = np.array([estimate.x_m.value, *estimate.x_m.interval_95])
+        x_m = prepared_model.free.x_m
+        deflection_m = _free_deflection_m(prepared_model.free, samples_record, time_s)
+        contact_point_m = interval_ends_m = None
+        if touch_estimate.x_m is not None:
+            positions_m = np.array([touch_estimate.x_m.value, *touch_estimate.x_m.interval_95])
             contact_points = _top_view(
                 angle_rad, positions_m, np.interp(positions_m, x_m, deflection_m)
             )
-            point, ends = contact_points[0], contact_points[1:]
+            contact_point_m, interval_ends_m = contact_points[0], contact_points[1:]
         return Touch(
-            number,
-            tick,
-            record.detected / rate_hz,
+            touch_number,
+            detection_tick,
+            samples_record.detected / rate_hz,
             angle_rad,
             start_s,
-            estimate,
+            touch_estimate,
             _top_view(angle_rad, x_m, deflection_m),
-            point,
-            ends,
+            contact_point_m,
+            interval_ends_m,
         )
 
-    def _prepare_model(self, model: TouchModel, rate_hz: float) -> _PreparedModel:
-        """Return estimator and free motion of a model, computed at the first use."""
+    def _prepare_model(self, touch_model: TouchModel, rate_hz: float) -> _PreparedModel:
+        """Return touch estimator and free motion of a beam model, computed at the first use."""
         key = (
-            model.beam, model.damping, model.tool_inertia_kg_m2, model.angle_delay_s,
-            model.torque_delay_s, model.sensor_filter, rate_hz,
+            touch_model.beam, touch_model.damping, touch_model.tool_inertia_kg_m2,
+            touch_model.angle_delay_s, touch_model.torque_delay_s, touch_model.sensor_filter,
+            rate_hz,
         )  # fmt: skip
         if key not in self._prepared:
-            x_m = np.linspace(0.0, model.beam.length_m, _ANTENNA_POINTS)
-            samples = round((HISTORY_S + FINAL_S) * rate_hz) + 1
+            x_m = np.linspace(0.0, touch_model.beam.length_m, _ANTENNA_POINTS)
+            sample_count = round((HISTORY_S + FINAL_S) * rate_hz) + 1
             self._prepared[key] = _PreparedModel(
-                TouchEstimator(model, rate_hz), FreeBeam(model, x_m, rate_hz, samples)
+                TouchEstimator(touch_model, rate_hz),
+                FreeBeam(touch_model, x_m, rate_hz, sample_count),
             )
         return self._prepared[key]
 
 
 @dataclass(frozen=True, slots=True)
 class _PreparedModel:
-    """Estimator and free motion of one model, computed once for all touches."""
+    """Estimator of touches and free motion of one model, computed once for all touches."""
 
     estimator: TouchEstimator
     free: FreeBeam
@@ -323,76 +343,94 @@ def _check_samples(session: Session) -> float:
     rate_hz = stated_rate_hz(session)
     ticks = samples["tick"].astype(np.int64)
     check_span(path, ticks)
-    for name in ("angle_rad", "coupling_torque_nm"):
-        check_finite(path, name, samples[name], ticks)
+    for field_name in ("angle_rad", "coupling_torque_nm"):
+        check_finite(path, field_name, samples[field_name], ticks)
     check_sensor(path, samples["coupling_torque_nm"])
     return rate_hz
 
 
-def _touch_model(session: Session, rate_hz: float, path: Path | None) -> TouchModel:
-    """Return the identified model from a file, or the nominal model of a session."""
+def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> TouchModel:
+    """Return the beam model with which the touches of a session are estimated.
+
+    It is the identified model in the file `model_path`, or else the nominal model of the session.
+    """
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
-    stated: dict[str, Any] = {
+    stated_values: dict[str, Any] = {
         key: stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")
     }
-    stated["sensor_filter"] = _sensor_filter(session, rate_hz)
-    stated["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
-    if path is not None:
-        return TouchModel.from_analysis(path, length_m=beam.length_m, **stated)
-    attached = (session.attachments.get(name, b"") for name in _DAMPING_ATTACHMENTS)
-    damping: Damping | None = next(filter(None, map(nominal_damping, attached)), None)
+    stated_values["sensor_filter"] = _sensor_filter(session, rate_hz)
+    stated_values["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
+    if model_path is not None:
+        return TouchModel.from_analysis(model_path, length_m=beam.length_m, **stated_values)
+    attached_files = (
+        session.attachments.get(attachment_name, b"") for attachment_name in _DAMPING_ATTACHMENTS
+    )
+    damping: Damping | None = next(filter(None, map(nominal_damping, attached_files)), None)
     if damping is None:
         raise SessionError(
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(beam, damping, **stated)
+    return TouchModel.assumed(beam, damping, **stated_values)
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
-    """Return the sensor's low-pass filter and the filter that averages its records."""
-    order, constant_s = max(enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1))
-    corner_hz = 1 / (2 * pi * constant_s) if constant_s else 0.0
+    """Return the filters of the sensor, as a session states them.
+
+    These are its low-pass filter and, if stated, the filter that averages several sensor records in
+    each tick.
+    """
+    filter_order, time_constant_s = max(
+        enumerate(stated_torque_filter_s(session), start=1), key=itemgetter(1)
+    )
+    corner_hz = 1 / (2 * pi * time_constant_s) if time_constant_s else 0.0
     filter_kind = session.metadata.get("sensor_filter", "")
     if not filter_kind:
-        return SensorFilter(corner_hz, order)
+        return SensorFilter(corner_hz, filter_order)
     delay_s = session.number("sensor_filter_delay_s", 0.0)
     # A mean of n records per tick has a delay of (n - 1) / 2n ticks, a triangle twice as much.
-    fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
-    if not 0.0 <= fraction < _LONGEST_FILTER_TICKS:
+    delay_fraction = delay_s * rate_hz * {"mean": 2.0, "triangle": 1.0}.get(filter_kind, inf)
+    if not 0.0 <= delay_fraction < _LONGEST_FILTER_TICKS:
         raise RecordError(
             f"{session.path}: sensor_filter is {filter_kind[:100]!r} with sensor_filter_delay_s = "
             f"{delay_s:g} s, but must be a mean (shorter than half a period, {0.5 / rate_hz:g} s) "
             f"or a triangle (shorter than a period); correct the file's metadata."
         )
-    records = round(1 / (1 - fraction))
-    spacing_s = fraction / rate_hz / max(records - 1, 1)
-    return SensorFilter.of_records(corner_hz, order, filter_kind, records, spacing_s)
+    record_count = round(1 / (1 - delay_fraction))
+    spacing_s = delay_fraction / rate_hz / max(record_count - 1, 1)
+    return SensorFilter.of_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:
-    """Return the coefficients that yield the base shear from the wrench; None without them."""
-    text = session.metadata.get("shear_projection", "")
-    if not text:
+    """Return the factors of fx, fy, fz, tx, ty, tz that yield the shear force at the base.
+
+    The six values are the forces and torques of the sensor. Return None if the session states no
+    factors or only zeros.
+    """
+    projection_text = session.metadata.get("shear_projection", "")
+    if not projection_text:
         return None
     try:
-        numbers = tuple(float(number_text) for number_text in text.split(","))
+        coefficients = tuple(float(number_text) for number_text in projection_text.split(","))
     except ValueError:
-        numbers = ()
-    if len(numbers) != 6 or not np.isfinite(numbers).all():
+        coefficients = ()
+    if len(coefficients) != 6 or not np.isfinite(coefficients).all():
         raise RecordError(
-            f"{session.path}: shear_projection is {text[:100]!r}, but must be six numbers for fx, "
-            "fy, fz, tx, ty, tz; correct the file's metadata."
+            f"{session.path}: shear_projection is {projection_text[:100]!r}, but must be six "
+            "numbers for fx, fy, fz, tx, ty, tz; correct the file's metadata."
         )
-    return numbers if any(numbers) else None
+    return coefficients if any(coefficients) else None
 
 
 # Detection
 
 
 def _detect_touches(
-    session: Session, model: TouchModel, rate_hz: float, shear: Sequence[float] | None
+    session: Session,
+    touch_model: TouchModel,
+    rate_hz: float,
+    shear_coefficients: Sequence[float] | None,
 ) -> list[tuple[int, int]]:
     """Detect touches by applying the control loop's test to a record.
 
@@ -402,36 +440,41 @@ def _detect_touches(
     samples = session.samples
     ticks = samples["tick"].astype(np.int64)
     torque_nm = samples["coupling_torque_nm"]
-    shear_n = np.zeros(len(samples)) if shear is None else base_shear_n(samples, shear)
-    rest = session.segments.get("rest", (0, 0))[1]
-    noise_end_tick = max(rest, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
-    resting = ticks < noise_end_tick
-    noise = ChannelNoise(
-        _white_noise_std(torque_nm[resting]),
-        None if shear is None else _white_noise_std(shear_n[resting]),
-        _angle_noise_std(samples["angle_rad"], resting),
+    shear_n = (
+        np.zeros(len(samples))
+        if shear_coefficients is None
+        else base_shear_n(samples, shear_coefficients)
     )
-    beam = watched_beam(model, rate_hz, noise)
-    detector = TouchDetector(beam, rate_hz, DetectorSettings())
+    rest_end_tick = session.segments.get("rest", (0, 0))[1]
+    noise_end_tick = max(rest_end_tick, int(ticks[0]) + round(_LEAST_REST_S * rate_hz))
+    is_at_rest = ticks < noise_end_tick
+    channel_noise = ChannelNoise(
+        _white_noise_std(torque_nm[is_at_rest]),
+        None if shear_coefficients is None else _white_noise_std(shear_n[is_at_rest]),
+        _angle_noise_std(samples["angle_rad"], is_at_rest),
+    )
+    beam_watch = watched_beam(touch_model, rate_hz, channel_noise)
+    detector = TouchDetector(beam_watch, rate_hz, DetectorSettings())
     is_armed = False
     detections: list[tuple[int, int]] = []
     pause_ticks = round(_LEAST_PAUSE_S * rate_hz)
     last_detection = int(ticks[0]) - pause_ticks - 1
     previous_tick = int(ticks[0]) - 1
-    columns = (
+    sample_columns = (
         ticks, samples["angle_rad"], torque_nm, shear_n,
         (samples["status"] & Status.ANGLE_STALE) != 0,
         (samples["status"] & Status.WRENCH_STALE) != 0,
     )  # fmt: skip
-    for tick, angle, torque, force, angle_stale, wrench_stale in zip(
-        *(column.tolist() for column in columns), strict=True
+    for tick, angle_rad, sample_torque_nm, sample_shear_n, is_angle_stale, is_wrench_stale in zip(
+        *(sample_column.tolist() for sample_column in sample_columns), strict=True
     ):
         if not is_armed and tick >= noise_end_tick:
             detector.arm()
             is_armed = True
         if detector.step(
-            angle, torque, force,
-            missed=tick - previous_tick - 1, angle_stale=angle_stale, wrench_stale=wrench_stale,
+            angle_rad, sample_torque_nm, sample_shear_n,
+            missed=tick - previous_tick - 1,
+            angle_stale=is_angle_stale, wrench_stale=is_wrench_stale,
         ):  # fmt: skip
             if tick - last_detection > pause_ticks:
                 detections.append((tick, last_detection + 1))
@@ -440,18 +483,22 @@ def _detect_touches(
     return detections
 
 
-def _white_noise_std(values: Real) -> float:
+def _white_noise_std(signal_values: Real) -> float:
     """Return the standard deviation of the white noise in a slowly changing signal."""
-    steps = np.diff(values)
-    return max(float(np.std(steps)) / sqrt(2), _LEAST_NOISE_STD) if steps.size else _LEAST_NOISE_STD
+    value_steps = np.diff(signal_values)
+    return (
+        max(float(np.std(value_steps)) / sqrt(2), _LEAST_NOISE_STD)
+        if value_steps.size
+        else _LEAST_NOISE_STD
+    )
 
 
-def _angle_noise_std(angle_rad: Real, resting: NDArray[np.bool_]) -> float:
+def _angle_noise_std(angle_rad: Real, is_at_rest: NDArray[np.bool_]) -> float:
     """Return the standard deviation of the angle's noise, from rest or from its resolution."""
-    steps = np.abs(np.diff(angle_rad))
-    steps = steps[steps > _LEAST_NOISE_STD]
-    resolution_rad = float(steps.min()) if steps.size else 0.0
-    return max(_white_noise_std(angle_rad[resting]), resolution_rad / sqrt(12))
+    angle_steps_rad = np.abs(np.diff(angle_rad))
+    angle_steps_rad = angle_steps_rad[angle_steps_rad > _LEAST_NOISE_STD]
+    resolution_rad = float(angle_steps_rad.min()) if angle_steps_rad.size else 0.0
+    return max(_white_noise_std(angle_rad[is_at_rest]), resolution_rad / sqrt(12))
 
 
 def _describe_doubts(touches: Sequence[Touch]) -> list[str]:
@@ -488,20 +535,20 @@ def _number_list(numbers: Sequence[int]) -> str:
 # Seen from above
 
 
-def _free_deflection_m(free: FreeBeam, record: TouchRecord, time_s: float) -> Real:
+def _free_deflection_m(free_beam: FreeBeam, record: TouchRecord, time_s: float) -> Real:
     """Return the deflection in metres of a beam that moves freely, relative to its undeformed line.
 
-    `free` has the free motion at points along the beam, the first at the motor's axis. The
+    `free_beam` has the free motion at points along the beam, the first at the motor's axis. The
     vibration is fitted to the samples of `record` before `time_s`, which counts from its start.
     """
     fit_samples = min(max(int(time_s * record.rate_hz) - 1, _LEAST_FIT_SAMPLES), record.detected)
-    motion = free.motion(record, fit_samples, fit_samples - 4)
-    step = round((time_s - motion.first_s) / motion.step_s)
-    displacement_m: Real = motion.displacement_m[
-        :, min(max(step, 0), motion.displacement_m.shape[1] - 1)
+    free_motion = free_beam.motion(record, fit_samples, fit_samples - 4)
+    step_index = round((time_s - free_motion.first_s) / free_motion.step_s)
+    displacement_m: Real = free_motion.displacement_m[
+        :, min(max(step_index, 0), free_motion.displacement_m.shape[1] - 1)
     ]
     times_s = np.arange(record.angle_rad.size) / record.rate_hz
-    return displacement_m - float(np.interp(time_s, times_s, record.angle_rad)) * free.x_m
+    return displacement_m - float(np.interp(time_s, times_s, record.angle_rad)) * free_beam.x_m
 
 
 def _top_view(angle_rad: float, along_m: Real, across_m: Real) -> Real:

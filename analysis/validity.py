@@ -61,9 +61,9 @@ def record_validity(
         Models estimated from the record; the largest slope among them is used. Without a model, the
         validity is unknown unless the file states it.
     """
-    stated = stated_validity(metadata)
-    if stated.predicted_peak_tip_slope_rad is not None:
-        return stated
+    stated_result = stated_validity(metadata)
+    if stated_result.predicted_peak_tip_slope_rad is not None:
+        return stated_result
     with np.errstate(all="ignore"):  # a wrong model may overflow, and the validity is then unknown
         return combined_validity(
             _validity_of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
@@ -79,14 +79,18 @@ def combined_validity(validities: Iterable[Validity]) -> Validity:
     validities : iterable of Validity
         Validities of the single records.
     """
-    slopes = [validity.predicted_peak_tip_slope_rad for validity in validities]
-    known = [slope for slope in slopes if slope is not None]
-    return _validity_of_slope(max(known)) if known and len(known) == len(slopes) else Validity()
+    slopes_rad = [validity.predicted_peak_tip_slope_rad for validity in validities]
+    known_slopes_rad = [slope_rad for slope_rad in slopes_rad if slope_rad is not None]
+    return (
+        _validity_of_slope(max(known_slopes_rad))
+        if known_slopes_rad and len(known_slopes_rad) == len(slopes_rad)
+        else Validity()
+    )
 
 
 def _validity_of_slope(slope_rad: float) -> Validity:
     """Return the validity for a tip slope in rad; unknown if the slope is not valid."""
     if not 0.0 <= slope_rad < math.inf:
         return Validity()
-    error = linear_model_error(slope_rad)
-    return Validity(slope_rad, error) if math.isfinite(error) else Validity()
+    model_error = linear_model_error(slope_rad)
+    return Validity(slope_rad, model_error) if math.isfinite(model_error) else Validity()

@@ -119,12 +119,12 @@ class CampaignResult:
 
     @property
     def validity(self) -> Validity:
-        """Validity of the linear model for the campaign: the combined_validity of its sessions."""
+        """Combined validity of the linear model for all sessions of the campaign."""
         return combined_validity(session.validity for session in self.sessions)
 
     @property
     def trials(self) -> int:
-        """Number of sessions that were to be predicted from the others."""
+        """Number of sessions whose torque was to be predicted by models of the other sessions."""
         return len(self.sessions) if len(self.sessions) >= FEWEST_SESSIONS else 0
 
 
@@ -189,32 +189,34 @@ def campaign(
     if dask is not None:
         paths = [path.absolute() for path in paths]
     settings = settings or WelchSettings()
-    task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
-    done, total = 0, 2 * len(paths)
+    session_task = SessionTask(settings, tuple(structures), tuple(fixed), band_hz, uniformity)
+    done_steps, total_steps = 0, 2 * len(paths)
 
     def report_step(name: str) -> None:
         """Report the completion of a step for a file."""
-        nonlocal done
-        done += 1
-        on_progress(done, total, name)
+        nonlocal done_steps
+        done_steps += 1
+        on_progress(done_steps, total_steps, name)
 
-    worker_context: AbstractContextManager[Workers]
+    workers_manager: AbstractContextManager[Workers]
     if workers is not None:
-        worker_context = nullcontext(workers)
+        workers_manager = nullcontext(workers)
     elif dask is not None:
-        worker_context = dask_cluster(dask)
+        workers_manager = dask_cluster(dask)
     else:
-        worker_context = process_pool(min(jobs or available_cores(), len(paths)))
-    with worker_context as ready_workers:
-        results = ready_workers.run(
-            analyse_session, [(path, task) for path in paths], lambda i: report_step(paths[i].name)
+        workers_manager = process_pool(min(jobs or available_cores(), len(paths)))
+    with workers_manager as ready_workers:
+        session_results = ready_workers.run(
+            analyse_session,
+            [(path, session_task) for path in paths],
+            lambda i: report_step(paths[i].name),
         )
         sessions, failures = _separate_experiments(
             [
-                SessionFailure(path, f"{path}: {result.reason}; analyse it by itself.")
-                if isinstance(result, LostTask)
-                else result
-                for path, result in zip(paths, results, strict=True)
+                SessionFailure(path, f"{path}: {session_result.reason}; analyse it by itself.")
+                if isinstance(session_result, LostTask)
+                else session_result
+                for path, session_result in zip(paths, session_results, strict=True)
             ]
         )
         if not sessions:
@@ -222,14 +224,14 @@ def campaign(
                 "No session could be analysed:\n" + "\n".join(f.message for f in failures)
             )
         validation: tuple[LeftOutError, ...] = ()
-        lost: tuple[LostTrial, ...] = ()
+        lost_sessions: tuple[LostTrial, ...] = ()
         if len(sessions) >= FEWEST_SESSIONS:
-            total = len(paths) + len(sessions)
-            names = [session.path.name for session in sessions]
-            validation, lost = validate(
-                ready_workers, sessions, band_hz, lambda i: report_step(names[i])
+            total_steps = len(paths) + len(sessions)
+            session_names = [session.path.name for session in sessions]
+            validation, lost_sessions = validate(
+                ready_workers, sessions, band_hz, lambda i: report_step(session_names[i])
             )
-    return campaign_result(sessions, failures, validation, lost)
+    return campaign_result(sessions, failures, validation, lost_sessions)
 
 
 def campaign_result(
@@ -251,21 +253,24 @@ def campaign_result(
     lost : sequence of LostTrial, optional
         Sessions that could not be predicted from the others.
     """
-    names = distinct_names(
+    session_names = distinct_names(
         [*(session.path for session in sessions), *(session.path for session in failures)]
     )
-    sessions = [replace(session, name=name) for session, name in zip(sessions, names, strict=False)]
-    failures = [
-        replace(session, name=name)
-        for session, name in zip(failures, names[len(sessions) :], strict=True)
+    sessions = [
+        replace(session, name=session_name)
+        for session, session_name in zip(sessions, session_names, strict=False)
     ]
-    pooled = pooled_estimates(sessions)
-    usable = [(session.name, session.experiment) for session in sessions]
-    left_out = [(session.name, session.experiment) for session in failures]
-    specimens = stated_specimens([*usable, *left_out], sessions[0].experiment)
-    homogeneity_test = homogeneity(sessions, pooled, specimens)
-    biases = welch_biases(sessions, pooled)
-    modal = pooled_modal(sessions)
+    failures = [
+        replace(session, name=session_name)
+        for session, session_name in zip(failures, session_names[len(sessions) :], strict=True)
+    ]
+    pooled_fits = pooled_estimates(sessions)
+    used_experiments = [(session.name, session.experiment) for session in sessions]
+    unused_experiments = [(session.name, session.experiment) for session in failures]
+    specimens = stated_specimens([*used_experiments, *unused_experiments], sessions[0].experiment)
+    homogeneity_test = homogeneity(sessions, pooled_fits, specimens)
+    all_biases = welch_biases(sessions, pooled_fits)
+    modal_model = pooled_modal(sessions)
     return CampaignResult(
         settings=sessions[0].settings,
         record_band_hz=sessions[0].record_band_hz,
@@ -273,13 +278,13 @@ def campaign_result(
         failures=tuple(failures),
         statistics=parameter_statistics(sessions),
         nominal=nominal_models(sessions),
-        welch_biases=biases,
+        welch_biases=all_biases,
         homogeneity=homogeneity_test,
-        structures=ranked_structures(sessions, pooled),
-        pooled=pooled,
-        modal=modal,
+        structures=ranked_structures(sessions, pooled_fits),
+        pooled=pooled_fits,
+        modal=modal_model,
         verdict=campaign_verdict(
-            sessions, pooled, homogeneity_test, validation, lost, biases, modal
+            sessions, pooled_fits, homogeneity_test, validation, lost, all_biases, modal_model
         ),
         validation=tuple(validation),
         lost_trials=tuple(lost),
@@ -287,29 +292,52 @@ def campaign_result(
 
 
 def _separate_experiments(
-    results: Sequence[SessionAnalysis | SessionFailure],
+    session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> tuple[list[SessionAnalysis], list[SessionFailure]]:
     """Separate the usable sessions of the most common experiment from all other sessions."""
-    usable = [result for result in results if isinstance(result, SessionAnalysis)]
-    if not usable:
-        return [], [result for result in results if isinstance(result, SessionFailure)]
-    results = _complete_labels(results)
-    usable = [result for result in results if isinstance(result, SessionAnalysis)]
-    common = usable[most_common_index([session.experiment for session in usable])]
-    stated = [result.experiment for result in results if result.experiment]
-    agreeing = sum(common.experiment.difference(experiment) is None for experiment in stated)
-    majority_text = ", as in most" if 2 * agreeing > len(stated) else ""
+    usable_sessions = [
+        session_result
+        for session_result in session_results
+        if isinstance(session_result, SessionAnalysis)
+    ]
+    if not usable_sessions:
+        return [], [
+            session_result
+            for session_result in session_results
+            if isinstance(session_result, SessionFailure)
+        ]
+    session_results = _complete_labels(session_results)
+    usable_sessions = [
+        session_result
+        for session_result in session_results
+        if isinstance(session_result, SessionAnalysis)
+    ]
+    common_session = usable_sessions[
+        most_common_index([session.experiment for session in usable_sessions])
+    ]
+    stated_experiments = [
+        session_result.experiment for session_result in session_results if session_result.experiment
+    ]
+    agreeing_count = sum(
+        common_session.experiment.difference(experiment) is None
+        for experiment in stated_experiments
+    )
+    majority_text = ", as in most" if 2 * agreeing_count > len(stated_experiments) else ""
     sessions: list[SessionAnalysis] = []
     failures: list[SessionFailure] = []
-    for result in results:
-        reason = _exclusion_reason(result, common, majority_text, sessions)
-        if reason is None and isinstance(result, SessionAnalysis):
-            sessions.append(result)
-        elif reason is None and isinstance(result, SessionFailure):
-            failures.append(result)
+    for session_result in session_results:
+        reason = _exclusion_reason(session_result, common_session, majority_text, sessions)
+        if reason is None and isinstance(session_result, SessionAnalysis):
+            sessions.append(session_result)
+        elif reason is None and isinstance(session_result, SessionFailure):
+            failures.append(session_result)
         else:
             failures.append(
-                SessionFailure(result.path, f"{result.path}: {reason}", result.experiment)
+                SessionFailure(
+                    session_result.path,
+                    f"{session_result.path}: {reason}",
+                    session_result.experiment,
+                )
             )
     return _equalize_welch_fits(sessions, failures)
 
@@ -326,10 +354,10 @@ def _equalize_welch_fits(
     without_fits = [session for session in sessions if not session.frequency_hz.size]
     if not without_fits:
         return sessions, failures
-    any_searched = any(session.experiment.planned_itself for session in without_fits)
-    if any_searched or 2 * len(without_fits) >= len(sessions):
+    has_searching = any(session.experiment.planned_itself for session in without_fits)
+    if has_searching or 2 * len(without_fits) >= len(sessions):
         return [session.without_welch() for session in sessions], failures
-    excluded = [
+    new_failures = [
         SessionFailure(
             session.path,
             f"{session.path}: {session.warnings[-1]} Most others have them: analyse this one by "
@@ -338,58 +366,74 @@ def _equalize_welch_fits(
         )
         for session in without_fits
     ]
-    return [session for session in sessions if session.frequency_hz.size], [*failures, *excluded]
+    return [session for session in sessions if session.frequency_hz.size], [
+        *failures,
+        *new_failures,
+    ]
 
 
 def _complete_labels(
-    results: Sequence[SessionAnalysis | SessionFailure],
+    session_results: Sequence[SessionAnalysis | SessionFailure],
 ) -> list[SessionAnalysis | SessionFailure]:
     """Return the results with the specimens' labels completed (see `complete_labels`)."""
-    stated = iter(complete_labels([result.experiment for result in results if result.experiment]))
+    completed_experiments = iter(
+        complete_labels(
+            [
+                session_result.experiment
+                for session_result in session_results
+                if session_result.experiment
+            ]
+        )
+    )
     return [
-        replace(result, experiment=next(stated)) if result.experiment else result
-        for result in results
+        replace(session_result, experiment=next(completed_experiments))
+        if session_result.experiment
+        else session_result
+        for session_result in session_results
     ]
 
 
 def _exclusion_reason(
-    result: SessionAnalysis | SessionFailure,
-    common: SessionAnalysis,
+    session_result: SessionAnalysis | SessionFailure,
+    common_session: SessionAnalysis,
     majority_text: str,
     accepted: Sequence[SessionAnalysis],
 ) -> str | None:
     """Return why a session does not belong to the campaign, or None if it does.
 
-    `common` is a session of the most common experiment, `accepted` are the sessions accepted so
-    far. `majority_text` says in words whether most sessions agree with `common`.
+    `common_session` is a session of the most common experiment. `accepted` are the sessions
+    accepted before. `majority_text` says in words whether most sessions agree with
+    `common_session`.
     """
-    experiment = result.experiment
-    difference = experiment and common.experiment.difference(experiment)
+    experiment = session_result.experiment
+    difference = experiment and common_session.experiment.difference(experiment)
     if difference:
         return (
-            f"{difference} in {common.path}{majority_text}; a campaign repeats one experiment on "
-            "one "
-            "specimen: analyse this one by itself, or correct the metadata."
+            f"{difference} in {common_session.path}{majority_text}; a campaign repeats one "
+            "experiment on one specimen: analyse this one by itself, or correct the metadata."
         )
-    if isinstance(result, SessionFailure):
+    if isinstance(session_result, SessionFailure):
         return None
-    for other in accepted:
-        if result.path == other.path:
+    for other_session in accepted:
+        if session_result.path == other_session.path:
             return "the file is given more than once, and counts once."
-        if result.experiment.identity == other.experiment.identity:
-            return f"it is the same session as {other.path}, which would count twice."
-        if result.digests & other.digests:
+        if session_result.experiment.identity == other_session.experiment.identity:
+            return f"it is the same session as {other_session.path}, which would count twice."
+        if session_result.digests & other_session.digests:
             return (
-                f"it has samples of {other.path}, noise included, which would count twice: a copy "
-                "or a part of that file, or a simulation with the same seed; analyse this one by "
-                "itself."
+                f"it has samples of {other_session.path}, noise included, which would count twice: "
+                "a copy or a part of that file, or a simulation with the same seed; analyse this "
+                "one by itself."
             )
-    both_have_welch = common.frequency_hz.size and result.frequency_hz.size
-    if both_have_welch and not np.array_equal(common.frequency_hz, result.frequency_hz):
+    both_have_welch = common_session.frequency_hz.size and session_result.frequency_hz.size
+    if both_have_welch and not np.array_equal(
+        common_session.frequency_hz, session_result.frequency_hz
+    ):
         return (
-            f"its estimate has {len(result.frequency_hz)} bins from {result.frequency_hz[0]:g} Hz, "
-            f"but that of {common.path} {len(common.frequency_hz)} from "
-            f"{common.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates differ; "
-            "analyse this one by itself, or leave --segment and --nfft to the defaults."
+            f"its estimate has {len(session_result.frequency_hz)} bins from "
+            f"{session_result.frequency_hz[0]:g} Hz, but that of {common_session.path} "
+            f"{len(common_session.frequency_hz)} from "
+            f"{common_session.frequency_hz[0]:g} Hz, so they cannot be averaged: their rates "
+            "differ; analyse this one by itself, or leave --segment and --nfft to the defaults."
         )
     return None

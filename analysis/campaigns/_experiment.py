@@ -114,10 +114,10 @@ class Experiment:
         excitation_facts = {
             key: _parse_number(metadata[key]) for key in _EXCITATION_KEYS if key in metadata
         }
-        label = metadata.get(LABEL_KEY, "").strip()
+        specimen_label = metadata.get(LABEL_KEY, "").strip()
         return cls(
             facts={
-                **({LABEL_KEY: label} if label else {}),
+                **({LABEL_KEY: specimen_label} if specimen_label else {}),
                 "beam_length_m": beam.length_m,
                 "beam_density_kg_per_m": beam.density_kg_per_m,
                 "beam_bending_stiffness_n_m2": beam.bending_stiffness_n_m2,
@@ -143,7 +143,10 @@ class Experiment:
 
     @property
     def planned_itself(self) -> bool:
-        """Whether the excitation was planned while it ran, which is compatible with any other."""
+        """Whether the excitation was planned during the session.
+
+        Such an excitation agrees with any other.
+        """
         return self.facts.get("excitation") == _SEARCH_NAME
 
     def unfinished_sweep_reason(self, outcome: str) -> str:
@@ -160,11 +163,11 @@ class Experiment:
             "and is not averaged with whole ones; analyse it by itself."
         )
 
-    def difference(self, other: Experiment) -> str | None:
+    def difference(self, other_experiment: Experiment) -> str | None:
         """Describe the first difference from another experiment; None if there is no difference."""
-        excitation_free = self.planned_itself or other.planned_itself
-        other_facts = dict(other.facts)
-        if {self.rising, other.rising} == {True, False}:
+        excitation_free = self.planned_itself or other_experiment.planned_itself
+        other_facts = dict(other_experiment.facts)
+        if {self.rising, other_experiment.rising} == {True, False}:
             start_key, stop_key = _SWEEP_END_KEYS
             other_facts[start_key], other_facts[stop_key] = (
                 other_facts[stop_key],
@@ -190,11 +193,11 @@ class Experiment:
             return None
         return start_hz < stop_hz
 
-    def same_specimen(self, other: Experiment) -> bool:
+    def same_specimen(self, other_experiment: Experiment) -> bool:
         """Return whether another experiment states the same beam and the same tool inertia."""
         return not any(
             key in self.facts
-            and not _equal_values(other.facts.get(key, self.facts[key]), self.facts[key])
+            and not _equal_values(other_experiment.facts.get(key, self.facts[key]), self.facts[key])
             for key in _SPECIMEN_KEYS
         )
 
@@ -207,14 +210,14 @@ def distinct_names(paths: Sequence[Path]) -> list[str]:
     paths : sequence of Path
         Paths of session files.
     """
-    names = [path.name for path in paths]
-    for depth in range(2, max((len(path.parts) for path in paths), default=0) + 1):
-        counts = Counter(names)
-        names = [
-            str(Path(*path.parts[-depth:])) if counts[name] > 1 else name
-            for path, name in zip(paths, names, strict=True)
+    short_names = [path.name for path in paths]
+    for part_count in range(2, max((len(path.parts) for path in paths), default=0) + 1):
+        name_counts = Counter(short_names)
+        short_names = [
+            str(Path(*path.parts[-part_count:])) if name_counts[short_name] > 1 else short_name
+            for path, short_name in zip(paths, short_names, strict=True)
         ]
-    return names
+    return short_names
 
 
 @dataclass(frozen=True, slots=True)
@@ -234,33 +237,33 @@ class StatedSpecimen:
 
 
 def stated_specimens(
-    stated: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
+    stated_experiments: Iterable[tuple[str, Experiment | None]], campaign_experiment: Experiment
 ) -> tuple[StatedSpecimen, ...]:
     """Group files by the specimen that they state, the specimen of the campaign first.
 
     Parameters
     ----------
-    stated : iterable of (str, Experiment or None)
+    stated_experiments : iterable of (str, Experiment or None)
         Name and experiment of each file; None for a file that could not be read.
     campaign_experiment : Experiment
         Experiment of the sessions that are pooled.
     """
     files_by_specimen: list[tuple[Experiment, list[str]]] = [(campaign_experiment, [])]
-    for file, experiment in stated:
+    for file_name, experiment in stated_experiments:
         if experiment is None:
             continue
-        for specimen, files in files_by_specimen:
+        for specimen, file_names in files_by_specimen:
             if specimen.same_specimen(experiment):
-                files.append(file)
+                file_names.append(file_name)
                 break
         else:
-            files_by_specimen.append((experiment, [file]))
+            files_by_specimen.append((experiment, [file_name]))
     return tuple(
         StatedSpecimen(
             {key: specimen.facts[key] for key in _SPECIMEN_KEYS if key in specimen.facts},
-            tuple(files),
+            tuple(file_names),
         )
-        for specimen, files in files_by_specimen
+        for specimen, file_names in files_by_specimen
     )
 
 
@@ -279,12 +282,14 @@ def complete_labels(experiments: Sequence[Experiment]) -> list[Experiment]:
 
 
 def differing_fact_keys(specimens: Sequence[StatedSpecimen]) -> tuple[str, ...]:
-    """Return the keys of the properties in which specimens differ."""
+    """Return the keys of the stated properties, such as the length, in which specimens differ."""
     first_facts = specimens[0].facts
     return tuple(
         key
-        for key, value in first_facts.items()
-        if not all(_equal_values(specimen.facts.get(key, value), value) for specimen in specimens)
+        for key, fact_value in first_facts.items()
+        if not all(
+            _equal_values(specimen.facts.get(key, fact_value), fact_value) for specimen in specimens
+        )
     )
 
 
@@ -293,33 +298,37 @@ def most_common_index(experiments: Sequence[Experiment]) -> int:
 
     A session that planned its own excitation agrees with any other, so it is no candidate.
     """
-    indices = [i for i, experiment in enumerate(experiments) if not experiment.planned_itself]
+    candidate_indices = [
+        i for i, experiment in enumerate(experiments) if not experiment.planned_itself
+    ]
     return max(
-        indices or range(len(experiments)),
+        candidate_indices or range(len(experiments)),
         key=lambda i: sum(experiments[i].difference(two) is None for two in experiments),
     )
 
 
-def _equal_values(first: str | float, second: str | float) -> bool:
+def _equal_values(first_value: str | float, second_value: str | float) -> bool:
     """Return whether two stated values are equal, numbers up to rounding."""
-    if isinstance(first, str) or isinstance(second, str):
-        return first == second
-    return math.isclose(first, second, rel_tol=1e-9)
+    if isinstance(first_value, str) or isinstance(second_value, str):
+        return first_value == second_value
+    return math.isclose(first_value, second_value, rel_tol=1e-9)
 
 
-def fact_text(key: str, value: str | float) -> str:
+def fact_text(key: str, fact_value: str | float) -> str:
     """Format a value of a session file with its unit.
 
     Parameters
     ----------
     key : str
         Key of the value, with the unit as a suffix.
-    value : str or float
+    fact_value : str or float
         The value.
     """
-    if isinstance(value, str):
-        return (f"“{value}”" if value else "not stated") if key == LABEL_KEY else value
-    return f"{value:g} {unit_of(key)}".rstrip()
+    if isinstance(fact_value, str):
+        return (
+            (f"“{fact_value}”" if fact_value else "not stated") if key == LABEL_KEY else fact_value
+        )
+    return f"{fact_value:g} {unit_of(key)}".rstrip()
 
 
 def _utc_text(utc_ns: str) -> str:
@@ -330,9 +339,9 @@ def _utc_text(utc_ns: str) -> str:
         return ""
 
 
-def _parse_number(text: str) -> str | float:
-    """Return a text as a number if it is one."""
+def _parse_number(number_text: str) -> str | float:
+    """Return a text as a number, or unchanged if it is not one."""
     try:
-        return float(text)
+        return float(number_text)
     except ValueError:
-        return text
+        return number_text

@@ -35,57 +35,58 @@ def p_value_text(p_value: float) -> str:
     )
 
 
-def describe_tolerance(modal: PooledModal, estimate: TolerantEstimate) -> str:
+def describe_tolerance(modal_model: PooledModal, estimate: TolerantEstimate) -> str:
     """Describe the basis of the parameters and the tolerated deviation from a uniform beam."""
-    stated = modal.stated[-1]
-    tolerance_text = f"{100 * stated:g} % as the files state it"
-    if len(modal.stated) > 1:
-        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal.stated])
+    largest_stated = modal_model.stated[-1]
+    tolerance_text = f"{100 * largest_stated:g} % as the files state it"
+    if len(modal_model.stated) > 1:
+        stated_texts = listed([f"{100 * uniformity:g}" for uniformity in modal_model.stated])
         tolerance_text = (
-            f"{100 * stated:g} %, the largest of the {stated_texts} % that the files state"
+            f"{100 * largest_stated:g} %, the largest of the {stated_texts} % that the files state"
         )
-    sentence = (
+    basis_sentence = (
         f"Parameters are those of a beam with both dampings, from the modal constants of "
-        f"{modal.sessions} sessions"
+        f"{modal_model.sessions} sessions"
     )
     if estimate.basis != "geometry":
         return (
-            f"{sentence}, by {_OTHER_BASES[estimate.basis]}: the frequencies are not those of a "
-            "uniform "
-            f"beam to {tolerance_text}, nor with a wider tolerance."
+            f"{basis_sentence}, by {_OTHER_BASES[estimate.basis]}: the frequencies are "
+            f"not those of a uniform beam to {tolerance_text}, nor with a wider tolerance."
         )
     used_text = tolerance_text
-    if estimate.uniformity > stated:
+    if estimate.uniformity > largest_stated:
         used_text = f"{100 * estimate.uniformity:g} % ({tolerance_text} does not suffice)"
     return (
-        f"{sentence}; each mode lies where that of a uniform beam does, to {used_text}. An "
+        f"{basis_sentence}; each mode lies where that of a uniform beam does, to {used_text}. An "
         "unevenness "
         "of the specimen is common to all sessions and does not average out."
     )
 
 
-def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
+def describe_slope(pooled_order: PooledOrder, modal_model: PooledModal) -> str:
     """Describe an order of the damping as the slope of a loss over the visible modes.
 
     Parameters
     ----------
     pooled_order : PooledOrder
         Order estimated with a tolerance of the geometry.
-    modal : PooledModal
+    modal_model : PooledModal
         Modal model of all sessions, with the estimate `tolerant`.
     """
-    estimate = modal.tolerant
+    estimate = modal_model.tolerant
     assert estimate is not None
-    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
-    sessions_sentence = describe_single_sessions(counts, sum(counts.values()))
+    status_counts = {
+        f"“{status}”": session_count for status, session_count in pooled_order.alone.items()
+    }
+    sessions_sentence = describe_single_sessions(status_counts, sum(status_counts.values()))
     if pooled_order.value is None or pooled_order.interval is None:
         return (
             f"The slope of the {LOSS_NAMES[pooled_order.order]} ({pooled_order.order}) is not "
             "identifiable: "
             f"{pooled_order.reason}. {sessions_sentence}"
         )
-    shown_hz = [mode.frequency_hz for mode in modal.modes]
-    sentence = loss_slope_sentence(
+    shown_hz = [mode.frequency_hz for mode in modal_model.modes]
+    slope_sentence = loss_slope_sentence(
         pooled_order.order,
         pooled_order.value,
         pooled_order.interval,
@@ -94,36 +95,44 @@ def describe_slope(pooled_order: PooledOrder, modal: PooledModal) -> str:
         pooled_order.status,
         pooled_order.reason,
     )
-    return f"{sentence} {sessions_sentence}"
+    return f"{slope_sentence} {sessions_sentence}"
 
 
 def describe_orders_if_exact(
-    freest: PooledEstimate, orders: Sequence[PooledOrder], modal: PooledModal | None
+    freest_fit: PooledEstimate, orders: Sequence[PooledOrder], modal_model: PooledModal | None
 ) -> list[str]:
     """Describe the orders of the damping on condition that the beam is exactly uniform.
 
     The list is empty if a uniform beam does not predict the modes.
     """
-    if modal is None or modal.uniform_beam.status == "refused":
+    if modal_model is None or modal_model.uniform_beam.status == "refused":
         return []
     orders_shown = []
     for order in orders:
-        exact = order.exact
-        if exact is None or exact.reason or exact.value is None or exact.interval is None:
+        exact_order = order.exact
+        if (
+            exact_order is None
+            or exact_order.reason
+            or exact_order.value is None
+            or exact_order.interval is None
+        ):
             continue
-        half_width = (exact.interval[1] - exact.interval[0]) / 2
-        value, low, high = to_uncertainty((exact.value, *exact.interval), exact.std or half_width)
+        half_width = (exact_order.interval[1] - exact_order.interval[0]) / 2
+        value_text, low, high_text = to_uncertainty(
+            (exact_order.value, *exact_order.interval), exact_order.std or half_width
+        )
         conclusions = {
             "compatible": "consistent with 1",
             "fractional": "which would exclude 1",
             "open": "1 would be doubtful",
         }
         orders_shown.append(
-            f"{order.order} {value} (95 %: {low} to {high}; {conclusions[exact.status]})"
+            f"{order.order} {value_text} (95 %: {low} to {high_text}; "
+            f"{conclusions[exact_order.status]})"
         )
     return (
         [
-            f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest.name}): "
+            f"{EXACTLY_UNIFORM_CONDITION.capitalize()} (type {freest_fit.name}): "
             f"{'; '.join(orders_shown)}."
         ]
         if orders_shown
@@ -163,8 +172,8 @@ def _describe_mode_change(mode_change: ModeInSweeps) -> str:
 
     def change_text(value: float, std: float) -> str:
         """Format a relative change in per cent, with its 95 % interval and direction."""
-        size, spread = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
-        return f"{size} ± {spread} % {'higher' if value > 0 else 'lower'}"
+        change_size, interval_text = to_uncertainty((abs(value), NORMAL_95 * std), std, 100.0)
+        return f"{change_size} ± {interval_text} % {'higher' if value > 0 else 'lower'}"
 
     return (
         f"mode {mode_change.mode} (falling: frequency "
@@ -175,20 +184,22 @@ def _describe_mode_change(mode_change: ModeInSweeps) -> str:
 
 
 def recommend_sweeps(
-    sweeps: OppositeSweeps | None, modal: PooledModal | None, sessions: Sequence[SessionAnalysis]
+    sweeps: OppositeSweeps | None,
+    modal_model: PooledModal | None,
+    sessions: Sequence[SessionAnalysis],
 ) -> list[str]:
     """Recommend further sweeps that show whether the specimen changes during the records."""
     if sweeps is not None and sweeps.changed:
-        modes = listed([str(mode_change.mode) for mode_change in sweeps.changed])
+        mode_numbers = listed([str(mode_change.mode) for mode_change in sweeps.changed])
         return [
             "To tell a change in time from one with amplitude, repeat both sweeps with half the "
-            f"amplitude: a difference in mode {modes} that stays is a change in time. Then check "
-            "clamp and temperature."
+            f"amplitude: a difference in mode {mode_numbers} that stays is a change in time. "
+            "Then check clamp and temperature."
         ]
-    directions = {session.experiment.rising for session in sessions}
-    refused = modal is not None and modal.uniform_beam.status == "refused"
-    if sweeps is None and refused and directions in ({True}, {False}):
-        missing_direction = "falling" if True in directions else "rising"
+    sweep_directions = {session.experiment.rising for session in sessions}
+    is_beam_refused = modal_model is not None and modal_model.uniform_beam.status == "refused"
+    if sweeps is None and is_beam_refused and sweep_directions in ({True}, {False}):
+        missing_direction = "falling" if True in sweep_directions else "rising"
         return [
             f"Add {missing_direction} sweeps (start_hz and stop_hz exchanged): in sweeps of one "
             "direction a "

@@ -53,14 +53,16 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         together. Without whole-record fits the list is empty.
     """
     documents = [dict(session.headline) for session in campaign.sessions if session.headline]
-    numbers, verdict = campaign_numbers(campaign), campaign.verdict
-    if numbers is not None and verdict is not None:
-        orders = (verdict.alpha, verdict.lambda_)
+    common_estimates, verdict = campaign_numbers(campaign), campaign.verdict
+    if common_estimates is not None and verdict is not None:
+        pooled_orders = (verdict.alpha, verdict.lambda_)
         named_findings = (
             replace(finding.example, sentence=finding.sentence, interval=None)
             for finding in verdict.findings
         )
-        documents.append(headline_json(None, numbers, orders, named_findings, campaign.validity))
+        documents.append(
+            headline_json(None, common_estimates, pooled_orders, named_findings, campaign.validity)
+        )
     return documents
 
 
@@ -77,54 +79,56 @@ def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
     Estimates or None
         The estimates; None without whole-record fits.
     """
-    pooled, verdict, modal = campaign.headline, campaign.verdict, campaign.modal
-    if pooled is None or verdict is None:
+    pooled_estimate, verdict, modal_model = campaign.headline, campaign.verdict, campaign.modal
+    if pooled_estimate is None or verdict is None:
         return None
-    orders = (verdict.alpha, verdict.lambda_)
-    exact_orders = tuple(order.exact or order for order in orders)
+    pooled_orders = (verdict.alpha, verdict.lambda_)
+    exact_orders = tuple(order.exact or order for order in pooled_orders)
     are_explained = verdict.adequate >= _ADEQUATE_FRACTION * verdict.sessions
     common_flag = None if are_explained else _UNEXPLAINED_FLAG
-    exact = Estimates(
-        name=pooled.name,
-        parameters=_reported_parameters(campaign, pooled, exact_orders, common_flag),
-        sizes=_reported_loss_factors(pooled, exact_orders, common_flag),
-        modes=_reported_modes(campaign, pooled, common_flag),
+    exact_estimates = Estimates(
+        name=pooled_estimate.name,
+        parameters=_reported_parameters(campaign, pooled_estimate, exact_orders, common_flag),
+        sizes=_reported_loss_factors(pooled_estimate, exact_orders, common_flag),
+        modes=_reported_modes(campaign, pooled_estimate, common_flag),
         structures=tuple(
-            (structure.name, _structure_status(structure, pooled))
+            (structure.name, _structure_status(structure, pooled_estimate))
             for structure in campaign.structures
         ),
-        simpler=_simpler_estimate(campaign, pooled),
+        simpler=_simpler_estimate(campaign, pooled_estimate),
         drag_speed_m_s=None,
     )
-    if modal is None:
-        return exact
-    numbers = replace_by_modal_model(
-        exact,
-        modal,
-        modal.uniform_beam,
-        modal.tolerant,
+    if modal_model is None:
+        return exact_estimates
+    reported_estimates = replace_by_modal_model(
+        exact_estimates,
+        modal_model,
+        modal_model.uniform_beam,
+        modal_model.tolerant,
         common_flag,
         common_flag,
-        half_width=modal.half_width,
+        half_width=modal_model.half_width,
     )
-    return _add_flags(numbers, campaign, orders)
+    return _add_flags(reported_estimates, campaign, pooled_orders)
 
 
 def _add_flags(
-    numbers: Estimates, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
+    estimates: Estimates, campaign: CampaignResult, orders: tuple[PooledOrder, ...]
 ) -> Estimates:
     """Flag quantities that differ between sessions, doubtful orders, and modes not shown."""
-    flags, mixed = _order_flags(orders), campaign.homogeneity.is_mixed
+    order_flags, is_mixed = _order_flags(orders), campaign.homogeneity.is_mixed
 
     def mixture_flag(quantity: str) -> str | None:
         """Return the flag of a quantity that differs between sessions, or None."""
-        return _MIXTURE_FLAG if mixed(quantity) else None
+        return _MIXTURE_FLAG if is_mixed(quantity) else None
 
     return replace(
-        numbers,
+        estimates,
         parameters={
-            name: parameter.flagged(mixture_flag(name) or flags.get(name))
-            for name, parameter in numbers.parameters.items()
+            parameter_name: parameter.flagged(
+                mixture_flag(parameter_name) or order_flags.get(parameter_name)
+            )
+            for parameter_name, parameter in estimates.parameters.items()
         },
         modes=tuple(
             replace(
@@ -136,88 +140,100 @@ def _add_flags(
                     mixture_flag(f"damping_ratio_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
             )
-            for mode in numbers.modes
+            for mode in estimates.modes
         ),
     )
 
 
 def _simpler_estimate(
-    campaign: CampaignResult, pooled: PooledEstimate
+    campaign: CampaignResult, reported_estimate: PooledEstimate
 ) -> ConditionalEstimate | None:
     """Return the estimate of the lowest BIC; it is valid if its fixed orders are true.
 
     Return None if that estimate is the reported one.
     """
-    conditional = campaign.pooled[0]
-    if conditional is pooled:
+    simpler_estimate = campaign.pooled[0]
+    if simpler_estimate is reported_estimate:
         return None
-    fixed = STRUCTURES[conditional.structure].fixed
+    fixed_orders = STRUCTURES[simpler_estimate.structure].fixed
     return ConditionalEstimate(
-        name=conditional.name,
-        fixed={name: value for name, value in fixed.items() if name in COEFFICIENT_OF},
+        name=simpler_estimate.name,
+        fixed={
+            order_name: order_value
+            for order_name, order_value in fixed_orders.items()
+            if order_name in COEFFICIENT_OF
+        },
         parameters={
             parameter.name: ReportedValue(parameter.value, parameter.std, parameter.interval)
-            for parameter in conditional.parameters
+            for parameter in simpler_estimate.parameters
         },
     )
 
 
 def _reported_parameters(
     campaign: CampaignResult,
-    pooled: PooledEstimate,
+    pooled_estimate: PooledEstimate,
     orders: tuple[PooledOrder, ...],
     common_flag: str | None,
 ) -> dict[str, ReportedValue]:
     """Return the pooled parameters with their flags."""
-    mixed = campaign.homogeneity.is_mixed
-    flags = _order_flags(orders)
-    reported = {
+    is_mixed = campaign.homogeneity.is_mixed
+    order_flags = _order_flags(orders)
+    reported_parameters = {
         parameter.name: ReportedValue(
             parameter.value,
             parameter.std,
             parameter.interval,
-            common_flag or (_MIXTURE_FLAG if mixed(parameter.name) else flags.get(parameter.name)),
+            common_flag
+            or (_MIXTURE_FLAG if is_mixed(parameter.name) else order_flags.get(parameter.name)),
         )
-        for parameter in pooled.parameters
+        for parameter in pooled_estimate.parameters
     }
-    free = STRUCTURES[pooled.structure].free
-    for name, value in pooled.plant.parameters.items():
-        if name not in reported and (name not in PARAMETERS or name in free):
-            reported[name] = ReportedValue(value, None, None, common_flag or _ON_BOUND_FLAG)
-    return reported
+    free_names = STRUCTURES[pooled_estimate.structure].free
+    for parameter_name, fixed_value in pooled_estimate.plant.parameters.items():
+        if parameter_name not in reported_parameters and (
+            parameter_name not in PARAMETERS or parameter_name in free_names
+        ):
+            reported_parameters[parameter_name] = ReportedValue(
+                fixed_value, None, None, common_flag or _ON_BOUND_FLAG
+            )
+    return reported_parameters
 
 
 def _order_flags(orders: tuple[PooledOrder, ...]) -> Mapping[str, str]:
-    """Return the reason against each doubtful order, also for the coefficient of the order."""
+    """Return a flag for each doubtful order and for its coefficient, by the parameter name."""
     return {
-        name: order.reason
+        order_name: order.reason
         for order in orders
         if order.reason is not None
-        for name in (order.order, COEFFICIENT_OF[order.order])
+        for order_name in (order.order, COEFFICIENT_OF[order.order])
     }
 
 
 def _reported_loss_factors(
-    pooled: PooledEstimate, orders: tuple[PooledOrder, ...], common_flag: str | None
+    pooled_estimate: PooledEstimate, orders: tuple[PooledOrder, ...], common_flag: str | None
 ) -> tuple[ReportedLossFactor, ...]:
     """Return the loss factors with their flags."""
-    flags = _order_flags(orders)
+    order_flags = _order_flags(orders)
     return tuple(
-        loss_factor.flagged(common_flag or flags.get(loss_factor.order))
-        for loss_factor in pooled.sizes
+        loss_factor.flagged(common_flag or order_flags.get(loss_factor.order))
+        for loss_factor in pooled_estimate.sizes
     )
 
 
 def _reported_modes(
-    campaign: CampaignResult, pooled: PooledEstimate, common_flag: str | None
+    campaign: CampaignResult, pooled_estimate: PooledEstimate, common_flag: str | None
 ) -> tuple[ReportedMode, ...]:
     """Return frequency and damping ratio of each pooled mode, with their flags."""
-    t, mixed = student_t_quantile(0.95, pooled.sessions - 1), campaign.homogeneity.is_mixed
+    t, is_mixed = (
+        student_t_quantile(0.95, pooled_estimate.sessions - 1),
+        campaign.homogeneity.is_mixed,
+    )
 
     def reported_value(value: float, std: float, quantity: str) -> ReportedValue:
         """Return a quantity of a mode with its interval and flag."""
-        flag = common_flag or (_MIXTURE_FLAG if mixed(quantity) else None)
-        return ReportedValue(value, std, (value - t * std, value + t * std), flag)
+        value_flag = common_flag or (_MIXTURE_FLAG if is_mixed(quantity) else None)
+        return ReportedValue(value, std, (value - t * std, value + t * std), value_flag)
 
     return tuple(
         ReportedMode(
@@ -228,13 +244,15 @@ def _reported_modes(
             ),
             shown=True,
         )
-        for mode in pooled.modes
+        for mode in pooled_estimate.modes
     )
 
 
-def _structure_status(structure: RankedStructure, pooled: PooledEstimate) -> StructureStatus:
+def _structure_status(
+    structure: RankedStructure, selected_estimate: PooledEstimate
+) -> StructureStatus:
     """Return whether a damping structure is selected, compatible with the data, or excluded."""
-    if structure.name == pooled.name:
+    if structure.name == selected_estimate.name:
         return "selected"
     bic_difference = structure.bic_above_lowest
     return (

@@ -133,12 +133,16 @@ class Homogeneity:
 
         Modes take precedence over parameters.
         """
-        mixed = [scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig]
+        mixed_scatters = [
+            scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig
+        ]
         mode_scatters = [
-            scatter for scatter in mixed if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
+            scatter
+            for scatter in mixed_scatters
+            if scatter.quantity.startswith(tuple(_MODE_QUANTITIES))
         ]
         return max(
-            mode_scatters or mixed,
+            mode_scatters or mixed_scatters,
             key=lambda scatter: scatter.between_std_in_own_stds,
             default=None,
         )
@@ -165,7 +169,7 @@ class Homogeneity:
 
 def homogeneity(
     sessions: Sequence[SessionAnalysis],
-    pooled: Sequence[PooledEstimate],
+    pooled_fits: Sequence[PooledEstimate],
     specimens: Sequence[StatedSpecimen],
 ) -> Homogeneity:
     """Test whether sessions are of one specimen, by their fits of one damping structure.
@@ -174,35 +178,35 @@ def homogeneity(
     ----------
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
-    pooled : sequence of PooledEstimate
+    pooled_fits : sequence of PooledEstimate
         Pooled estimates, the lowest BIC first.
     specimens : sequence of StatedSpecimen
         Different specimens stated in the files.
     """
-    name = common_structure(sessions)
+    structure_name = common_structure(sessions)
     common_estimates = [
         (session.name, estimate)
         for session in sessions
         for estimate in session.record_estimates
-        if estimate.name == name
+        if estimate.name == structure_name
     ]
     values_by_quantity = dict(_mode_values(common_estimates))
-    freest = freest_estimate(pooled)
-    if freest is not None:
-        values_by_quantity |= dict(_parameter_values(sessions, freest))
+    freest_fit = freest_estimate(pooled_fits)
+    if freest_fit is not None:
+        values_by_quantity |= dict(_parameter_values(sessions, freest_fit))
     values_by_quantity = {
-        quantity: values
-        for quantity, values in values_by_quantity.items()
-        if len(values) >= _FEWEST_SESSIONS
+        quantity: quantity_values
+        for quantity, quantity_values in values_by_quantity.items()
+        if len(quantity_values) >= _FEWEST_SESSIONS
     }
-    level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
+    significance_level = SIGNIFICANCE_LEVEL / max(len(values_by_quantity), 1)
     return Homogeneity(
         tuple(specimens),
         tuple(
-            _test_heterogeneity(quantity, values, level)
-            for quantity, values in values_by_quantity.items()
+            _test_heterogeneity(quantity, quantity_values, significance_level)
+            for quantity, quantity_values in values_by_quantity.items()
         ),
-        name,
+        structure_name,
     )
 
 
@@ -210,66 +214,72 @@ def _mode_values(
     estimates: Sequence[tuple[str, RecordEstimate]],
 ) -> Iterator[tuple[str, SessionValues]]:
     """Yield frequencies and damping ratios of the modes that all sessions have."""
-    count = min((len(estimate.modes) for _, estimate in estimates), default=0)
+    mode_count = min((len(estimate.modes) for _, estimate in estimates), default=0)
     for quantity, std in _MODE_QUANTITIES.items():
-        for index in range(count):
-            values = (
+        for mode_index in range(mode_count):
+            session_values = (
                 (
-                    file,
-                    getattr(estimate.modes[index], quantity),
-                    getattr(estimate.modes[index], std),
+                    file_name,
+                    getattr(estimate.modes[mode_index], quantity),
+                    getattr(estimate.modes[mode_index], std),
                 )
-                for file, estimate in estimates
+                for file_name, estimate in estimates
             )
-            yield f"{quantity}_{index + 1}", _with_known_std(values)
+            yield f"{quantity}_{mode_index + 1}", _with_known_std(session_values)
 
 
 def _parameter_values(
-    sessions: Sequence[SessionAnalysis], freest: PooledEstimate
+    sessions: Sequence[SessionAnalysis], freest_fit: PooledEstimate
 ) -> Iterator[tuple[str, SessionValues]]:
     """Yield the estimates of each pooled parameter, one for each session."""
-    for parameter in freest.parameters:
-        name = parameter.name
-        values = (
-            (session.name, estimate.parameters[name], estimate.std[name] or 0.0)
+    for parameter in freest_fit.parameters:
+        parameter_name = parameter.name
+        session_values = (
+            (session.name, estimate.parameters[parameter_name], estimate.std[parameter_name] or 0.0)
             for session in sessions
             for estimate in session.record_estimates
-            if estimate.name == freest.name and name in estimate.determined
+            if estimate.name == freest_fit.name and parameter_name in estimate.determined
         )
-        yield name, _with_known_std(values)
+        yield parameter_name, _with_known_std(session_values)
 
 
-def _with_known_std(values: Iterator[tuple[str, float, float]]) -> SessionValues:
+def _with_known_std(session_values: Iterator[tuple[str, float, float]]) -> SessionValues:
     """Return the entries with a finite and positive standard deviation."""
-    return tuple(entry for entry in values if math.isfinite(entry[2]) and entry[2] > 0)
+    return tuple(entry for entry in session_values if math.isfinite(entry[2]) and entry[2] > 0)
 
 
-def _test_heterogeneity(quantity: str, values: SessionValues, level: float) -> Heterogeneity:
+def _test_heterogeneity(
+    quantity: str, session_values: SessionValues, significance_level: float
+) -> Heterogeneity:
     """Return the between-session scatter of a quantity, tested at a significance level."""
-    estimate, std = np.array([entry[1:] for entry in values]).T
-    logarithmic = quantity in LOGARITHMIC_PARAMETERS
-    if logarithmic:
-        estimate, std = np.log(estimate), std / estimate
-    effects = random_effects(estimate[:, None], (std**2)[:, None, None])
-    chance = float(chi_square_p_value(effects.cochran_q[0], len(values) - 1))
-    mean = math.exp(effects.mean[0]) if logarithmic else float(effects.mean[0])
-    significant = chance < level
-    split = split_groups(estimate, std) if significant else ()
-    q = float(effects.cochran_q[0])
+    estimates, std = np.array([entry[1:] for entry in session_values]).T
+    is_logarithmic = quantity in LOGARITHMIC_PARAMETERS
+    if is_logarithmic:
+        estimates, std = np.log(estimates), std / estimates
+    pooled_effects = random_effects(estimates[:, None], (std**2)[:, None, None])
+    p_value = float(chi_square_p_value(pooled_effects.cochran_q[0], len(session_values) - 1))
+    mean = math.exp(pooled_effects.mean[0]) if is_logarithmic else float(pooled_effects.mean[0])
+    is_significant = p_value < significance_level
+    session_groups = split_groups(estimates, std) if is_significant else ()
+    q = float(pooled_effects.cochran_q[0])
     return Heterogeneity(
         quantity=quantity,
-        values=values,
+        values=session_values,
         mean=mean,
-        between_std=float(effects.between_std[0]) * (mean if logarithmic else 1.0),
+        between_std=float(pooled_effects.between_std[0]) * (mean if is_logarithmic else 1.0),
         cochran_q=q,
-        chance=chance,
-        mixed=significant and (bool(split) or q * (1 - _MIXTURE_I_SQUARED) >= len(values) - 1),
-        groups=tuple(tuple(values[index][0] for index in sorted(group)) for group in split),
+        chance=p_value,
+        mixed=is_significant
+        and (bool(session_groups) or q * (1 - _MIXTURE_I_SQUARED) >= len(session_values) - 1),
+        groups=tuple(
+            tuple(session_values[session_index][0] for session_index in sorted(group))
+            for group in session_groups
+        ),
     )
 
 
 def split_groups(
-    estimate: NDArray[np.float64], std: NDArray[np.float64]
+    estimates: NDArray[np.float64], std: NDArray[np.float64]
 ) -> tuple[tuple[int, ...], ...]:
     """Split estimates at clear gaps into groups of session indices, the lowest values first.
 
@@ -280,24 +290,26 @@ def split_groups(
 
     Parameters
     ----------
-    estimate, std : ndarray, shape (K,)
+    estimates, std : ndarray, shape (K,)
         Estimate of each session, and its standard deviation.
     """
-    order = np.argsort(estimate)
-    gaps = np.diff(estimate[order])
+    sorted_indices = np.argsort(estimates)
+    value_gaps = np.diff(estimates[sorted_indices])
     session_std = math.sqrt(float(np.mean(std**2)))
     best_groups: tuple[tuple[int, ...], ...] = ()
-    clearest = _CLEAR_GAP_STDS
-    for count in range(2, (order.size + 1) // 2 + 1):
-        cut_indices = np.sort(np.argsort(gaps)[1 - count :]) + 1
-        candidate_groups = np.split(order, cut_indices)
-        squares = sum(
-            float(((estimate[p] - estimate[p].mean()) ** 2).sum()) for p in candidate_groups
+    largest_ratio = _CLEAR_GAP_STDS
+    for group_count in range(2, (sorted_indices.size + 1) // 2 + 1):
+        cut_indices = np.sort(np.argsort(value_gaps)[1 - group_count :]) + 1
+        candidate_groups = np.split(sorted_indices, cut_indices)
+        squared_deviations = sum(
+            float(((estimates[p] - estimates[p].mean()) ** 2).sum()) for p in candidate_groups
         )
-        group_std = max(math.sqrt(squares / (order.size - count)), session_std)
-        smallest_gap = float(gaps[cut_indices - 1].min()) / group_std
-        if smallest_gap > clearest:
-            clearest, best_groups = (
+        group_std = max(
+            math.sqrt(squared_deviations / (sorted_indices.size - group_count)), session_std
+        )
+        smallest_gap = float(value_gaps[cut_indices - 1].min()) / group_std
+        if smallest_gap > largest_ratio:
+            largest_ratio, best_groups = (
                 smallest_gap,
                 tuple(tuple(group.tolist()) for group in candidate_groups),
             )

@@ -81,27 +81,27 @@ class PooledModal(ModalEstimate):
 
     @property
     def leads(self) -> bool:
-        """Whether the modes of this model are reported, and not those of a uniform beam."""
+        """Whether the report has the modes of this modal model, and not those of a uniform beam."""
         return self.tolerant is not None or self.uniform_beam.status == "refused"
 
     @property
     def modes(self) -> tuple[PooledMode, ...]:
         """Frequency, damping ratio and inertia of each mode, with their standard deviations."""
         pooled_modes = []
-        for number in self.numbers:
-            mode, (inertia, relative_std) = self.mode(number), self.inertia(number)
-            between = self.between_std[self.rows([number])]
+        for mode_number in self.numbers:
+            mode, (inertia, relative_std) = self.mode(mode_number), self.inertia(mode_number)
+            scatter_std = self.between_std[self.rows([mode_number])]
             pooled_modes.append(
                 PooledMode(
-                    number=number,
+                    number=mode_number,
                     frequency_hz=mode.frequency_hz,
                     frequency_std_hz=mode.frequency_std_hz,
                     frequency_between_std_hz=mode.frequency_hz
-                    * float(between[_LN_FREQUENCY_INDEX]),
+                    * float(scatter_std[_LN_FREQUENCY_INDEX]),
                     damping_ratio=mode.damping_ratio,
                     damping_ratio_std=mode.damping_ratio_std,
                     damping_ratio_between_std=mode.damping_ratio
-                    * float(between[_LN_DAMPING_RATIO_INDEX]),
+                    * float(scatter_std[_LN_DAMPING_RATIO_INDEX]),
                     source="modal",
                     participation_kg_m2=inertia,
                     participation_std_kg_m2=inertia * relative_std,
@@ -118,57 +118,72 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
     """
-    with_modes = [
+    modal_sessions = [
         session for session in sessions if session.modal is not None and session.nominal is not None
     ]
-    modes = _common_modes([session.modal for session in with_modes if session.modal is not None])
-    used = [
-        session
-        for session in with_modes
-        if session.modal and set(modes) <= set(session.modal.visible)
-    ]
-    if not modes or len(used) < _FEWEST_SESSIONS:
-        return None
-    effects = _pooled_constants(
-        [session.modal for session in used if session.modal is not None], modes
+    common_modes = _common_modes(
+        [session.modal for session in modal_sessions if session.modal is not None]
     )
-    estimate = _modal_estimate(modes, effects.mean, effects.covariance)
-    nominal = used[0].nominal
-    assert nominal is not None
-    stated = tuple(sorted({session.uniformity for session in used}))
-    tolerant = None
-    if stated[-1]:
+    used_sessions = [
+        session
+        for session in modal_sessions
+        if session.modal and set(common_modes) <= set(session.modal.visible)
+    ]
+    if not common_modes or len(used_sessions) < _FEWEST_SESSIONS:
+        return None
+    pooled_constants = _pooled_constants(
+        [session.modal for session in used_sessions if session.modal is not None], common_modes
+    )
+    modal_estimate = _modal_estimate(
+        common_modes, pooled_constants.mean, pooled_constants.covariance
+    )
+    nominal_plant = used_sessions[0].nominal
+    assert nominal_plant is not None
+    stated_uniformities = tuple(sorted({session.uniformity for session in used_sessions}))
+    tolerant_fit = None
+    if stated_uniformities[-1]:
         # The intervals assume a normal distribution, but Student's t of few sessions is wider.
-        variance_factor = (student_t_quantile(0.95, len(used) - 1) / NORMAL_95) ** 2
-        widened_estimate = replace(estimate, joint_covariance=variance_factor * effects.covariance)
-        tolerant = tolerant_estimate(widened_estimate, nominal, stated[-1])
+        variance_factor = (student_t_quantile(0.95, len(used_sessions) - 1) / NORMAL_95) ** 2
+        widened_estimate = replace(
+            modal_estimate, joint_covariance=variance_factor * pooled_constants.covariance
+        )
+        tolerant_fit = tolerant_estimate(widened_estimate, nominal_plant, stated_uniformities[-1])
     return PooledModal(
-        model=estimate.model,
-        numbers=modes,
-        constants=estimate.constants,
-        joint_covariance=effects.covariance,
-        sessions=len(used),
-        between_std=effects.between_std[: estimate.constants.size],
-        stated=stated,
-        uniform_beam=uniform_beam_test(estimate, nominal),
-        tolerant=tolerant,
+        model=modal_estimate.model,
+        numbers=common_modes,
+        constants=modal_estimate.constants,
+        joint_covariance=pooled_constants.covariance,
+        sessions=len(used_sessions),
+        between_std=pooled_constants.between_std[: modal_estimate.constants.size],
+        stated=stated_uniformities,
+        uniform_beam=uniform_beam_test(modal_estimate, nominal_plant),
+        tolerant=tolerant_fit,
     )
 
 
 def _modal_estimate(
-    modes: tuple[int, ...], joint: NDArray[np.float64], covariance: NDArray[np.float64]
+    modes: tuple[int, ...], joint_values: NDArray[np.float64], joint_covariance: NDArray[np.float64]
 ) -> ModalEstimate:
-    """Return the modal estimate with given constants and background, and their covariance."""
-    constants, background = np.split(joint, [len(modes) * len(MODE_CONSTANT_NAMES)])
-    model = ModalModel.of_constants(constants, background.tolist())
-    return ModalEstimate(model, modes, constants, covariance)
+    """Return the modal estimate of some modes from the vector of constants and background."""
+    constants, background = np.split(joint_values, [len(modes) * len(MODE_CONSTANT_NAMES)])
+    modal_model = ModalModel.of_constants(constants, background.tolist())
+    return ModalEstimate(modal_model, modes, constants, joint_covariance)
 
 
 def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
-    """Return the numbers of the modes that nearly all sessions show."""
-    mode_counts = Counter(number for estimate in estimates for number in estimate.visible)
-    fewest = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
-    return tuple(sorted(number for number, sessions in mode_counts.items() if sessions >= fewest))
+    """Return the numbers of the modes that are visible in nearly all sessions.
+
+    Such a mode is visible in at least 90 % of the sessions, and in at least two.
+    """
+    mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
+    fewest_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
+    return tuple(
+        sorted(
+            mode_number
+            for mode_number, session_count in mode_counts.items()
+            if session_count >= fewest_sessions
+        )
+    )
 
 
 def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) -> RandomEffects:
@@ -176,26 +191,26 @@ def _pooled_constants(estimates: Sequence[ModalEstimate], modes: Sequence[int]) 
 
     Whole turns are removed from the phase differences to the first estimate.
     """
-    values, covariances = map(
+    session_values, session_covariances = map(
         np.array, zip(*(_constants_and_background(e, modes) for e in estimates), strict=True)
     )
-    phases = values[
+    residue_phases = session_values[
         :, _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
     ]
-    phases -= 2 * math.pi * np.round((phases - phases[0]) / (2 * math.pi))
-    return random_effects(values, covariances)
+    residue_phases -= 2 * math.pi * np.round((residue_phases - residue_phases[0]) / (2 * math.pi))
+    return random_effects(session_values, session_covariances)
 
 
 def _constants_and_background(
     estimate: ModalEstimate, modes: Sequence[int]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return constants of some modes and background of one session, with covariance."""
-    rows = estimate.rows(modes)
+    """Return modal constants and background of a session as one vector, and its covariance."""
+    constant_indices = estimate.rows(modes)
     indices = np.concatenate(
-        [rows, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
+        [constant_indices, np.arange(estimate.constants.size, len(estimate.joint_covariance))]
     )
-    values = np.concatenate([estimate.constants[rows], estimate.model.background])
-    return values, estimate.joint_covariance[np.ix_(indices, indices)]
+    joint_values = np.concatenate([estimate.constants[constant_indices], estimate.model.background])
+    return joint_values, estimate.joint_covariance[np.ix_(indices, indices)]
 
 
 # Rising and falling sweeps
@@ -258,57 +273,69 @@ def opposite_sweeps(sessions: Sequence[SessionAnalysis]) -> OppositeSweeps | Non
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
     """
-    rising = [
+    rising_estimates = [
         session.modal for session in sessions if session.modal and session.experiment.rising is True
     ]
-    falling = [
+    falling_estimates = [
         session.modal
         for session in sessions
         if session.modal and session.experiment.rising is False
     ]
-    if not rising or not falling:
+    if not rising_estimates or not falling_estimates:
         return None
-    common = set.intersection(*(set(estimate.visible) for estimate in (*rising, *falling)))
-    modes = tuple(sorted(common))
+    common_modes = set.intersection(
+        *(set(estimate.visible) for estimate in (*rising_estimates, *falling_estimates))
+    )
+    modes = tuple(sorted(common_modes))
     if not modes:
         return None
-    values, covariances = zip(*_pool_groups((rising, falling), modes), strict=True)
-    difference, covariance = values[1] - values[0], covariances[0] + covariances[1]
-    phases = difference[
+    pooled_values, covariances = zip(
+        *_pool_groups((rising_estimates, falling_estimates), modes), strict=True
+    )
+    value_difference, covariance = (
+        pooled_values[1] - pooled_values[0],
+        covariances[0] + covariances[1],
+    )
+    phases = value_difference[
         _RESIDUE_PHASE_INDEX : len(modes) * len(MODE_CONSTANT_NAMES) : len(MODE_CONSTANT_NAMES)
-    ]  # a view into `difference`
+    ]  # a view into `value_difference`
     phases -= 2 * math.pi * np.round(phases / (2 * math.pi))
-    changes = []
-    for index, mode in enumerate(modes):
-        rows = slice(len(MODE_CONSTANT_NAMES) * index, len(MODE_CONSTANT_NAMES) * (index + 1))
-        mode_difference, mode_covariance = difference[rows], covariance[rows, rows]
-        chance = float(
+    mode_changes = []
+    for mode_index, mode in enumerate(modes):
+        mode_slice = slice(
+            len(MODE_CONSTANT_NAMES) * mode_index, len(MODE_CONSTANT_NAMES) * (mode_index + 1)
+        )
+        mode_difference, mode_covariance = (
+            value_difference[mode_slice],
+            covariance[mode_slice, mode_slice],
+        )
+        p_value = float(
             chi_square_p_value(
                 mode_difference @ np.linalg.solve(mode_covariance, mode_difference),
                 len(MODE_CONSTANT_NAMES),
             )
         )
         std = np.sqrt(np.diag(mode_covariance))
-        changes.append(
+        mode_changes.append(
             ModeInSweeps(
                 mode,
                 float(mode_difference[_LN_FREQUENCY_INDEX]),
                 float(std[_LN_FREQUENCY_INDEX]),
                 float(mode_difference[_LN_DAMPING_RATIO_INDEX]),
                 float(std[_LN_DAMPING_RATIO_INDEX]),
-                chance, chance < _SIGNIFICANCE_LEVEL / len(modes),
+                p_value, p_value < _SIGNIFICANCE_LEVEL / len(modes),
             )
         )  # fmt: skip
-    return OppositeSweeps(len(rising), len(falling), tuple(changes))
+    return OppositeSweeps(len(rising_estimates), len(falling_estimates), tuple(mode_changes))
 
 
 def _pool_groups(
     groups: Iterable[Sequence[ModalEstimate]], modes: Sequence[int]
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield pooled constants and background of each group of estimates, with their covariance."""
-    for group in groups:
-        if len(group) < _FEWEST_SESSIONS:
-            yield _constants_and_background(group[0], modes)
+    for group_estimates in groups:
+        if len(group_estimates) < _FEWEST_SESSIONS:
+            yield _constants_and_background(group_estimates[0], modes)
         else:
-            effects = _pooled_constants(group, modes)
-            yield effects.mean, effects.covariance
+            pooled_effects = _pooled_constants(group_estimates, modes)
+            yield pooled_effects.mean, pooled_effects.covariance

@@ -39,25 +39,25 @@ _DETERMINING_FRACTION: Final = 0.9
 structure for it to be reported."""
 
 
-def freest_estimate(pooled: Sequence[PooledEstimate]) -> PooledEstimate | None:
-    """Return the estimate of the freest damping structure that nearly all sessions determine.
+def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimate | None:
+    """Return the estimate of the freest damping structure that at least 90 % of sessions determine.
 
-    The freest structure has the largest number of free parameters. A structure that far fewer
-    sessions determine than the one of the lowest BIC does not represent all sessions.
+    The freest structure has the largest number of free parameters. The 90 %
+    (`_DETERMINING_FRACTION`) are of the sessions that determine the structure of the lowest BIC.
 
     Parameters
     ----------
-    pooled : sequence of PooledEstimate
+    pooled_estimates : sequence of PooledEstimate
         Pooled estimates, the lowest BIC first; None is returned if there are none.
     """
-    if not pooled:
+    if not pooled_estimates:
         return None
-    best = pooled[0]
+    lowest_bic_estimate = pooled_estimates[0]
     return max(
         (
             estimate
-            for estimate in pooled
-            if estimate.sessions >= _DETERMINING_FRACTION * best.sessions
+            for estimate in pooled_estimates
+            if estimate.sessions >= _DETERMINING_FRACTION * lowest_bic_estimate.sessions
         ),
         key=lambda estimate: len(STRUCTURES[estimate.structure].free),
     )
@@ -76,12 +76,14 @@ def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
     str or None
         The freest structure that was fitted to every session. None without whole-record fits.
     """
-    fitted = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, fitted.values()), default=0)
-    candidates = [
-        estimates[0] for estimates in fitted.values() if len(estimates) == fitted_sessions
+    estimates_by_name = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
+    structure_estimates = [
+        estimates[0]
+        for estimates in estimates_by_name.values()
+        if len(estimates) == fitted_sessions
     ]
-    return max(candidates, key=_free_parameter_count).name if candidates else None
+    return max(structure_estimates, key=_free_parameter_count).name if structure_estimates else None
 
 
 def _free_parameter_count(estimate: RecordEstimate) -> int:
@@ -145,7 +147,11 @@ class PooledOrder:
     exact: PooledOrder | None = None
 
     def doubted(self, reason: str) -> PooledOrder:
-        """Return the order with a reason for doubt; unchanged if it already has a reason."""
+        """Return this order with a reason against its interpretation.
+
+        Its status becomes "open" if it has an interval. An order that already has a reason is
+        returned unchanged.
+        """
         if self.reason is not None:
             return self
         return replace(self, status="open" if self.interval else self.status, reason=reason)
@@ -153,7 +159,7 @@ class PooledOrder:
 
 def pooled_order(
     order: Order,
-    ranked: Sequence[PooledEstimate],
+    ranked_estimates: Sequence[PooledEstimate],
     verdicts: Sequence[Verdict],
     homogeneity: Homogeneity,
 ) -> PooledOrder:
@@ -163,7 +169,7 @@ def pooled_order(
     ----------
     order : str
         "alpha" or "lambda".
-    ranked : sequence of PooledEstimate
+    ranked_estimates : sequence of PooledEstimate
         Pooled estimates, the lowest BIC first; not empty.
     verdicts : sequence of Verdict
         Verdicts of the sessions.
@@ -176,35 +182,37 @@ def pooled_order(
     single_statuses: dict[str, int] = dict(
         Counter(str(one.status) for one in session_orders).most_common()
     )
-    freest = freest_estimate(ranked)
-    assert freest is not None
-    parameter = freest.by_name.get(order)
-    status, reason = _status_and_reason(order, ranked, freest, verdicts, single_statuses)
-    is_known = parameter is not None and status not in ("not identifiable", "absent")
-    mixture = is_known and (
-        homogeneity.is_mixed(order) or (homogeneity.mixed and freest.sessions < len(verdicts))
+    freest_fit = freest_estimate(ranked_estimates)
+    assert freest_fit is not None
+    parameter = freest_fit.by_name.get(order)
+    order_status, doubt_reason = _status_and_reason(
+        order, ranked_estimates, freest_fit, verdicts, single_statuses
     )
-    if mixture:
-        status = "open"
-        reason = "the sessions are not of one specimen and do not all share it"
+    is_estimated = parameter is not None and order_status not in ("not identifiable", "absent")
+    is_mixture = is_estimated and (
+        homogeneity.is_mixed(order) or (homogeneity.mixed and freest_fit.sessions < len(verdicts))
+    )
+    if is_mixture:
+        order_status = "open"
+        doubt_reason = "the sessions are not of one specimen and do not all share it"
     return PooledOrder(
         order=order,
-        status=status,
+        status=order_status,
         value=parameter.value
-        if parameter and is_known
+        if parameter and is_estimated
         else 1.0
-        if status == "compatible"
+        if order_status == "compatible"
         else None,
-        interval=parameter.interval if parameter and is_known else None,
-        reason=reason,
+        interval=parameter.interval if parameter and is_estimated else None,
+        reason=doubt_reason,
         alone=single_statuses,
-        mixture=mixture,
-        std=parameter.std if parameter and is_known else None,
+        mixture=is_mixture,
+        std=parameter.std if parameter and is_estimated else None,
     )
 
 
 def tolerant_pooled_order(
-    exact: PooledOrder,
+    exact_order: PooledOrder,
     estimate: TolerantEstimate,
     verdicts: Sequence[Verdict],
     *,
@@ -214,7 +222,7 @@ def tolerant_pooled_order(
 
     Parameters
     ----------
-    exact : PooledOrder
+    exact_order : PooledOrder
         The same order on an exactly uniform beam.
     estimate : TolerantEstimate
         Estimate from the modal constants of all sessions.
@@ -223,52 +231,67 @@ def tolerant_pooled_order(
     refused : bool
         Whether a uniform beam does not predict the pooled constants.
     """
-    order = exact.order
-    status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
-    pooled = PooledOrder(
-        order=order,
-        status=status,
-        value=estimate.values[order] if reason is None else None,
-        interval=estimate.interval[order] if reason is None else None,
-        reason=reason,
-        alone=exact.alone,
-        std=estimate.std[order] if reason is None else None,
-        exact=exact,
+    order = exact_order.order
+    order_status, doubt_reason = order_status_with_geometry_tolerance(
+        order, estimate, refused=refused
     )
-    if exact.mixture and exact.reason is not None:
-        return replace(pooled.doubted(exact.reason), mixture=True)
+    tolerant_order = PooledOrder(
+        order=order,
+        status=order_status,
+        value=estimate.values[order] if doubt_reason is None else None,
+        interval=estimate.interval[order] if doubt_reason is None else None,
+        reason=doubt_reason,
+        alone=exact_order.alone,
+        std=estimate.std[order] if doubt_reason is None else None,
+        exact=exact_order,
+    )
+    if exact_order.mixture and exact_order.reason is not None:
+        return replace(tolerant_order.doubted(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
-        return pooled.doubted(_UNEXPLAINED_REASON)
-    effective = effective_reason(order, refused=refused)
-    return pooled if effective is None else pooled.doubted(effective)
+        return tolerant_order.doubted(_UNEXPLAINED_REASON)
+    final_reason = effective_reason(order, refused=refused)
+    return tolerant_order if final_reason is None else tolerant_order.doubted(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:
-    """Return whether the residuals of nearly all sessions are noise."""
+    """Return whether the residual is noise in at least 90 % of the sessions."""
     return sum(verdict.adequate for verdict in verdicts) >= _ADEQUATE_FRACTION * len(verdicts)
 
 
-def rival_estimates(ranked: Sequence[PooledEstimate], margin: float) -> tuple[PooledEstimate, ...]:
-    """Return the estimates, except the first, whose BIC is less than `margin` above the lowest."""
-    return tuple(estimate for estimate in ranked[1:] if estimate.bic < ranked[0].bic + margin)
+def rival_estimates(
+    ranked_estimates: Sequence[PooledEstimate], bic_margin: float
+) -> tuple[PooledEstimate, ...]:
+    """Return the estimates, except the first, whose BIC is close to the lowest BIC.
+
+    Their BIC is less than `bic_margin` above the lowest.
+    """
+    return tuple(
+        estimate
+        for estimate in ranked_estimates[1:]
+        if estimate.bic < ranked_estimates[0].bic + bic_margin
+    )
 
 
 def _status_and_reason(
     order: Order,
-    ranked: Sequence[PooledEstimate],
-    freest: PooledEstimate,
+    ranked_estimates: Sequence[PooledEstimate],
+    freest_fit: PooledEstimate,
     verdicts: Sequence[Verdict],
     single_statuses: Mapping[str, int],
 ) -> tuple[PooledStatus, str | None]:
-    """Return the status of one order of the damping, and the reason against reporting it."""
-    structure = STRUCTURES[freest.structure]
-    modes = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[0][0]
+    """Return the status of an order of the damping, and the reason against it or None."""
+    structure = STRUCTURES[freest_fit.structure]
+    usual_mode_count = Counter(len(verdict.visible_modes) for verdict in verdicts).most_common(1)[
+        0
+    ][0]
     several_modes = 2 * sum(len(v.visible_modes) > 1 for v in verdicts) > len(verdicts)
-    if few_modes_reason := too_few_modes(structure, max(modes, 2) if several_modes else 1):
+    if few_modes_reason := too_few_modes(
+        structure, max(usual_mode_count, 2) if several_modes else 1
+    ):
         return "not identifiable", few_modes_reason
     if not structure.has(order):
         return "absent", "no such damping shows"
-    parameter = freest.by_name.get(order)
+    parameter = freest_fit.by_name.get(order)
     if (
         parameter is None
         and structure.fixed.get(order) == 1.0
@@ -282,14 +305,14 @@ def _status_and_reason(
         return "open", _UNEXPLAINED_REASON
     integer_rivals = [
         estimate
-        for estimate in (ranked[0], *rival_estimates(ranked, BIC_DECISIVE))
+        for estimate in (ranked_estimates[0], *rival_estimates(ranked_estimates, BIC_DECISIVE))
         if _has_order_one(estimate, order)
     ]
-    low, high = parameter.interval
-    if low <= 1 <= high:
+    low, upper_limit = parameter.interval
+    if low <= 1 <= upper_limit:
         return "compatible", None
-    excluded = not integer_rivals and _excludes_one(parameter, freest.sessions)
-    return ("fractional" if excluded else "open"), None
+    is_one_excluded = not integer_rivals and _excludes_one(parameter, freest_fit.sessions)
+    return ("fractional" if is_one_excluded else "open"), None
 
 
 def _has_order_one(estimate: PooledEstimate, order: Order) -> bool:
@@ -302,6 +325,6 @@ def _excludes_one(order: PooledParameter, sessions: int) -> bool:
     return abs(order.value - 1) > student_t_quantile(_EXCLUSION_LEVEL, sessions - 1) * order.std
 
 
-def _relative_width(interval: tuple[float, float]) -> float:
+def _relative_width(order_interval: tuple[float, float]) -> float:
     """Return the width of an interval as a fraction of the range of orders."""
-    return (interval[1] - interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])
+    return (order_interval[1] - order_interval[0]) / (ORDER_RANGE[1] - ORDER_RANGE[0])

@@ -180,7 +180,7 @@ class SessionTask:
     uniformity: float | None = None
 
 
-def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionFailure:
+def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | SessionFailure:
     """Read and analyse a session by a fit to the whole record, and by Welch's method if applicable.
 
     An error of one session is returned, not raised, because the others are still usable.
@@ -189,7 +189,7 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
     ----------
     path : Path
         Session file.
-    task : SessionTask
+    session_task : SessionTask
         Settings of the analysis.
     """
     from analysis.record import load_record
@@ -198,92 +198,111 @@ def analyse_session(path: Path, task: SessionTask) -> SessionAnalysis | SessionF
     session_errors = session_error_types()
     experiment = None
     try:
-        record = with_uniformity(load_record(path), task.uniformity)
+        record = with_uniformity(load_record(path), session_task.uniformity)
         experiment = Experiment.from_record(record)
-        unfinished = experiment.unfinished_sweep_reason(record.outcome)
-        if unfinished:
-            return SessionFailure(path, f"{path}: {unfinished}", experiment)
-        welch, omission_remark = welch_analysis(
-            record, task.settings, task.band_hz, optional=bool(task.structures)
+        unfinished_reason = experiment.unfinished_sweep_reason(record.outcome)
+        if unfinished_reason:
+            return SessionFailure(path, f"{path}: {unfinished_reason}", experiment)
+        welch_results, omission_remark = welch_analysis(
+            record,
+            session_task.settings,
+            session_task.band_hz,
+            optional=bool(session_task.structures),
         )
     except session_errors as error:
         return SessionFailure(path, str(error), experiment)
     except MemoryError:
         return SessionFailure(path, f"{path}: not enough memory to analyse it; use fewer --jobs.")
-    warnings = record.warnings if welch is None else welch.warnings
+    warnings = record.warnings if welch_results is None else welch_results.warnings
     warnings = (
         *warnings,
-        *remarks(record, task.band_hz),
+        *remarks(record, session_task.band_hz),
         *((omission_remark,) if omission_remark else ()),
     )
     record_result = None
-    if task.structures:
+    if session_task.structures:
         try:
-            record_result = whole_record(record, task.fixed, task.band_hz)
+            record_result = whole_record(record, session_task.fixed, session_task.band_hz)
         except session_errors as error:
-            if welch is None:
+            if welch_results is None:
                 return SessionFailure(path, str(error), experiment)
             warnings = (*warnings, f"Not in the whole-record estimate: {error}")
         except (MemoryError, np.linalg.LinAlgError) as error:
-            reason = "not enough memory" if isinstance(error, MemoryError) else error
-            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {reason}")
+            failure_reason = "not enough memory" if isinstance(error, MemoryError) else error
+            warnings = (*warnings, f"Not in the whole-record estimate: {path}: {failure_reason}")
     findings = record_result.verdict.findings if record_result else ()
-    if invalidating := next(
+    if invalidating_findings := next(
         (finding.sentence for finding in findings if finding.kind in _INVALIDATING_FINDINGS), None
     ):
-        return SessionFailure(path, f"{path}: {invalidating}", experiment)
-    return _session_result(RecordResult(record, record_result, welch), task, experiment, warnings)
+        return SessionFailure(path, f"{path}: {invalidating_findings}", experiment)
+    return _session_result(
+        RecordResult(record, record_result, welch_results), session_task, experiment, warnings
+    )
 
 
 def _session_result(
-    result: RecordResult, task: SessionTask, experiment: Experiment, warnings: tuple[str, ...]
+    record_result: RecordResult,
+    session_task: SessionTask,
+    experiment: Experiment,
+    warnings: tuple[str, ...],
 ) -> SessionAnalysis:
     """Return the results of a session that a campaign retains."""
     from analysis.suited import record_band_hz, welch_settings
 
-    record, whole, welch = result.record, result.whole, result.welch
-    measured = _NO_RESPONSE if welch is None else welch.response
+    record, whole_fits, welch_results = (
+        record_result.record,
+        record_result.whole,
+        record_result.welch,
+    )
+    measured_response = _NO_RESPONSE if welch_results is None else welch_results.response
     delay_s = record.torque_delay_s - record.angle_delay_s
-    settings = welch_settings(record, task.settings, task.band_hz)
-    modal = None if whole is None else whole.headline.modal
-    if welch is not None:
-        settings = replace(settings, **asdict(welch.segmentation))
+    used_settings = welch_settings(record, session_task.settings, session_task.band_hz)
+    modal_estimate = None if whole_fits is None else whole_fits.headline.modal
+    if welch_results is not None:
+        used_settings = replace(used_settings, **asdict(welch_results.segmentation))
     return SessionAnalysis(
         path=record.path,
         experiment=experiment,
         beam=record.beam,
         tool_inertia_kg_m2=record.tool_inertia_kg_m2,
         delay_s=delay_s,
-        frequency_hz=measured.frequency_hz,
-        response=measured.response,
-        peaks=() if welch is None else welch.peaks,
-        welch_fits=() if welch is None else tuple(map(WelchFit.from_model, welch.models)),
+        frequency_hz=measured_response.frequency_hz,
+        response=measured_response.response,
+        peaks=() if welch_results is None else welch_results.peaks,
+        welch_fits=()
+        if welch_results is None
+        else tuple(map(WelchFit.from_model, welch_results.models)),
         record_estimates=()
-        if whole is None
-        else _record_estimates(whole, task.structures, measured, delay_s),
-        verdict=None if whole is None else whole.verdict,
+        if whole_fits is None
+        else _record_estimates(whole_fits, session_task.structures, measured_response, delay_s),
+        verdict=None if whole_fits is None else whole_fits.verdict,
         warnings=warnings,
-        headline=None if whole is None else whole.headline_json(),
-        settings=settings,
-        segments=measured.segments,
-        record_band_hz=record_band_hz(record, task.band_hz),
+        headline=None if whole_fits is None else whole_fits.headline_json(),
+        settings=used_settings,
+        segments=measured_response.segments,
+        record_band_hz=record_band_hz(record, session_task.band_hz),
         digests=sample_digests(record.angle_rad, record.torque_nm),
-        validity=result.validity,
-        modal=None if modal is None or not modal.visible else modal.restrict_to_visible_modes(),
-        nominal=None if whole is None else whole.analysis.comparison.measurement.nominal,
+        validity=record_result.validity,
+        modal=None
+        if modal_estimate is None or not modal_estimate.visible
+        else modal_estimate.restrict_to_visible_modes(),
+        nominal=None if whole_fits is None else whole_fits.analysis.comparison.measurement.nominal,
         uniformity=record.uniformity,
     )
 
 
 def _record_estimates(
-    whole: WholeRecord, structures: Collection[str], measured: FrequencyResponse, delay_s: float
+    whole_record: WholeRecord,
+    structure_names: Collection[str],
+    measured_response: FrequencyResponse,
+    delay_s: float,
 ) -> tuple[RecordEstimate, ...]:
     """Return the fits of the requested damping structures and of the selected one."""
     from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
 
-    omega = 2 * np.pi * measured.frequency_hz
-    grid = ResponseGrid(1j * omega)
+    omega = 2 * np.pi * measured_response.frequency_hz
+    response_grid = ResponseGrid(1j * omega)
 
     def estimate_of(candidate: Candidate) -> RecordEstimate:
         """Return the retained results of a fit, with its fit indices."""
@@ -292,15 +311,17 @@ def _record_estimates(
         plant = replace(plant, delay_s=plant.delay_s - delay_s)
         if not omega.size:
             return RecordEstimate.from_candidate(candidate, _NO_INDICES)
-        response = grid.evaluate(plant)[0]
+        model_response = response_grid.evaluate(plant)[0]
         return RecordEstimate.from_candidate(
-            candidate, fit_indices(omega, measured.response, response)
+            candidate, fit_indices(omega, measured_response.response, model_response)
         )
 
-    order = list(STRUCTURES)
-    requested = [
+    structure_order = list(STRUCTURES)
+    requested_estimates = [
         estimate_of(candidate)
-        for candidate in whole.selection.candidates
-        if candidate.fit.structure.name in structures or candidate.fit is whole.fit
+        for candidate in whole_record.selection.candidates
+        if candidate.fit.structure.name in structure_names or candidate.fit is whole_record.fit
     ]
-    return tuple(sorted(requested, key=lambda estimate: order.index(estimate.structure)))
+    return tuple(
+        sorted(requested_estimates, key=lambda estimate: structure_order.index(estimate.structure))
+    )

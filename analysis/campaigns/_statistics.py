@@ -64,30 +64,32 @@ def fits_by_model(
     sessions: Sequence[SessionAnalysis],
 ) -> dict[tuple[str, str], tuple[WelchFit, ...]]:
     """Return the Welch fits of all sessions by damping structure and weighting."""
-    rows = zip(*(session.welch_fits for session in sessions), strict=True)
-    return {(row[0].structure, row[0].weighting): row for row in rows}
+    fits_per_model = zip(*(session.welch_fits for session in sessions), strict=True)
+    return {(row[0].structure, row[0].weighting): row for row in fits_per_model}
 
 
 def parameter_statistics(sessions: Sequence[SessionAnalysis]) -> tuple[ParameterStatistics, ...]:
     """Return statistics of the free parameters of all Welch fits (Table 3 of the paper)."""
-    statistics = []
-    for (structure, weighting), fits in fits_by_model(sessions).items():
+    all_statistics = []
+    for (structure, weighting), model_fits in fits_by_model(sessions).items():
         for parameter in STRUCTURES[structure].free:
-            values = np.array([fit.parameters[parameter] for fit in fits])
-            statistics.append(
+            parameter_values = np.array([fit.parameters[parameter] for fit in model_fits])
+            all_statistics.append(
                 ParameterStatistics(
                     structure=structure,
                     weighting=weighting,
                     parameter=parameter,
-                    mean=float(values.mean()),
-                    median=float(np.median(values)),
-                    std=float(values.std(ddof=1)) if values.size > 1 else float("nan"),
-                    min=float(values.min()),
-                    max=float(values.max()),
-                    at_bounds=sum(parameter in fit.at_bounds for fit in fits),
+                    mean=float(parameter_values.mean()),
+                    median=float(np.median(parameter_values)),
+                    std=float(parameter_values.std(ddof=1))
+                    if parameter_values.size > 1
+                    else float("nan"),
+                    min=float(parameter_values.min()),
+                    max=float(parameter_values.max()),
+                    at_bounds=sum(parameter in fit.at_bounds for fit in model_fits),
                 )
             )
-    return tuple(statistics)
+    return tuple(all_statistics)
 
 
 # Nominal models
@@ -154,9 +156,9 @@ class NominalModel:
         return float(np.mean([index_set.wmse for index_set in self.indices]))
 
 
-def mean_damping(structure: str, fits: Sequence[WelchFit]) -> Damping:
+def mean_damping(structure: str, welch_fits: Sequence[WelchFit]) -> Damping:
     """Return the damping whose parameters are the means over the sessions' fits."""
-    return STRUCTURES[structure].damping(_mean_parameters(fits))
+    return STRUCTURES[structure].damping(_mean_parameters(welch_fits))
 
 
 def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, ...]:
@@ -165,10 +167,12 @@ def nominal_models(sessions: Sequence[SessionAnalysis]) -> tuple[NominalModel, .
     if not first_session.frequency_hz.size:
         return ()
     frequency_hz, beam = first_session.frequency_hz, first_session.beam
-    model = FrequencyResponseModel(frequency_hz, beam, first_session.tool_inertia_kg_m2)
+    response_model = FrequencyResponseModel(frequency_hz, beam, first_session.tool_inertia_kg_m2)
     return tuple(
-        _nominal_model(structure, weighting, fits, sessions, model, frequency_hz, beam)
-        for (structure, weighting), fits in fits_by_model(sessions).items()
+        _nominal_model(
+            structure, weighting, model_fits, sessions, response_model, frequency_hz, beam
+        )
+        for (structure, weighting), model_fits in fits_by_model(sessions).items()
     )
 
 
@@ -186,32 +190,36 @@ def best_models(models: Sequence[NominalModel]) -> tuple[NominalModel, ...]:
 
 
 def mean_deviations(
-    measured: Sequence[Sequence[Peak | None]], modelled: Sequence[Peak | None]
+    measured_peaks: Sequence[Sequence[Peak | None]], model_peaks: Sequence[Peak | None]
 ) -> tuple[MeanPeakDeviation, ...]:
     """Return the mean deviation of each resonant peak over the sessions (Eqs. 31 and 32).
 
     Parameters
     ----------
-    measured : sequence of sequence of Peak or None
+    measured_peaks : sequence of sequence of Peak or None
         Peaks of each session, one for each mode.
-    modelled : sequence of Peak or None
+    model_peaks : sequence of Peak or None
         Peaks of the model, one for each mode.
     """
     deviations = []
-    for number, (model, session_peaks) in enumerate(
-        zip(modelled, zip(*measured, strict=True), strict=True), start=1
+    for mode_number, (model_peak, session_peaks) in enumerate(
+        zip(model_peaks, zip(*measured_peaks, strict=True), strict=True), start=1
     ):
-        terms = [
-            peak_deviation(peak, model)
+        peak_deviations = [
+            peak_deviation(peak, model_peak)
             for peak in session_peaks
-            if peak is not None and model is not None
+            if peak is not None and model_peak is not None
         ]
         deviations.append(
             MeanPeakDeviation(
-                mode=number,
-                frequency_rad_s=_mean_or_nan([term.frequency_rad_s for term in terms]),
-                magnitude_db=_mean_or_nan([term.magnitude_db for term in terms]),
-                sessions=len(terms),
+                mode=mode_number,
+                frequency_rad_s=_mean_or_nan(
+                    [peak_term.frequency_rad_s for peak_term in peak_deviations]
+                ),
+                magnitude_db=_mean_or_nan(
+                    [peak_term.magnitude_db for peak_term in peak_deviations]
+                ),
+                sessions=len(peak_deviations),
             )
         )
     return tuple(deviations)
@@ -220,35 +228,38 @@ def mean_deviations(
 def _nominal_model(
     structure: str,
     weighting: str,
-    fits: Sequence[WelchFit],
+    welch_fits: Sequence[WelchFit],
     sessions: Sequence[SessionAnalysis],
-    model: FrequencyResponseModel,
+    response_model: FrequencyResponseModel,
     frequency_hz: NDArray[np.float64],
     beam: Beam,
 ) -> NominalModel:
     """Return the nominal model of one damping structure and weighting."""
-    damping = mean_damping(structure, fits)
-    response = model.evaluate(damping)
-    count = len(sessions[0].peaks)
+    mean_damping_model = mean_damping(structure, welch_fits)
+    model_response = response_model.evaluate(mean_damping_model)
+    mode_count = len(sessions[0].peaks)
     peaks = resonant_peaks(
-        frequency_hz, response, undamped_frequencies_rad_s(beam, count) / (2 * np.pi)
+        frequency_hz, model_response, undamped_frequencies_rad_s(beam, mode_count) / (2 * np.pi)
     )
     omega = 2 * np.pi * frequency_hz
     return NominalModel(
         structure=structure,
         weighting=weighting,
-        damping=damping,
-        parameters=_mean_parameters(fits),
-        response=response,
+        damping=mean_damping_model,
+        parameters=_mean_parameters(welch_fits),
+        response=model_response,
         peaks=peaks,
-        indices=tuple(fit_indices(omega, session.response, response) for session in sessions),
+        indices=tuple(fit_indices(omega, session.response, model_response) for session in sessions),
         deviations=mean_deviations([session.peaks for session in sessions], peaks),
     )
 
 
-def _mean_parameters(fits: Sequence[WelchFit]) -> dict[Parameter, float]:
+def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[Parameter, float]:
     """Return the mean of each damping parameter over the sessions' fits."""
-    return {name: float(np.mean([fit.parameters[name] for fit in fits])) for name in PARAMETERS}
+    return {
+        parameter_name: float(np.mean([fit.parameters[parameter_name] for fit in welch_fits]))
+        for parameter_name in PARAMETERS
+    }
 
 
 def _wmse_key(model: NominalModel) -> float:
@@ -304,7 +315,7 @@ class RankedStructure:
 
 
 def ranked_structures(
-    sessions: Sequence[SessionAnalysis], pooled: Sequence[PooledEstimate]
+    sessions: Sequence[SessionAnalysis], pooled_fits: Sequence[PooledEstimate]
 ) -> tuple[RankedStructure, ...]:
     """Rank all fitted damping structures: first the pooled ones by BIC, then the others.
 
@@ -312,33 +323,35 @@ def ranked_structures(
     ----------
     sessions : sequence of SessionAnalysis
         Sessions of the campaign.
-    pooled : sequence of PooledEstimate
+    pooled_fits : sequence of PooledEstimate
         Pooled estimates, the lowest BIC first.
     """
-    fits = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, fits.values()), default=0)
+    estimates_by_name = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
     bic = {
-        name: pooled_bic(estimates)
-        for name, estimates in fits.items()
+        structure_name: pooled_bic(estimates)
+        for structure_name, estimates in estimates_by_name.items()
         if len(estimates) == fitted_sessions
     }
     single_selections = Counter(session.selected for session in sessions)
-    misfit = {pooled_estimate.name: pooled_estimate.misfit for pooled_estimate in pooled}
-    lowest = pooled[0].bic if pooled else min(bic.values(), default=0.0)
-    ranked = [
+    misfit_by_name = {
+        pooled_estimate.name: pooled_estimate.misfit for pooled_estimate in pooled_fits
+    }
+    lowest_bic = pooled_fits[0].bic if pooled_fits else min(bic.values(), default=0.0)
+    ranked_list = [
         RankedStructure(
             structure=estimates[0].structure,
             fitted=len(estimates),
             determined=sum(map(determines_damping, estimates)),
-            selected_alone=single_selections[name],
-            misfit=misfit.get(name)
+            selected_alone=single_selections[structure_name],
+            misfit=misfit_by_name.get(structure_name)
             or float(np.median([one.cost / one.degrees_of_freedom for one in estimates])),
-            bic_above_lowest=bic[name] - lowest if name in bic else None,
-            pooled=name in misfit,
+            bic_above_lowest=bic[structure_name] - lowest_bic if structure_name in bic else None,
+            pooled=structure_name in misfit_by_name,
         )
-        for name, estimates in fits.items()
+        for structure_name, estimates in estimates_by_name.items()
     ]
-    return tuple(sorted(ranked, key=_rank_key))
+    return tuple(sorted(ranked_list, key=_rank_key))
 
 
 def _rank_key(structure: RankedStructure) -> tuple[bool, bool, float]:

@@ -78,19 +78,22 @@ class PlantPrediction:
 
 
 def models_without_session(
-    sessions: Sequence[SessionAnalysis], left_out: int
+    sessions: Sequence[SessionAnalysis], left_out_index: int
 ) -> tuple[PlantPrediction, ...]:
     """Return the models estimated from all sessions but one, to predict that session."""
-    session = sessions[left_out]
-    others = [*sessions[:left_out], *sessions[left_out + 1 :]]
-    own = {estimate.name: estimate.plant for estimate in session.record_estimates}
+    session = sessions[left_out_index]
+    other_sessions = [*sessions[:left_out_index], *sessions[left_out_index + 1 :]]
+    own_plants = {estimate.name: estimate.plant for estimate in session.record_estimates}
     predictions = [
-        PlantPrediction("record", estimate.name, None, estimate.plant, own[estimate.name])
-        for estimate in pooled_estimates(others)
-        if estimate.name in own
+        PlantPrediction("record", estimate.name, None, estimate.plant, own_plants[estimate.name])
+        for estimate in pooled_estimates(other_sessions)
+        if estimate.name in own_plants
     ]
-    for number, fit in enumerate(session.welch_fits):
-        damping = mean_damping(fit.structure, [other.welch_fits[number] for other in others])
+    for model_index, fit in enumerate(session.welch_fits):
+        damping = mean_damping(
+            fit.structure,
+            [other_session.welch_fits[model_index] for other_session in other_sessions],
+        )
         plant = Plant(session.beam, damping, session.delay_s, session.tool_inertia_kg_m2)
         predictions.append(PlantPrediction("welch", fit.structure, fit.weighting, plant, None))
     return tuple(predictions)
@@ -111,19 +114,19 @@ def validate(
         for i, session in enumerate(sessions)
     ]
     try:
-        results = workers.run(left_out_errors, prediction_tasks, on_done)
+        task_results = workers.run(left_out_errors, prediction_tasks, on_done)
     except CampaignError as error:
         return (), tuple(LostTrial(session.path, str(error)) for session in sessions)
-    errors: list[LeftOutError] = []
-    lost: list[LostTrial] = []
-    for session, result in zip(sessions, results, strict=True):
-        if isinstance(result, LostTask):
-            lost.append(LostTrial(session.path, result.reason))
-        elif isinstance(result, LostTrial):
-            lost.append(result)
+    prediction_errors: list[LeftOutError] = []
+    lost_sessions: list[LostTrial] = []
+    for session, task_result in zip(sessions, task_results, strict=True):
+        if isinstance(task_result, LostTask):
+            lost_sessions.append(LostTrial(session.path, task_result.reason))
+        elif isinstance(task_result, LostTrial):
+            lost_sessions.append(task_result)
         else:
-            errors.extend(result)
-    return tuple(errors), tuple(lost)
+            prediction_errors.extend(task_result)
+    return tuple(prediction_errors), tuple(lost_sessions)
 
 
 def left_out_errors(
@@ -145,13 +148,16 @@ def left_out_errors(
         return LostTrial(path, str(why))
     except MemoryError:
         return LostTrial(path, "not enough memory to predict it; use fewer --jobs")
-    measured = comparison.torque_nm[comparison.retained]
-    size = np.linalg.norm(comparison.spectrum(measured))
+    measured_torque_nm = comparison.torque_nm[comparison.retained]
+    torque_norm = np.linalg.norm(comparison.spectrum(measured_torque_nm))
 
     def prediction_error(plant: Plant) -> float:
         """Return the relative error of the torque that a plant predicts."""
-        predicted, _ = comparison.prediction.torque(plant)
-        return float(np.linalg.norm(comparison.spectrum(predicted - measured)) / size)
+        predicted_torque_nm, _ = comparison.prediction.torque(plant)
+        return float(
+            np.linalg.norm(comparison.spectrum(predicted_torque_nm - measured_torque_nm))
+            / torque_norm
+        )
 
     return tuple(
         LeftOutError(
@@ -174,7 +180,14 @@ def group_errors_by_model(
     The group of the smallest mean error comes first.
     """
     errors_by_model: dict[tuple[str, str, str | None], list[LeftOutError]] = {}
-    for error in errors:
-        errors_by_model.setdefault((error.method, error.name, error.weighting), []).append(error)
-    groups = [(*key, tuple(group)) for key, group in errors_by_model.items()]
-    return sorted(groups, key=lambda group: float(np.mean([error.error for error in group[3]])))
+    for left_out_error in errors:
+        errors_by_model.setdefault(
+            (left_out_error.method, left_out_error.name, left_out_error.weighting), []
+        ).append(left_out_error)
+    error_groups = [(*key, tuple(group_errors)) for key, group_errors in errors_by_model.items()]
+    return sorted(
+        error_groups,
+        key=lambda group_errors: float(
+            np.mean([left_out_error.error for left_out_error in group_errors[3]])
+        ),
+    )

@@ -71,14 +71,18 @@ class CommonFinding:
     @property
     def sentence(self) -> str:
         """Sentence that states the effect, the number of sessions, and the range of its size."""
-        count = len(self.files)
-        files_text = f" ({', '.join(self.files)})" if count < min(self.sessions, 3) else ""
-        statement = f"In {count} of {self.sessions} sessions{files_text}: {self.example.sentence}"
-        if self.span is None or count == 1:
+        file_count = len(self.files)
+        files_text = f" ({', '.join(self.files)})" if file_count < min(self.sessions, 3) else ""
+        statement = (
+            f"In {file_count} of {self.sessions} sessions{files_text}: {self.example.sentence}"
+        )
+        if self.span is None or file_count == 1:
             return statement
-        factor, unit = _DISPLAY_UNITS.get(self.example.unit, (1.0, self.example.unit))
-        span = interval_text(self.span, factor)
-        return f"{statement} (Median session; range over all sessions: {span} {unit}.)"
+        display_factor, display_unit = _DISPLAY_UNITS.get(
+            self.example.unit, (1.0, self.example.unit)
+        )
+        span_text = interval_text(self.span, display_factor)
+        return f"{statement} (Median session; range over all sessions: {span_text} {display_unit}.)"
 
 
 def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding, ...]:
@@ -87,24 +91,31 @@ def common_findings(sessions: Sequence[SessionAnalysis]) -> tuple[CommonFinding,
     Two findings describe the same effect if their sentences differ only in numbers.
     """
     findings_by_effect: dict[tuple[str, str], list[tuple[str, Finding]]] = {}
-    examined = [session for session in sessions if session.verdict is not None]
-    for session in examined:
+    examined_sessions = [session for session in sessions if session.verdict is not None]
+    for session in examined_sessions:
         for finding in session.verdict.findings if session.verdict else ():
             effect_key = finding.kind, _NUMBER_PATTERN.sub("#", finding.sentence)
             findings_by_effect.setdefault(effect_key, []).append((session.name, finding))
-    counted = [_common_finding(group, len(examined)) for group in findings_by_effect.values()]
-    return tuple(sorted(counted, key=lambda effect: -len(effect.files)))
+    counted_findings = [
+        _common_finding(effect_findings, len(examined_sessions))
+        for effect_findings in findings_by_effect.values()
+    ]
+    return tuple(sorted(counted_findings, key=lambda effect: -len(effect.files)))
 
 
-def _common_finding(group: list[tuple[str, Finding]], sessions: int) -> CommonFinding:
+def _common_finding(
+    effect_findings: list[tuple[str, Finding]], session_count: int
+) -> CommonFinding:
     """Return one effect with all sessions that show it."""
-    files = tuple(dict.fromkeys(name for name, _ in group))
-    sizes = [finding.value for _, finding in group if finding.value is not None]
-    if len(sizes) < len(group):
-        return CommonFinding(group[0][1], files, sessions, None)
-    median_size = median_low(sizes)
-    example = next(finding for _, finding in group if finding.value == median_size)
-    return CommonFinding(example, files, sessions, (min(sizes), max(sizes)))
+    file_names = tuple(dict.fromkeys(file_name for file_name, _ in effect_findings))
+    effect_sizes = [finding.value for _, finding in effect_findings if finding.value is not None]
+    if len(effect_sizes) < len(effect_findings):
+        return CommonFinding(effect_findings[0][1], file_names, session_count, None)
+    median_size = median_low(effect_sizes)
+    median_finding = next(finding for _, finding in effect_findings if finding.value == median_size)
+    return CommonFinding(
+        median_finding, file_names, session_count, (min(effect_sizes), max(effect_sizes))
+    )
 
 
 # Verdict
@@ -187,9 +198,9 @@ def campaign_verdict(
     pooled: Sequence[PooledEstimate],
     homogeneity: Homogeneity,
     validation: Sequence[LeftOutError],
-    lost: Sequence[LostTrial],
+    lost_sessions: Sequence[LostTrial],
     biases: Sequence[WelchBias] = (),
-    modal: PooledModal | None = None,
+    modal_model: PooledModal | None = None,
 ) -> CampaignVerdict | None:
     """Return the verdict on a campaign, or None if no damping structure could be pooled.
 
@@ -203,118 +214,137 @@ def campaign_verdict(
         Whether the sessions are of one specimen.
     validation : sequence of LeftOutError
         Errors of sessions predicted from the others.
-    lost : sequence of LostTrial
+    lost_sessions : sequence of LostTrial
         Sessions that could not be predicted from the others.
     biases : sequence of WelchBias, optional
         Differences of the Welch fits from the pooled estimates.
-    modal : PooledModal, optional
+    modal_model : PooledModal, optional
         Modal model of all sessions.
     """
     verdicts = [session.verdict for session in sessions if session.verdict is not None]
     if not pooled or not verdicts:
         return None
-    best, freest = pooled[0], freest_estimate(pooled)
-    assert freest is not None
+    lowest_bic_estimate, freest_fit = pooled[0], freest_estimate(pooled)
+    assert freest_fit is not None
     alpha, lambda_ = (
-        _final_order(pooled_order(order, pooled, verdicts, homogeneity), verdicts, modal)
+        _final_order(pooled_order(order, pooled, verdicts, homogeneity), verdicts, modal_model)
         for order in ("alpha", "lambda")
     )
-    sweeps = opposite_sweeps(sessions)
-    refused = modal is not None and modal.uniform_beam.status == "refused"
+    sweep_comparison = opposite_sweeps(sessions)
+    is_beam_refused = modal_model is not None and modal_model.uniform_beam.status == "refused"
     findings = common_findings(sessions)
     close_rivals = rival_estimates(pooled, BIC_TIE)
     single_selections = dict(
         Counter(session.selected for session in sessions if session.selected).most_common()
     )
-    adequate = sum(verdict.adequate for verdict in verdicts)
-    dissent = _dissenting_sessions(sessions, best)
-    advice_counts = Counter(advice for verdict in verdicts for advice in verdict.experiments)
-    advice = [what for what, count in advice_counts.most_common() if 2 * count > len(verdicts)]
+    adequate_count = sum(verdict.adequate for verdict in verdicts)
+    dissenting_sessions = _dissenting_sessions(sessions, lowest_bic_estimate)
+    advice_counts = Counter(
+        common_advice for verdict in verdicts for common_advice in verdict.experiments
+    )
+    common_advice = [
+        experiment
+        for experiment, advice_count in advice_counts.most_common()
+        if 2 * advice_count > len(verdicts)
+    ]
     return CampaignVerdict(
-        headline=freest.name,
-        structure=best.structure,
+        headline=freest_fit.name,
+        structure=lowest_bic_estimate.structure,
         rivals=tuple(rival.name for rival in close_rivals),
         sessions=len(verdicts),
         alone=single_selections,
-        adequate=adequate,
+        adequate=adequate_count,
         alpha=alpha,
         lambda_=lambda_,
         findings=findings,
-        dissent=dissent,
-        sweeps=sweeps,
+        dissent=dissenting_sessions,
+        sweeps=sweep_comparison,
         sentences=(
             *specimen_sentences.specimens(homogeneity),
-            sentences.describe_orders(freest, alpha, lambda_, validation),
-            *_describe_parameters(freest, best, modal, adequate, len(verdicts)),
-            *_describe_modes(freest, modal, mixed=homogeneity.mixed),
-            *_describe_slopes(alpha, lambda_, modal),
-            *geometry.describe_sweeps(sweeps),
-            *geometry.describe_orders_if_exact(freest, (alpha, lambda_), modal),
+            sentences.describe_orders(freest_fit, alpha, lambda_, validation),
+            *_describe_parameters(
+                freest_fit, lowest_bic_estimate, modal_model, adequate_count, len(verdicts)
+            ),
+            *_describe_modes(freest_fit, modal_model, mixed=homogeneity.mixed),
+            *_describe_slopes(alpha, lambda_, modal_model),
+            *geometry.describe_sweeps(sweep_comparison),
+            *geometry.describe_orders_if_exact(freest_fit, (alpha, lambda_), modal_model),
             *sentences.describe_welch_bias(
-                freest,
+                freest_fit,
                 biases,
                 _withheld_orders(alpha, lambda_),
-                comparable=not (homogeneity.mixed or refused),
+                comparable=not (homogeneity.mixed or is_beam_refused),
             ),
             sentences.describe_selection(pooled, close_rivals, single_selections, len(verdicts)),
             *(finding.sentence for finding in findings),
             *sentences.describe_dissent(
-                [(dissenter.file, dissenter.structure) for dissenter in dissent], best
+                [
+                    (dissenting_session.file, dissenting_session.structure)
+                    for dissenting_session in dissenting_sessions
+                ],
+                lowest_bic_estimate,
             ),
-            *([] if homogeneity.mixed else [sentences.describe_scatter(freest)]),
-            *sentences.describe_prediction_errors(freest, validation, len(sessions)),
-            *sentences.lost_trials(lost, len(sessions)),
+            *([] if homogeneity.mixed else [sentences.describe_scatter(freest_fit)]),
+            *sentences.describe_prediction_errors(freest_fit, validation, len(sessions)),
+            *sentences.lost_trials(lost_sessions, len(sessions)),
         ),
-        experiments=(*geometry.recommend_sweeps(sweeps, modal, sessions), *advice),
+        experiments=(
+            *geometry.recommend_sweeps(sweep_comparison, modal_model, sessions),
+            *common_advice,
+        ),
     )
 
 
 def _final_order(
-    exact: PooledOrder, verdicts: Sequence[Verdict], modal: PooledModal | None
+    exact_order: PooledOrder, verdicts: Sequence[Verdict], modal_model: PooledModal | None
 ) -> PooledOrder:
     """Return an order estimated from the modal constants, or from a uniform beam without them."""
-    if modal is None:
-        return exact
-    if modal.tolerant is not None:
-        refused = modal.uniform_beam.status == "refused"
-        return tolerant_pooled_order(exact, modal.tolerant, verdicts, refused=refused)
-    reason = uniform_beam_refusal_reason(modal.uniform_beam)
-    return exact if reason is None else exact.doubted(reason)
+    if modal_model is None:
+        return exact_order
+    if modal_model.tolerant is not None:
+        is_beam_refused = modal_model.uniform_beam.status == "refused"
+        return tolerant_pooled_order(
+            exact_order, modal_model.tolerant, verdicts, refused=is_beam_refused
+        )
+    refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam)
+    return exact_order if refusal_reason is None else exact_order.doubted(refusal_reason)
 
 
 def _describe_parameters(
-    freest: PooledEstimate,
-    best: PooledEstimate,
-    modal: PooledModal | None,
-    adequate: int,
-    sessions: int,
+    freest_fit: PooledEstimate,
+    lowest_bic_estimate: PooledEstimate,
+    modal_model: PooledModal | None,
+    adequate_count: int,
+    session_count: int,
 ) -> tuple[str, ...]:
     """Describe the model of the reported parameters, how well it fits, and the loss factors."""
-    uniformity_sentences = uniformity(modal.uniform_beam if modal else None)
-    if modal is None or modal.tolerant is None:
-        residual_sentence = sentences.describe_residual(freest, adequate, sessions)
+    uniformity_sentences = uniformity(modal_model.uniform_beam if modal_model else None)
+    if modal_model is None or modal_model.tolerant is None:
+        residual_sentence = sentences.describe_residual(freest_fit, adequate_count, session_count)
         return (
-            sentences.describe_structure(freest, best),
+            sentences.describe_structure(freest_fit, lowest_bic_estimate),
             *uniformity_sentences,
             residual_sentence,
-            *sentences.describe_loss_factors(freest.sizes),
+            *sentences.describe_loss_factors(freest_fit.sizes),
         )
-    residual_sentence = sentences.describe_noise_sessions(adequate, sessions)
+    residual_sentence = sentences.describe_noise_sessions(adequate_count, session_count)
     return (
-        geometry.describe_tolerance(modal, modal.tolerant),
+        geometry.describe_tolerance(modal_model, modal_model.tolerant),
         *uniformity_sentences,
         residual_sentence,
         *sentences.describe_loss_factors(
-            loss_factors_with_geometry_tolerance(modal.uniform_beam, modal.tolerant)
+            loss_factors_with_geometry_tolerance(modal_model.uniform_beam, modal_model.tolerant)
         ),
     )
 
 
-def _describe_modes(freest: PooledEstimate, modal: PooledModal | None, *, mixed: bool) -> list[str]:
+def _describe_modes(
+    freest_fit: PooledEstimate, modal_model: PooledModal | None, *, mixed: bool
+) -> list[str]:
     """Describe the modes of the modal model if these are reported, else of the uniform beam."""
-    if modal is not None and modal.leads:
-        return sentences.describe_modes(modal.modes, modal.sessions, mixed=mixed)
-    return sentences.describe_modes(freest.modes, freest.sessions, mixed=mixed)
+    if modal_model is not None and modal_model.leads:
+        return sentences.describe_modes(modal_model.modes, modal_model.sessions, mixed=mixed)
+    return sentences.describe_modes(freest_fit.modes, freest_fit.sessions, mixed=mixed)
 
 
 def _describe_slopes(
@@ -332,15 +362,15 @@ def _withheld_orders(*orders: PooledOrder) -> frozenset[str]:
 
 
 def _dissenting_sessions(
-    sessions: Sequence[SessionAnalysis], best: PooledEstimate
+    sessions: Sequence[SessionAnalysis], lowest_bic_estimate: PooledEstimate
 ) -> tuple[Dissent, ...]:
     """Return the sessions that alone exclude the damping structure of the lowest common BIC."""
     dissents = []
     for session in sessions:
-        by_name = {estimate.name: estimate for estimate in session.record_estimates}
-        if by_name:
-            own = min(by_name.values(), key=lambda estimate: estimate.bic)
-            margin = by_name[best.name].bic - own.bic
-            if margin > BIC_DECISIVE:
-                dissents.append(Dissent(session.name, own.name, margin))
+        estimates_by_name = {estimate.name: estimate for estimate in session.record_estimates}
+        if estimates_by_name:
+            own = min(estimates_by_name.values(), key=lambda estimate: estimate.bic)
+            bic_margin = estimates_by_name[lowest_bic_estimate.name].bic - own.bic
+            if bic_margin > BIC_DECISIVE:
+                dissents.append(Dissent(session.name, own.name, bic_margin))
     return tuple(sorted(dissents, key=lambda dissenter: -dissenter.margin))

@@ -113,35 +113,38 @@ def welch_biases(
         left out, because its pooled estimate is no reference.
     """
     biases = []
-    by_name = {
+    pooled_by_name = {
         record_estimate.name: record_estimate
         for record_estimate in pooled
         if record_estimate.misfit <= LARGEST_MISFIT
     }
-    for (structure, weighting), fits in fits_by_model(sessions).items():
-        estimate = by_name.get(structure)
-        if estimate is None or len(fits) < _FEWEST_SESSIONS:
+    for (structure, weighting), welch_fits in fits_by_model(sessions).items():
+        pooled_estimate = pooled_by_name.get(structure)
+        if pooled_estimate is None or len(welch_fits) < _FEWEST_SESSIONS:
             continue
-        limit = student_t_quantile(_CONFIDENCE_LEVEL, len(fits) - 1)
+        significance_limit = student_t_quantile(_CONFIDENCE_LEVEL, len(welch_fits) - 1)
         parameters = []
-        for name in STRUCTURES[structure].free:
-            if name not in estimate.by_name:
+        for parameter_name in STRUCTURES[structure].free:
+            if parameter_name not in pooled_estimate.by_name:
                 continue
-            record = estimate.by_name[name]
-            values = np.array([fit.parameters[name] for fit in fits])
-            mean, std = float(values.mean()), float(values.std(ddof=1))
-            bias, bias_std = mean - record.value, math.hypot(std / len(fits) ** 0.5, record.std)
+            record_value = pooled_estimate.by_name[parameter_name]
+            welch_values = np.array([fit.parameters[parameter_name] for fit in welch_fits])
+            welch_mean, std = float(welch_values.mean()), float(welch_values.std(ddof=1))
+            bias, bias_std = (
+                welch_mean - record_value.value,
+                math.hypot(std / len(welch_fits) ** 0.5, record_value.std),
+            )
             parameters.append(
                 ParameterBias(
-                    parameter=name,
-                    welch=mean,
+                    parameter=parameter_name,
+                    welch=welch_mean,
                     welch_std=std,
-                    record=record.value,
-                    record_std=record.std,
+                    record=record_value.value,
+                    record_std=record_value.std,
                     bias=bias,
                     bias_std=bias_std,
-                    significant=abs(bias) > limit * bias_std,
-                    at_bounds=sum(name in fit.at_bounds for fit in fits),
+                    significant=abs(bias) > significance_limit * bias_std,
+                    at_bounds=sum(parameter_name in fit.at_bounds for fit in welch_fits),
                 )
             )
         biases.append(
@@ -149,7 +152,7 @@ def welch_biases(
                 structure,
                 weighting,
                 tuple(parameters),
-                _mean_or_nan([fit.indices.wmse for fit in fits if fit.indices]),
+                _mean_or_nan([fit.indices.wmse for fit in welch_fits if fit.indices]),
                 _mean_or_nan(
                     [
                         record_estimate.indices.wmse
@@ -163,6 +166,6 @@ def welch_biases(
     return tuple(biases)
 
 
-def _mean_or_nan(values: Sequence[float]) -> float:
+def _mean_or_nan(numbers: Sequence[float]) -> float:
     """Return the mean of values, or NaN without values."""
-    return float(np.mean(values)) if values else math.nan
+    return float(np.mean(numbers)) if numbers else math.nan

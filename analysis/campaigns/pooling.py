@@ -42,7 +42,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RandomEffects:
-    """Pooled estimate of k parameters over K sessions.
+    """Mean of k parameters over K sessions by the random-effects model, and its statistics.
 
     Attributes
     ----------
@@ -82,31 +82,31 @@ def random_effects(
     covariances : ndarray, shape (K, k, k)
         Positive definite covariance of each session's estimates.
     """
-    weight = 1 / np.diagonal(covariances, axis1=1, axis2=2)
-    total_weight = weight.sum(axis=0)
-    q = (weight * (estimates - (weight * estimates).sum(axis=0) / total_weight) ** 2).sum(axis=0)
-    excess = q - (len(estimates) - 1)
+    weights = 1 / np.diagonal(covariances, axis1=1, axis2=2)
+    weight_sum = weights.sum(axis=0)
+    q = (weights * (estimates - (weights * estimates).sum(axis=0) / weight_sum) ** 2).sum(axis=0)
+    excess_q = q - (len(estimates) - 1)
     between_variance = np.maximum(
-        excess / (total_weight - (weight**2).sum(axis=0) / total_weight), 0.0
+        excess_q / (weight_sum - (weights**2).sum(axis=0) / weight_sum), 0.0
     )
 
     # Values are in units of a typical standard deviation, as parameters differ by orders of
     # magnitude.
-    unit = 1 / np.sqrt(weight.mean(axis=0))
-    units = np.outer(unit, unit)
-    origin = estimates.mean(axis=0)
+    scale_unit = 1 / np.sqrt(weights.mean(axis=0))
+    unit_products = np.outer(scale_unit, scale_unit)
+    mean_estimate = estimates.mean(axis=0)
     own_covariances, total_covariances = (
-        covariances / units,
-        covariances / units + np.diag(between_variance / unit**2),
+        covariances / unit_products,
+        covariances / unit_products + np.diag(between_variance / scale_unit**2),
     )
-    deviations = (estimates - origin) / unit
-    shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
+    deviations = (estimates - mean_estimate) / scale_unit
+    mean_shift, mean_covariance, squared_deviations = _weighted_mean(deviations, total_covariances)
     log_determinants = float(
         (np.linalg.slogdet(total_covariances)[1] - np.linalg.slogdet(own_covariances)[1]).sum()
     )
     return RandomEffects(
-        mean=origin + unit * shift,
-        covariance=units * mean_covariance,
+        mean=mean_estimate + scale_unit * mean_shift,
+        covariance=unit_products * mean_covariance,
         between_std=np.sqrt(between_variance),
         cochran_q=q,
         deviance=min(
@@ -116,17 +116,21 @@ def random_effects(
 
 
 def _weighted_mean(
-    values: NDArray[np.float64], covariances: NDArray[np.float64]
+    estimates: NDArray[np.float64], covariances: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], float]:
-    """Return the mean weighted by inverse covariances, its covariance, and sum of squares.
+    """Return the mean weighted by inverse covariances, its covariance, and a sum of squares.
 
-    The sum is that of the squared deviations from the mean, weighted in the same way.
+    The sum of squares is that of the deviations from the mean, weighted in the same way.
     """
-    precision = np.linalg.inv(covariances)
-    mean_covariance = np.linalg.inv(precision.sum(axis=0))
-    mean = mean_covariance @ np.einsum("kij,kj->i", precision, values)
-    deviations = values - mean
-    return mean, mean_covariance, float(np.einsum("ki,kij,kj->", deviations, precision, deviations))
+    precisions = np.linalg.inv(covariances)
+    mean_covariance = np.linalg.inv(precisions.sum(axis=0))
+    weighted_mean = mean_covariance @ np.einsum("kij,kj->i", precisions, estimates)
+    deviations = estimates - weighted_mean
+    return (
+        weighted_mean,
+        mean_covariance,
+        float(np.einsum("ki,kij,kj->", deviations, precisions, deviations)),
+    )
 
 
 # Modes
@@ -168,11 +172,17 @@ class PooledMode:
 def pool_modes(estimates: Sequence[RecordEstimate]) -> tuple[PooledMode, ...]:
     """Pool frequency and damping ratio, separately, of each mode that all sessions have."""
     pooled_list = []
-    for modes in zip(*(estimate.modes for estimate in estimates), strict=False):
-        frequency = _pool_quantity([(mode.frequency_hz, mode.frequency_std_hz) for mode in modes])
-        ratio = _pool_quantity([(mode.damping_ratio, mode.damping_ratio_std) for mode in modes])
-        if frequency is not None and ratio is not None:
-            pooled_list.append(PooledMode(modes[0].number, *frequency, *ratio))
+    for session_modes in zip(*(estimate.modes for estimate in estimates), strict=False):
+        pooled_frequency = _pool_quantity(
+            [(mode.frequency_hz, mode.frequency_std_hz) for mode in session_modes]
+        )
+        pooled_ratio = _pool_quantity(
+            [(mode.damping_ratio, mode.damping_ratio_std) for mode in session_modes]
+        )
+        if pooled_frequency is not None and pooled_ratio is not None:
+            pooled_list.append(
+                PooledMode(session_modes[0].number, *pooled_frequency, *pooled_ratio)
+            )
     return tuple(pooled_list)
 
 
@@ -181,12 +191,16 @@ def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, flo
 
     Return None if a session has no standard deviation.
     """
-    values, std = np.array(estimates).T
+    session_values, std = np.array(estimates).T
     if not (np.isfinite(std).all() and (std > 0).all()):
         return None
-    effects = random_effects(values[:, None], (std**2)[:, None, None])
-    mean, variance, between = effects.mean[0], effects.covariance[0, 0], effects.between_std[0]
-    return float(mean), math.sqrt(variance), float(between)
+    pooled_effects = random_effects(session_values[:, None], (std**2)[:, None, None])
+    pooled_mean, mean_variance, between_std = (
+        pooled_effects.mean[0],
+        pooled_effects.covariance[0, 0],
+        pooled_effects.between_std[0],
+    )
+    return float(pooled_mean), math.sqrt(mean_variance), float(between_std)
 
 
 # Structures
@@ -278,17 +292,21 @@ class PooledEstimate:
     @property
     def sizes(self) -> tuple[ReportedLossFactor, ...]:
         """Loss factors of the kinds of damping that all sessions together determine."""
-        names = tuple(parameter.name for parameter in self.parameters)
+        parameter_names = tuple(parameter.name for parameter in self.parameters)
         t, loss_factors = student_t_quantile(0.95, self.sessions - 1), []
-        values = self.plant.parameters
+        plant_values = self.plant.parameters
         first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPING_PARAMETERS:
-            size = damping_size(coefficient, order, values, names, self.covariance, first_rad_s)
-            if size is not None:
-                factor = math.exp(t * size.std / size.value)
-                interval = size.value / factor, size.value * factor
-                quantity = ReportedValue(size.value, size.std, interval)
-                loss_factors.append(ReportedLossFactor(damping, size.omega_rad_s, quantity))
+            loss_factor = damping_size(
+                coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
+            )
+            if loss_factor is not None:
+                factor = math.exp(t * loss_factor.std / loss_factor.value)
+                interval = loss_factor.value / factor, loss_factor.value * factor
+                order_name = ReportedValue(loss_factor.value, loss_factor.std, interval)
+                loss_factors.append(
+                    ReportedLossFactor(damping, loss_factor.omega_rad_s, order_name)
+                )
         return tuple(loss_factors)
 
     @property
@@ -304,11 +322,11 @@ def pooled_estimates(sessions: Sequence[SessionAnalysis]) -> tuple[PooledEstimat
 
     The estimates are sorted by BIC, the lowest first.
     """
-    by_name = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, by_name.values()), default=0)
+    estimates_by_name = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
     pooled_list = [
         pool_estimates(estimates)
-        for estimates in by_name.values()
+        for estimates in estimates_by_name.values()
         if len(estimates) == fitted_sessions
     ]
     return tuple(
@@ -342,32 +360,36 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     used_estimates = list(filter(determines_damping, estimates))
     if len(used_estimates) < _FEWEST_SESSIONS:
         return None
-    names = [
-        name
-        for name in used_estimates[0].determined
-        if all(name in e.determined for e in used_estimates)
+    determined_names = [
+        parameter_name
+        for parameter_name in used_estimates[0].determined
+        if all(parameter_name in e.determined for e in used_estimates)
     ]
-    values, covariances = _stack_estimates(used_estimates, names)
-    effects = random_effects(values, covariances)
-    std = np.sqrt(np.diag(effects.covariance))
+    parameter_values, covariances = _stack_estimates(used_estimates, determined_names)
+    pooled_effects = random_effects(parameter_values, covariances)
+    std = np.sqrt(np.diag(pooled_effects.covariance))
     within_std = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2).mean(axis=0))
     t = student_t_quantile(0.95, len(used_estimates) - 1)
-    chances = chi_square_p_value(effects.cochran_q, len(used_estimates) - 1)
-    statistics = (effects.mean, std, within_std, effects.between_std, chances)
+    p_values = chi_square_p_value(pooled_effects.cochran_q, len(used_estimates) - 1)
+    pooled_statistics = (pooled_effects.mean, std, within_std, pooled_effects.between_std, p_values)
     parameters = tuple(
-        _pooled_parameter(name, t, *row)
-        for name, row in zip(names, np.transpose(statistics).tolist(), strict=True)
+        _pooled_parameter(parameter_name, t, *row)
+        for parameter_name, row in zip(
+            determined_names, np.transpose(pooled_statistics).tolist(), strict=True
+        )
     )
-    means = {
-        name: float(np.mean([e.parameters[name] for e in used_estimates])) for name in SETTINGS
+    mean_settings = {
+        parameter_name: float(np.mean([e.parameters[parameter_name] for e in used_estimates]))
+        for parameter_name in SETTINGS
     }
     return PooledEstimate(
         structure=used_estimates[0].structure,
         plant=_pooled_plant(
-            used_estimates[0], means | {parameter.name: parameter.value for parameter in parameters}
+            used_estimates[0],
+            mean_settings | {parameter.name: parameter.value for parameter in parameters},
         ),
         parameters=parameters,
-        covariance=effects.covariance,
+        covariance=pooled_effects.covariance,
         modes=pool_modes(used_estimates),
         sessions=len(used_estimates),
         misfit=float(np.median([e.cost / e.degrees_of_freedom for e in used_estimates])),
@@ -387,76 +409,101 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
     each session. A single session loses no likelihood.
     """
     damping_parameters = STRUCTURES[estimates[0].structure].free
-    common = [name for name in damping_parameters if all(name in e.determined for e in estimates)]
-    deviance = sum(e.deviance for e in estimates)
-    if common and len(estimates) >= _FEWEST_SESSIONS:
-        deviance += random_effects(*_stack_estimates(estimates, common)).deviance
-    separate_cost = (len(damping_parameters) - len(common)) * sum(
+    common_names = [
+        parameter_name
+        for parameter_name in damping_parameters
+        if all(parameter_name in e.determined for e in estimates)
+    ]
+    common_deviance = sum(e.deviance for e in estimates)
+    if common_names and len(estimates) >= _FEWEST_SESSIONS:
+        common_deviance += random_effects(*_stack_estimates(estimates, common_names)).deviance
+    separate_cost = (len(damping_parameters) - len(common_names)) * sum(
         math.log(e.values) for e in estimates
     )
-    return deviance + len(common) * math.log(sum(e.values for e in estimates)) + separate_cost
+    return (
+        common_deviance
+        + len(common_names) * math.log(sum(e.values for e in estimates))
+        + separate_cost
+    )
 
 
 def _stack_estimates(
-    estimates: Sequence[RecordEstimate], names: Sequence[str]
+    estimates: Sequence[RecordEstimate], parameter_names: Sequence[str]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the estimates, shape (K, k), and their covariances, shape (K, k, k)."""
-    values = [[_coordinate(name, e.parameters[name]) for name in names] for e in estimates]
-    return np.array(values), np.array([_covariance_block(e, names) for e in estimates])
+    coordinates = [
+        [
+            _coordinate(parameter_name, e.parameters[parameter_name])
+            for parameter_name in parameter_names
+        ]
+        for e in estimates
+    ]
+    return np.array(coordinates), np.array(
+        [_covariance_block(e, parameter_names) for e in estimates]
+    )
 
 
 def _pooled_parameter(
-    name: str,
+    parameter_name: str,
     t: float,
     mean: float,
     std: float,
     within_std: float,
     between_std: float,
-    chance: float,
+    p_value: float,
 ) -> PooledParameter:
     """Return a pooled parameter from the statistics of its value or of its logarithm."""
-    value = math.exp(mean) if name in LOGARITHMIC_PARAMETERS else mean
-    unit = value if name in LOGARITHMIC_PARAMETERS else 1.0
+    pooled_value = math.exp(mean) if parameter_name in LOGARITHMIC_PARAMETERS else mean
+    std_factor = pooled_value if parameter_name in LOGARITHMIC_PARAMETERS else 1.0
     return PooledParameter(
-        name=name,
-        value=value,
-        std=unit * std,
-        interval=_parameter_interval(name, mean, t * std),
-        within_std=unit * within_std,
-        between_std=unit * between_std,
-        chance=chance,
-        next_interval=_parameter_interval(name, mean, t * math.hypot(std, between_std)),
+        name=parameter_name,
+        value=pooled_value,
+        std=std_factor * std,
+        interval=_parameter_interval(parameter_name, mean, t * std),
+        within_std=std_factor * within_std,
+        between_std=std_factor * between_std,
+        chance=p_value,
+        next_interval=_parameter_interval(parameter_name, mean, t * math.hypot(std, between_std)),
     )
 
 
 def _parameter_interval(name: str, mean: float, half_width: float) -> tuple[float, float]:
-    """Return an interval of a parameter from the centre and half width of its coordinate."""
+    """Return an interval of a parameter from the mean and half width of its coordinate.
+
+    The coordinate is the parameter or its logarithm (see `_coordinate`).
+    """
     if name in LOGARITHMIC_PARAMETERS:
         return math.exp(mean - half_width), math.exp(mean + half_width)
     return mean - half_width, mean + half_width
 
 
-def _coordinate(name: str, value: float) -> float:
+def _coordinate(parameter_name: str, value: float) -> float:
     """Return the value of a parameter, or its logarithm if the logarithm is estimated."""
-    return math.log(value) if name in LOGARITHMIC_PARAMETERS else value
+    return math.log(value) if parameter_name in LOGARITHMIC_PARAMETERS else value
 
 
-def _covariance_block(estimate: RecordEstimate, names: Sequence[str]) -> NDArray[np.float64]:
+def _covariance_block(
+    estimate: RecordEstimate, parameter_names: Sequence[str]
+) -> NDArray[np.float64]:
     """Return the covariance of some parameters of an estimate."""
-    indices = [estimate.determined.index(name) for name in names]
+    indices = [estimate.determined.index(parameter_name) for parameter_name in parameter_names]
     return estimate.covariance[np.ix_(indices, indices)]
 
 
-def _pooled_plant(estimate: RecordEstimate, values: dict[str, float]) -> Plant:
+def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) -> Plant:
     """Return a plant with given parameters and all other properties of a session's plant."""
-    stiffness = values["bending_stiffness_n_m2"]
-    free = STRUCTURES[estimate.structure].free
+    stiffness = parameter_values["bending_stiffness_n_m2"]
+    free_names = STRUCTURES[estimate.structure].free
     return replace(
         estimate.plant,
         beam=Beam(
-            estimate.plant.beam.length_m, values["density_over_stiffness"] * stiffness, stiffness
+            estimate.plant.beam.length_m,
+            parameter_values["density_over_stiffness"] * stiffness,
+            stiffness,
         ),
-        damping=STRUCTURES[estimate.structure].damping({name: values[name] for name in free}),
-        delay_s=values["delay_s"],
-        tool_inertia_kg_m2=values["tool_inertia_kg_m2"],
+        damping=STRUCTURES[estimate.structure].damping(
+            {parameter_name: parameter_values[parameter_name] for parameter_name in free_names}
+        ),
+        delay_s=parameter_values["delay_s"],
+        tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
     )

@@ -53,18 +53,22 @@ def label(quantity: str) -> tuple[str, float, str]:
     times the factor is in the display unit.
     """
     if quantity in QUANTITIES:
-        symbol, _, unit, factor = QUANTITIES[quantity]
-        unit, factor = _FINER_UNITS.get(quantity, (unit, factor))
-        power, _, unit_rest = unit.partition(" ")
-        if power.startswith("1e"):
-            unit = f"10{power.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
-        return _CLEARER_NAMES.get(quantity, symbol), factor, "" if unit == "1" else unit
-    field_name, mode = quantity.rsplit("_", 1)
-    mode_quantity, factor, unit = _MODE_QUANTITIES[field_name]
-    return f"{mode_quantity} of mode {mode}", factor, unit
+        symbol, _, display_unit, display_factor = QUANTITIES[quantity]
+        display_unit, display_factor = _FINER_UNITS.get(quantity, (display_unit, display_factor))
+        power_text, _, unit_rest = display_unit.partition(" ")
+        if power_text.startswith("1e"):
+            display_unit = f"10{power_text.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
+        return (
+            _CLEARER_NAMES.get(quantity, symbol),
+            display_factor,
+            "" if display_unit == "1" else display_unit,
+        )
+    quantity_name, mode_number = quantity.rsplit("_", 1)
+    mode_quantity, display_factor, display_unit = _MODE_QUANTITIES[quantity_name]
+    return f"{mode_quantity} of mode {mode_number}", display_factor, display_unit
 
 
-def symbol_with_unit(parameter: str) -> str:
+def symbol_with_unit(quantity: str) -> str:
     """Return the symbol or name of a quantity, followed by its display unit in parentheses.
 
     Examples
@@ -73,8 +77,8 @@ def symbol_with_unit(parameter: str) -> str:
     >>> symbol_with_unit("zeta"), symbol_with_unit("frequency_hz_2")
     ('ζ (10⁻⁵ s^α)', 'frequency of mode 2 (Hz)')
     """
-    symbol, _, unit = label(parameter)
-    return f"{symbol} ({unit})" if unit else symbol
+    symbol, _, display_unit = label(quantity)
+    return f"{symbol} ({display_unit})" if display_unit else symbol
 
 
 def probability(p_value: float) -> str:
@@ -124,16 +128,16 @@ def specimens(homogeneity: Homogeneity) -> list[str]:
     sentences = (
         _describe_stated_specimens(homogeneity.specimens) if len(homogeneity.specimens) > 1 else []
     )
-    leading = homogeneity.leading
+    leading_scatter = homogeneity.leading
     return (
         sentences
-        if leading is None
-        else [*sentences, *_describe_different_specimens(homogeneity, leading)]
+        if leading_scatter is None
+        else [*sentences, *_describe_different_specimens(homogeneity, leading_scatter)]
     )
 
 
 def title(text: str, homogeneity: Homogeneity) -> str:
-    """Return a title, with an addition if the values are pooled over several specimens.
+    """Return the title of a table or figure, with an addition for values of several specimens.
 
     Parameters
     ----------
@@ -169,18 +173,20 @@ def _describe_stated_specimens(specimens: Sequence[StatedSpecimen]) -> list[str]
     ]
 
 
-def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogeneity) -> list[str]:
+def _describe_different_specimens(
+    homogeneity: Homogeneity, leading_scatter: Heterogeneity
+) -> list[str]:
     """Describe how the estimates show that the sessions are of different specimens."""
-    others = [
+    other_labels = [
         label(scatter.quantity)[0]
         for scatter in homogeneity.quantities
-        if scatter.mixed and not scatter.of_rig and scatter is not leading
+        if scatter.mixed and not scatter.of_rig and scatter is not leading_scatter
     ]
-    others_sentence = f" The same holds of {', '.join(others)}." if others else ""
+    others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
     return [
         "The sessions are not of one specimen in one state: "
-        f"{_describe_heterogeneity(leading)}.{others_sentence}",
-        f"{_describe_groups(leading)} Pooled values are then means of a mixture (marked "
+        f"{_describe_heterogeneity(leading_scatter)}.{others_sentence}",
+        f"{_describe_groups(leading_scatter)} Pooled values are then means of a mixture (marked "
         f"{MIXTURE_MARK}) that "
         "may hold for none of the specimens: analyse the sessions of each specimen separately, or "
         "find what changed between sessions (clamp, temperature, "
@@ -190,12 +196,12 @@ def _describe_different_specimens(homogeneity: Homogeneity, leading: Heterogenei
 
 def _small_scatter_remark(homogeneity: Homogeneity) -> str:
     """Return a remark that the frequencies vary little in relative terms, or an empty text."""
-    frequencies = [
+    frequency_scatters = [
         scatter for scatter in homogeneity.quantities if scatter.quantity.startswith("frequency_hz")
     ]
-    mixed = [scatter for scatter in frequencies if scatter.mixed]
-    if not mixed or any(
-        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed
+    mixed_scatters = [scatter for scatter in frequency_scatters if scatter.mixed]
+    if not mixed_scatters or any(
+        scatter.between_std > _SLIGHT_FREQUENCY_SCATTER * scatter.mean for scatter in mixed_scatters
     ):
         return ""
     return (
@@ -225,44 +231,49 @@ def _describe_heterogeneity(scatter: Heterogeneity) -> str:
 
 def _describe_groups(scatter: Heterogeneity) -> str:
     """Describe the groups of sessions, or the sessions of lowest and highest value."""
-    name, _, _ = label(scatter.quantity)
-    values = {file: (value, std) for file, value, std in scatter.values}
+    quantity_label, _, _ = label(scatter.quantity)
+    values_by_file = {
+        file_name: (session_value, std) for file_name, session_value, std in scatter.values
+    }
     if scatter.groups:
-        groups = "; ".join(
-            f"{_mean_text([values[file][0] for file in group], scatter)} in {_list_files(group)}"
+        groups_text = "; ".join(
+            f"{_mean_text([values_by_file[file_name][0] for file_name in group], scatter)} in "
+            f"{_list_files(group)}"
             for group in scatter.groups
         )
-        return f"By the {name} they are {len(scatter.groups)} groups: {groups}."
+        return f"By the {quantity_label} they are {len(scatter.groups)} groups: {groups_text}."
     low, high = _extreme_sessions(scatter.values)
     return (
-        f"There are no clear groups: the {name} goes from {_mean_text([low[1]], scatter)} in "
-        f"{low[0]} "
+        f"There are no clear groups: the {quantity_label} goes from "
+        f"{_mean_text([low[1]], scatter)} in {low[0]} "
         f"to {_mean_text([high[1]], scatter)} in {high[0]}."
     )
 
 
 def _extreme_sessions(
-    values: SessionValues,
+    session_values: SessionValues,
 ) -> tuple[tuple[str, float, float], tuple[str, float, float]]:
     """Return the entries of the sessions with the lowest and the highest value."""
-    ordered = sorted(values, key=lambda entry: entry[1])
-    return ordered[0], ordered[-1]
+    sorted_entries = sorted(session_values, key=lambda entry: entry[1])
+    return sorted_entries[0], sorted_entries[-1]
 
 
-def _mean_text(values: Sequence[float], scatter: Heterogeneity) -> str:
+def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
     """Format the mean of values with its unit, and enough digits to distinguish the groups."""
-    _, factor, unit = label(scatter.quantity)
+    _, factor, display_unit = label(scatter.quantity)
     digits = min(decimals(factor * max(scatter.between_std, 1e-300)), 9)
-    separator = "·" if unit.startswith("10") else " "
-    return f"{factor * float(np.mean(values)):.{digits}f}{separator}{unit}".rstrip()
+    separator = "·" if display_unit.startswith("10") else " "
+    return f"{factor * float(np.mean(session_values)):.{digits}f}{separator}{display_unit}".rstrip()
 
 
-def _list_files(names: Sequence[str]) -> str:
+def _list_files(file_names: Sequence[str]) -> str:
     """Return the number of files and the names of the first few."""
-    shown = ", ".join(names[:_MOST_FILES_LISTED]) + (
-        f" and {len(names) - _MOST_FILES_LISTED} more" if len(names) > _MOST_FILES_LISTED else ""
+    listed_names = ", ".join(file_names[:_MOST_FILES_LISTED]) + (
+        f" and {len(file_names) - _MOST_FILES_LISTED} more"
+        if len(file_names) > _MOST_FILES_LISTED
+        else ""
     )
-    return f"{len(names)} file{'' if len(names) == 1 else 's'} ({shown})"
+    return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({listed_names})"
 
 
 # Verdict
@@ -284,7 +295,7 @@ _NEARLY_INTEGER_DISTANCE: Final = 0.05
 
 
 def describe_orders(
-    freest: PooledEstimate,
+    freest_fit: PooledEstimate,
     alpha: PooledOrder,
     lambda_: PooledOrder,
     validation: Sequence[LeftOutError],
@@ -295,7 +306,7 @@ def describe_orders(
 
     Parameters
     ----------
-    freest : PooledEstimate
+    freest_fit : PooledEstimate
         Pooled estimate of the freest structure.
     alpha, lambda_ : PooledOrder
         Orders of internal and external damping.
@@ -305,16 +316,20 @@ def describe_orders(
     conjunction = " and " if alpha.exact is None else "; "
     dampings = f"{_order_clause(alpha)}{conjunction}{_order_clause(lambda_)}"
     sentence = f"{dampings[0].upper()}{dampings[1:]}."
-    errors: dict[str, list[str]] = {}
-    for name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest.name)):
-        type_errors = [e.error for e in validation if e.method == "record" and e.name == name]
+    names_by_error: dict[str, list[str]] = {}
+    for structure_name in dict.fromkeys((_CLASSICAL_STRUCTURE, freest_fit.name)):
+        type_errors = [
+            e.error for e in validation if e.method == "record" and e.name == structure_name
+        ]
         if type_errors:
-            errors.setdefault(f"{100 * float(np.mean(type_errors)):.2g} %", []).append(name)
-    if not errors:
+            names_by_error.setdefault(f"{100 * float(np.mean(type_errors)):.2g} %", []).append(
+                structure_name
+            )
+    if not names_by_error:
         return sentence
     error_texts = ", ".join(
-        f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error}"
-        for error, names in errors.items()
+        f"type{'s' if len(names) > 1 else ''} {listed(names)} with {error_text}"
+        for error_text, names in names_by_error.items()
     )
     return f"{sentence} Error of the torque predicted for an unseen session: {error_texts}."
 
@@ -323,40 +338,40 @@ def _order_clause(pooled_order: PooledOrder) -> str:
     """Describe the order of one damping as the clause of a sentence."""
     if pooled_order.exact is not None:
         return _slope_clause(pooled_order)
-    damping = _DAMPING_OF_ORDER[pooled_order.order]
+    damping_name = _DAMPING_OF_ORDER[pooled_order.order]
     if pooled_order.status == "absent":
-        return f"no {damping}"
+        return f"no {damping_name}"
     if pooled_order.status == "compatible" and pooled_order.interval is None:
-        return f"{damping} of order 1 ({pooled_order.order} was not fitted)"
+        return f"{damping_name} of order 1 ({pooled_order.order} was not fitted)"
     if (
         pooled_order.value is None
         or pooled_order.interval is None
         or pooled_order.reason is not None
     ):
-        return f"{damping} of an order that is not established"
+        return f"{damping_name} of an order that is not established"
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
     value_text = " ± ".join(
         to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
     )
     order_text = f"{pooled_order.order} = {value_text}"
     if pooled_order.status == "compatible":
-        return f"{damping} of integer order ({order_text})"
+        return f"{damping_name} of integer order ({order_text})"
     if pooled_order.status == "open":
-        return f"{damping} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
+        return f"{damping_name} of an order near 1 ({order_text}; 1 is doubtful, but not excluded)"
     if abs(pooled_order.value - 1) < _NEARLY_INTEGER_DISTANCE:
-        return f"{damping} of nearly integer order ({order_text}; 1 is excluded)"
-    return f"{damping} of fractional order ({order_text})"
+        return f"{damping_name} of nearly integer order ({order_text}; 1 is excluded)"
+    return f"{damping_name} of fractional order ({order_text})"
 
 
 def _slope_clause(pooled_order: PooledOrder) -> str:
     """Describe how one loss grows with frequency over the visible modes, as a clause."""
-    loss = LOSS_NAMES[pooled_order.order]
+    loss_name = LOSS_NAMES[pooled_order.order]
     if (
         pooled_order.value is None
         or pooled_order.interval is None
         or pooled_order.reason is not None
     ):
-        return f"{loss} with a slope that is not established"
+        return f"{loss_name} with a slope that is not established"
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
     slope_text = " ± ".join(
         to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
@@ -366,62 +381,70 @@ def _slope_clause(pooled_order: PooledOrder) -> str:
         "fractional": "which excludes order 1",
         "open": "which alone does not exclude order 1",
     }
-    return f"{loss} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
+    return f"{loss_name} growing as f^({slope_text}), {conclusion[pooled_order.status]}"
 
 
-def describe_structure(freest: PooledEstimate, best: PooledEstimate) -> str:
+def describe_structure(freest_fit: PooledEstimate, lowest_bic_estimate: PooledEstimate) -> str:
     """Describe the damping structure of the reported parameters, and a simpler one.
 
     Parameters
     ----------
-    freest : PooledEstimate
+    freest_fit : PooledEstimate
         Estimate whose parameters are reported.
-    best : PooledEstimate
+    lowest_bic_estimate : PooledEstimate
         Estimate of the lowest BIC.
     """
     fixed_orders = [
-        name for name in _ORDER_NAMES if STRUCTURES[freest.structure].fixed.get(name) == 1.0
+        order_name
+        for order_name in _ORDER_NAMES
+        if STRUCTURES[freest_fit.structure].fixed.get(order_name) == 1.0
     ]
-    verb = "is" if len(fixed_orders) == 1 else "are"
+    order_verb = "is" if len(fixed_orders) == 1 else "are"
     consequence = (
-        f"; it assumes that {' and '.join(fixed_orders)} {verb} 1."
+        f"; it assumes that {' and '.join(fixed_orders)} {order_verb} 1."
         if fixed_orders
         else ", so its intervals hold for any simpler one, too."
     )
-    sentence = (
-        f"The numbers are those of type {freest.name}: {_describe_damping(freest.structure)}. "
+    structure_sentence = (
+        f"The numbers are those of type {freest_fit.name}: "
+        f"{_describe_damping(freest_fit.structure)}. "
         f"It is the freest structure that the sessions determine{consequence}"
     )
-    if best.name != freest.name:
-        sentence += (
-            f" Type {best.name} has the lowest BIC ({_describe_damping(best.structure)}); "
+    if lowest_bic_estimate.name != freest_fit.name:
+        structure_sentence += (
+            f" Type {lowest_bic_estimate.name} has the lowest BIC "
+            f"({_describe_damping(lowest_bic_estimate.structure)}); "
             "its intervals are narrower, and valid only if it is true."
         )
-    return sentence
+    return structure_sentence
 
 
 def describe_loss_factors(loss_factors: Sequence[ReportedLossFactor]) -> list[str]:
     """Describe each loss factor at the frequency where it depends least on the order."""
-    factors = []
+    factor_texts = []
     for loss_factor in loss_factors:
         if loss_factor.omega_rad_s is None or not (
             loss_factor.size.std and loss_factor.size.interval_95
         ):
             continue
-        value, low, high = to_uncertainty(
+        value_text, low, high_text = to_uncertainty(
             (loss_factor.size.value, *loss_factor.size.interval_95), loss_factor.size.std
         )
         remark = f", {loss_factor.size.flag}" if loss_factor.size.flag else ""
-        factors.append(
-            f"{loss_factor.damping} {value} (95 %: {low} to {high}) at "
+        factor_texts.append(
+            f"{loss_factor.damping} {value_text} (95 %: {low} to {high_text}) at "
             f"{loss_factor.omega_rad_s / (2 * np.pi):.3g} Hz{remark}"
         )
-    return [f"Loss factors at the pivot frequencies: {'; '.join(factors)}."] if factors else []
+    return (
+        [f"Loss factors at the pivot frequencies: {'; '.join(factor_texts)}."]
+        if factor_texts
+        else []
+    )
 
 
 def describe_selection(
-    ranked: Sequence[PooledEstimate],
-    rivals: Sequence[PooledEstimate],
+    ranked_estimates: Sequence[PooledEstimate],
+    rival_estimates: Sequence[PooledEstimate],
     single_selections: Mapping[str, int],
     sessions: int,
 ) -> str:
@@ -429,65 +452,70 @@ def describe_selection(
 
     Parameters
     ----------
-    ranked : sequence of PooledEstimate
+    ranked_estimates : sequence of PooledEstimate
         Estimates of all structures, the lowest BIC first.
-    rivals : sequence of PooledEstimate
+    rival_estimates : sequence of PooledEstimate
         Estimates whose BIC is not distinguishable from the lowest.
     single_selections : mapping of str to int
         Number of sessions that select each structure by themselves.
     sessions : int
         Number of sessions.
     """
-    best = ranked[0]
-    sentence = f"Lowest BIC: type {best.name}."
-    if rivals:
-        names = " or ".join(f"type {rival.name}" for rival in rivals)
-        sentence += (
-            f" All sessions together do not distinguish it from {names} (ΔBIC "
-            f"{rivals[0].bic - best.bic:.1f}; 10 = decisive)."
+    lowest_bic_estimate = ranked_estimates[0]
+    bic_sentence = f"Lowest BIC: type {lowest_bic_estimate.name}."
+    if rival_estimates:
+        rival_names = " or ".join(f"type {rival.name}" for rival in rival_estimates)
+        bic_sentence += (
+            f" All sessions together do not distinguish it from {rival_names} (ΔBIC "
+            f"{rival_estimates[0].bic - lowest_bic_estimate.bic:.1f}; 10 = decisive)."
         )
-    elif len(ranked) > 1:
-        margin = ranked[1].bic - best.bic
-        sentence += f" Next: type {ranked[1].name}, ΔBIC {margin:.3g} (10 = decisive)."
-    selections = {f"type {name}": count for name, count in single_selections.items()}
-    return f"{sentence} {describe_single_sessions(selections, sessions)}"
+    elif len(ranked_estimates) > 1:
+        bic_margin = ranked_estimates[1].bic - lowest_bic_estimate.bic
+        bic_sentence += (
+            f" Next: type {ranked_estimates[1].name}, ΔBIC {bic_margin:.3g} (10 = decisive)."
+        )
+    selection_counts = {
+        f"type {structure_name}": session_count
+        for structure_name, session_count in single_selections.items()
+    }
+    return f"{bic_sentence} {describe_single_sessions(selection_counts, sessions)}"
 
 
-def describe_residual(best: PooledEstimate, adequate: int, sessions: int) -> str:
+def describe_residual(pooled_estimate: PooledEstimate, adequate_count: int, sessions: int) -> str:
     """Describe whether the residual of a damping structure's fit is noise.
 
     Parameters
     ----------
-    best : PooledEstimate
+    pooled_estimate : PooledEstimate
         Pooled estimate of the structure.
-    adequate : int
+    adequate_count : int
         Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
-    if best.misfit > LARGEST_MISFIT:
+    if pooled_estimate.misfit > LARGEST_MISFIT:
         return (
-            f"Its residual is {best.misfit:.3g} times the noise: no structure fitted describes the "
-            "beam, and standard deviations are meaningless."
+            f"Its residual is {pooled_estimate.misfit:.3g} times the noise: no structure fitted "
+            "describes the beam, and standard deviations are meaningless."
         )
-    return describe_noise_sessions(adequate, sessions)
+    return describe_noise_sessions(adequate_count, sessions)
 
 
-def describe_noise_sessions(adequate: int, sessions: int) -> str:
+def describe_noise_sessions(adequate_count: int, sessions: int) -> str:
     """State in how many sessions the residual of the fit is noise.
 
     Parameters
     ----------
-    adequate : int
+    adequate_count : int
         Number of sessions whose residual is noise.
     sessions : int
         Number of sessions.
     """
-    if adequate == sessions:
+    if adequate_count == sessions:
         return "The residual is noise in every session: the model suffices for these records."
     return (
-        f"The residual is noise in {adequate} of {sessions} sessions; in the others something is "
-        "unexplained."
+        f"The residual is noise in {adequate_count} of {sessions} sessions; in the others "
+        "something is unexplained."
     )
 
 
@@ -506,45 +534,49 @@ def describe_modes(pooled_modes: Sequence[PooledMode], sessions: int, *, mixed: 
     if not pooled_modes:
         return []
     t = student_t_quantile(0.95, sessions - 1)
-    modes = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
+    mode_clauses = "; ".join(_mode_clause(mode, t) for mode in pooled_modes)
     of = "the sessions, a mixture" if mixed else "the sessions"
-    return [f"Modes: {modes} (± 95 % of the mean over {of})."]
+    return [f"Modes: {mode_clauses} (± 95 % of the mean over {of})."]
 
 
 def describe_order(pooled_order: PooledOrder) -> str:
     """Describe the pooled estimate of one order of the damping."""
-    name, damping = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
-    counts = {f"“{status}”": count for status, count in pooled_order.alone.items()}
-    sessions_sentence = f" {describe_single_sessions(counts, sum(counts.values()))}"
+    order_name, damping_name = pooled_order.order, _DAMPING_OF_ORDER[pooled_order.order]
+    status_counts = {
+        f"“{status}”": session_count for status, session_count in pooled_order.alone.items()
+    }
+    sessions_text = f" {describe_single_sessions(status_counts, sum(status_counts.values()))}"
     if pooled_order.status == "absent":
-        return f"No {damping} was found, so its order {name} has no meaning.{sessions_sentence}"
+        return (
+            f"No {damping_name} was found, so its order {order_name} has no meaning.{sessions_text}"
+        )
     if pooled_order.status == "compatible" and pooled_order.interval is None:
         return (
-            f"The order {name} of the {damping} is fixed at 1, with which it is "
-            f"compatible.{sessions_sentence}"
+            f"The order {order_name} of the {damping_name} is fixed at 1, with which it is "
+            f"compatible.{sessions_text}"
         )
     if pooled_order.value is None or pooled_order.interval is None:
         return (
-            f"The order {name} of the {damping} is not identifiable: "
-            f"{pooled_order.reason}.{sessions_sentence}"
+            f"The order {order_name} of the {damping_name} is not identifiable: "
+            f"{pooled_order.reason}.{sessions_text}"
         )
     half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
-    value, low, high = to_uncertainty(
+    value_text, low, high_text = to_uncertainty(
         (pooled_order.value, *pooled_order.interval), pooled_order.std or half_width
     )
-    statement = (
-        f"The order {name} of the {damping} is {value} "
-        f"(95 %: {low} to {high}, between-session variance included)"
+    order_statement = (
+        f"The order {order_name} of the {damping_name} is {value_text} "
+        f"(95 %: {low} to {high_text}, between-session variance included)"
     )
     if pooled_order.reason is not None:
-        conditional = statement.replace(" is ", " would be ", 1)
-        return f"{conditional}, but {pooled_order.reason}; do not interpret it.{sessions_sentence}"
+        would_be = order_statement.replace(" is ", " would be ", 1)
+        return f"{would_be}, but {pooled_order.reason}; do not interpret it.{sessions_text}"
     conclusion = {
         "compatible": "consistent with 1",
         "fractional": "1 is excluded",
         "open": "1 is doubtful, but not excluded",
     }
-    return f"{statement}: {conclusion[pooled_order.status]}.{sessions_sentence}"
+    return f"{order_statement}: {conclusion[pooled_order.status]}.{sessions_text}"
 
 
 def describe_welch_bias(
@@ -574,14 +606,17 @@ def describe_welch_bias(
     best_model_biases = [
         bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
     ]
-    left_out = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
+    omitted_parameters = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
-        significant = [one for one in bias.significant if one.parameter not in left_out]
-        if not significant:
+        significant_parameters = [
+            one for one in bias.significant if one.parameter not in omitted_parameters
+        ]
+        if not significant_parameters:
             continue
         sentences.append(
-            f"Welch's {'; '.join(map(_bias_clause, significant))} (type {bias.structure}, weights "
+            f"Welch's {'; '.join(map(_bias_clause, significant_parameters))} (type "
+            f"{bias.structure}, weights "
             f"{bias.weighting}, as in Table 3): bias, not scatter, which more sessions do not "
             "reduce."
         )
@@ -596,40 +631,47 @@ def describe_welch_bias(
 
 def _bias_clause(parameter_bias: ParameterBias) -> str:
     """Describe the value of one parameter of a Welch fit and its bias."""
-    symbol, factor, unit = label(parameter_bias.parameter)
-    value, scatter = to_uncertainty(
-        (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, factor
+    symbol, display_factor, display_unit = label(parameter_bias.parameter)
+    value_text, scatter_text = to_uncertainty(
+        (parameter_bias.welch, parameter_bias.welch_std), parameter_bias.welch_std, display_factor
     )
-    (record,) = to_uncertainty((parameter_bias.record,), parameter_bias.record_std, factor)
-    (bias_text,) = to_uncertainty((abs(parameter_bias.bias),), parameter_bias.bias_std, factor)
-    name = parameter_bias.parameter if parameter_bias.parameter in _ORDER_NAMES else symbol
-    unit_text = f"·{unit}" if unit else ""
+    (record_text,) = to_uncertainty(
+        (parameter_bias.record,), parameter_bias.record_std, display_factor
+    )
+    (bias_text,) = to_uncertainty(
+        (abs(parameter_bias.bias),), parameter_bias.bias_std, display_factor
+    )
+    shown_name = parameter_bias.parameter if parameter_bias.parameter in _ORDER_NAMES else symbol
+    unit_text = f"·{display_unit}" if display_unit else ""
     bounds_remark = (
         f", at the edge of the search range in {parameter_bias.at_bounds}"
         if parameter_bias.at_bounds
         else ""
     )
     return (
-        f"{name} ({value} ± {scatter}{unit_text} between sessions{bounds_remark}) is "
-        f"{bias_text}{unit_text} "
-        f"{'above' if parameter_bias.bias > 0 else 'below'} the whole records' {record}{unit_text}"
+        f"{shown_name} ({value_text} ± {scatter_text}{unit_text} between sessions{bounds_remark}) "
+        f"is {bias_text}{unit_text} "
+        f"{'above' if parameter_bias.bias > 0 else 'below'} the whole records' "
+        f"{record_text}{unit_text}"
     )
 
 
-def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) -> list[str]:
+def describe_dissent(
+    sessions: Sequence[tuple[str, str]], lowest_bic_estimate: PooledEstimate
+) -> list[str]:
     """List the sessions that alone exclude the damping structure selected by all together.
 
     Parameters
     ----------
     sessions : sequence of tuple
         File of each such session, and the structure that it selects.
-    best : PooledEstimate
+    lowest_bic_estimate : PooledEstimate
         Estimate of the structure that all sessions select together.
     """
     if not sessions:
         return []
-    names = ", ".join(
-        f"{file} (type {structure})" for file, structure in sessions[:_MOST_FILES_LISTED]
+    session_texts = ", ".join(
+        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MOST_FILES_LISTED]
     )
     more_text = (
         f" and {len(sessions) - _MOST_FILES_LISTED} more"
@@ -637,34 +679,39 @@ def describe_dissent(sessions: Sequence[tuple[str, str]], best: PooledEstimate) 
         else ""
     )
     return [
-        f"Type {best.name} is excluded by {len(sessions)} single "
+        f"Type {lowest_bic_estimate.name} is excluded by {len(sessions)} single "
         f"session{'s' if len(sessions) > 1 else ''}: "
-        f"{names}{more_text}. Check their reports (analyze --each) before relying on the mean."
+        f"{session_texts}{more_text}. Check their reports (analyze --each) before relying on the "
+        "mean."
     ]
 
 
-def describe_scatter(best: PooledEstimate) -> str:
+def describe_scatter(pooled_estimate: PooledEstimate) -> str:
     """Describe whether any parameter varies significantly between the sessions.
 
     The level of the test gives one false alarm in a hundred campaigns.
     """
-    level = _SIGNIFICANCE_LEVEL / max(len(best.parameters), 1)
-    varying = [
-        label(parameter.name)[0] for parameter in best.parameters if parameter.chance < level
+    significance_level = _SIGNIFICANCE_LEVEL / max(len(pooled_estimate.parameters), 1)
+    varying_labels = [
+        label(parameter.name)[0]
+        for parameter in pooled_estimate.parameters
+        if parameter.chance < significance_level
     ]
-    if not varying:
-        lowest = min((parameter.chance for parameter in best.parameters), default=1.0)
+    if not varying_labels:
+        lowest_p_value = min(
+            (parameter.chance for parameter in pooled_estimate.parameters), default=1.0
+        )
         tau_remark = (
             "; the τ above zero are within chance"
-            if any(parameter.between_std > 0 for parameter in best.parameters)
+            if any(parameter.between_std > 0 for parameter in pooled_estimate.parameters)
             else ""
         )
         return (
             "No significant between-session variance (Cochran's Q, lowest p of "
-            f"{len(best.parameters)}: {probability(lowest)}{tau_remark})."
+            f"{len(pooled_estimate.parameters)}: {probability(lowest_p_value)}{tau_remark})."
         )
     return (
-        f"Between-session variance in {', '.join(varying)} (Cochran's Q): something changes "
+        f"Between-session variance in {', '.join(varying_labels)} (Cochran's Q): something changes "
         "between "
         "sessions, such as clamp, temperature or motor, and the interval of a single session is "
         "too narrow for the specimen."
@@ -672,13 +719,13 @@ def describe_scatter(best: PooledEstimate) -> str:
 
 
 def describe_prediction_errors(
-    best: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
+    pooled_estimate: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
 ) -> list[str]:
     """Describe how well a damping structure predicts a session from the other sessions.
 
     Parameters
     ----------
-    best : PooledEstimate
+    pooled_estimate : PooledEstimate
         Estimate of the structure.
     validation : sequence of LeftOutError
         Errors of sessions predicted from the others.
@@ -688,90 +735,95 @@ def describe_prediction_errors(
     structure_errors = [
         left_out
         for left_out in validation
-        if left_out.method == "record" and left_out.name == best.name
+        if left_out.method == "record" and left_out.name == pooled_estimate.name
     ]
     own_errors = [
         left_out.own_error for left_out in structure_errors if left_out.own_error is not None
     ]
     if not own_errors:
         return []
-    error, own_error = (
+    mean_error, mean_own_error = (
         float(np.mean([left_out.error for left_out in structure_errors])),
         float(np.mean(own_errors)),
     )
-    verdict = (
+    comparison_text = (
         "the others predict a session as well as its own fit"
-        if error <= _EQUAL_ERROR_RATIO * own_error
+        if mean_error <= _EQUAL_ERROR_RATIO * mean_own_error
         else "the others predict a session worse than its own fit, as the parameters vary"
     )
     sessions_remark = (
         f"; mean of {len(own_errors)} of {sessions} sessions" if len(own_errors) < sessions else ""
     )
     return [
-        f"Leave-one-out error of the torque {100 * error:.2f} % rms (in-sample "
-        f"{100 * own_error:.2f} %, noise included{sessions_remark}): {verdict}."
+        f"Leave-one-out error of the torque {100 * mean_error:.2f} % rms (in-sample "
+        f"{100 * mean_own_error:.2f} %, noise included{sessions_remark}): {comparison_text}."
     ]
 
 
-def lost_trials(lost: Sequence[LostTrial], requested: int) -> list[str]:
+def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
-    lost : sequence of LostTrial
+    lost_sessions : sequence of LostTrial
         Sessions that were not predicted.
     requested : int
         Number of sessions that were to be predicted.
     """
-    if not lost:
+    if not lost_sessions:
         return []
-    reasons = "; ".join(f"{trial.path.name}: {trial.reason}" for trial in lost[:_MOST_FILES_LISTED])
+    reasons_text = "; ".join(
+        f"{lost_trial.path.name}: {lost_trial.reason}"
+        for lost_trial in lost_sessions[:_MOST_FILES_LISTED]
+    )
     more_text = (
-        f"; and {len(lost) - _MOST_FILES_LISTED} more" if len(lost) > _MOST_FILES_LISTED else ""
+        f"; and {len(lost_sessions) - _MOST_FILES_LISTED} more"
+        if len(lost_sessions) > _MOST_FILES_LISTED
+        else ""
     )
     return [
-        f"Of {requested} sessions to be predicted from the others, {requested - len(lost)} "
-        f"{'was' if requested - len(lost) == 1 else 'were'} and {len(lost)} "
-        f"{'was' if len(lost) == 1 else 'were'} not ({reasons}{more_text}). Prediction errors are "
-        "averaged "
-        "over those predicted."
+        f"Of {requested} sessions to be predicted from the others, "
+        f"{requested - len(lost_sessions)} "
+        f"{'was' if requested - len(lost_sessions) == 1 else 'were'} and {len(lost_sessions)} "
+        f"{'was' if len(lost_sessions) == 1 else 'were'} not ({reasons_text}{more_text}). "
+        "Prediction errors are averaged over those predicted."
     ]
 
 
-def describe_single_sessions(counts: Mapping[str, int], sessions: int) -> str:
+def describe_single_sessions(conclusion_counts: Mapping[str, int], sessions: int) -> str:
     """State how many sessions by themselves reach each conclusion.
 
     Parameters
     ----------
-    counts : mapping of str to int
+    conclusion_counts : mapping of str to int
         Number of sessions by their conclusion, the most common first.
     sessions : int
         Number of sessions.
     """
-    (first_conclusion, count), *others = counts.items()
-    other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in others)
-    return f"Single sessions: {first_conclusion} in {count} of {sessions}{other_texts}."
+    (first_conclusion, first_count), *other_conclusions = conclusion_counts.items()
+    other_texts = "".join(f", {conclusion} in {n}" for conclusion, n in other_conclusions)
+    return f"Single sessions: {first_conclusion} in {first_count} of {sessions}{other_texts}."
 
 
 def _describe_damping(structure: str) -> str:
     """Describe the kinds of damping of a damping structure, and whether orders are free."""
     damping_structure = STRUCTURES[structure]
-    kinds = [
-        f"{name} damping ({order} {'free' if order in damping_structure.free else '= 1'})"
-        for name, order, present in (
+    damping_texts = [
+        f"{damping_name} damping ({order} {'free' if order in damping_structure.free else '= 1'})"
+        for damping_name, order, is_present in (
             ("internal", "alpha", damping_structure.internal),
             ("external", "lambda", damping_structure.external),
         )
-        if present
+        if is_present
     ]
-    return " and ".join(kinds)
+    return " and ".join(damping_texts)
 
 
 def _mode_clause(mode: PooledMode, t: float) -> str:
     """Describe the frequency and the damping ratio of one mode."""
     half_width = t * 100 * mode.damping_ratio_std
-    digits = decimals(max(half_width, 1e-9))
+    decimal_digits = decimals(max(half_width, 1e-9))
     return (
         f"{mode.frequency_hz:.5g} Hz with a damping ratio of "
-        f"{100 * mode.damping_ratio:.{digits}f} ± {half_width:.{digits}f} %"
+        f"{100 * mode.damping_ratio:.{decimal_digits}f} ± {half_width:.{decimal_digits}f} %"
     )

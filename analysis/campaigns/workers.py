@@ -122,75 +122,90 @@ class Workers:
         CampaignError
             There are no workers any more.
         """
-        results: dict[int, Result | LostTask] = {}
+        task_results: dict[int, Result | LostTask] = {}
 
-        def submit(index: int) -> Future[Result]:
+        def submit(task_index: int) -> Future[Result]:
             """Start a task by its index."""
-            return self._executor.submit(function, *arguments[index])
+            return self._executor.submit(function, *arguments[task_index])
 
-        def store_result(index: int, result: Result | LostTask) -> None:
+        def store_result(task_index: int, task_result: Result | LostTask) -> None:
             """Store the result of a task and report its completion."""
-            results[index] = result
-            on_done(index)
+            task_results[task_index] = task_result
+            on_done(task_index)
 
-        queue = deque(range(len(arguments)))
-        while queue:
+        task_queue = deque(range(len(arguments)))
+        while task_queue:
             with self._convert_errors():
-                interrupted = self._run_until_process_ends(queue, submit, store_result)
-                for index in interrupted:
+                interrupted_tasks = self._run_until_process_ends(task_queue, submit, store_result)
+                for task_index in interrupted_tasks:
                     self._replace_executor(alone=True)
-                    if self._run_until_process_ends(deque([index]), submit, store_result):
-                        store_result(index, LostTask(self._lost_task_reason))
-            if interrupted:
-                any_finished = any(not isinstance(result, LostTask) for result in results.values())
+                    if self._run_until_process_ends(deque([task_index]), submit, store_result):
+                        store_result(task_index, LostTask(self._lost_task_reason))
+            if interrupted_tasks:
+                any_finished = any(
+                    not isinstance(task_result, LostTask) for task_result in task_results.values()
+                )
                 if (
                     self._no_workers_message
                     and not any_finished
-                    and (len(results) >= _FEWEST_LOST_TASKS or not queue)
+                    and (len(task_results) >= _FEWEST_LOST_TASKS or not task_queue)
                 ):
                     raise CampaignError(self._no_workers_message)
                 self._replace_executor()
-        return [results[index] for index in range(len(arguments))]
+        return [task_results[task_index] for task_index in range(len(arguments))]
 
     def _run_until_process_ends(
         self,
-        queue: deque[int],
-        submit: Callable[[int], Future[Result]],
+        task_queue: deque[int],
+        submit_task: Callable[[int], Future[Result]],
         store_result: Callable[[int, Result], None],
     ) -> list[int]:
-        """Run queued tasks until a worker process ends; return the tasks interrupted by it."""
+        """Run queued tasks until a worker process ends.
+
+        Return the indices of the tasks that its end interrupted; the list is empty if all tasks
+        ran.
+        """
         in_progress: dict[Future[Result], int] = {}
-        interrupted: list[int] = []
+        interrupted_tasks: list[int] = []
         last_seen_s = time.monotonic()
-        while in_progress or (queue and not interrupted):
-            while queue and not interrupted and len(in_progress) != self._most_in_progress:
+        while in_progress or (task_queue and not interrupted_tasks):
+            while (
+                task_queue and not interrupted_tasks and len(in_progress) != self._most_in_progress
+            ):
                 try:
-                    in_progress[submit(queue[0])] = queue[0]
+                    in_progress[submit_task(task_queue[0])] = task_queue[0]
                 except BrokenExecutor:
                     if not in_progress:  # an idle process has ended
                         self._replace_executor()
                     break
-                queue.popleft()
+                task_queue.popleft()
             for future in wait(in_progress, _PRESENCE_CHECK_INTERVAL_S, FIRST_COMPLETED).done:
-                index = in_progress.pop(future)
+                task_index = in_progress.pop(future)
                 try:
-                    result = future.result()
+                    task_result = future.result()
                 except self._process_end_error:
-                    interrupted.append(index)
+                    interrupted_tasks.append(task_index)
                 else:
-                    store_result(index, result)
+                    store_result(task_index, task_result)
             last_seen_s = self._check_presence(last_seen_s)
-        return interrupted
+        return interrupted_tasks
 
     def _replace_executor(self, *, alone: bool = False) -> None:
-        """Replace the executor after a worker process ended; `alone` requests one process."""
+        """Replace the executor after a worker process ended.
+
+        `alone` states that the new executor shall have a single process.
+        """
 
     def _convert_errors(self) -> AbstractContextManager[None]:
         """Convert other errors that mean the loss of all workers to `CampaignError`."""
         return nullcontext()
 
     def _check_presence(self, last_seen_s: float) -> float:
-        """Return when workers were last present; raise if there have been none for too long."""
+        """Return the time in s at which workers were last present.
+
+        The time is that of `time.monotonic`. Raise `CampaignError` if there have been no workers
+        for too long.
+        """
         return last_seen_s
 
 
@@ -202,7 +217,9 @@ def process_pool(jobs: int) -> Iterator[Workers]:
     safely. They ignore Ctrl-C, which the caller handles, and end together with the caller. Tasks in
     progress are abandoned when an exception leaves the context.
     """
-    environment = {name: os.environ.get(name) for name in SINGLE_THREADED}
+    saved_environment = {
+        variable_name: os.environ.get(variable_name) for variable_name in SINGLE_THREADED
+    }
     use_one_thread()
     other_processes = set(multiprocessing.active_children())
     workers = _LocalWorkers(jobs)
@@ -215,11 +232,11 @@ def process_pool(jobs: int) -> Iterator[Workers]:
         raise
     finally:
         workers.close()
-        for name, value in environment.items():
-            if value is None:
-                os.environ.pop(name, None)
+        for variable_name, saved_value in saved_environment.items():
+            if saved_value is None:
+                os.environ.pop(variable_name, None)
             else:
-                os.environ[name] = value
+                os.environ[variable_name] = saved_value
 
 
 class _LocalWorkers(Workers):
@@ -236,7 +253,7 @@ class _LocalWorkers(Workers):
         self._most_in_progress = jobs
 
     def _replace_executor(self, *, alone: bool = False) -> None:
-        """Start a new pool after a worker process ended; `alone` requests one process."""
+        """Start a new pool after a worker process ended, with a single process if `alone`."""
         self.close()
         self._executor = _spawn_pool(1 if alone else self._most_in_progress)
 
@@ -255,12 +272,12 @@ def _spawn_pool(jobs: int | None) -> ProcessPoolExecutor:
 def _initialize_worker() -> None:
     """Make a worker process ignore Ctrl-C and end together with its parent process."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    parent = multiprocessing.parent_process()
+    parent_process = multiprocessing.parent_process()
 
     def end_with_parent() -> None:
         """End this process when its parent process ends."""
-        if parent is not None:
-            parent.join()
+        if parent_process is not None:
+            parent_process.join()
             os._exit(1)
 
     threading.Thread(target=end_with_parent, daemon=True).start()
@@ -301,7 +318,7 @@ def dask_cluster(address: str) -> Iterator[Workers]:
     with _suppress_dask_messages():
         try:
             _check_scheduler(address)
-            client = distributed.Client(
+            dask_client = distributed.Client(
                 address, timeout=_CONNECTION_TIMEOUT_S, set_as_default=False
             )
         except (OSError, ValueError) as error:
@@ -311,24 +328,24 @@ def dask_cluster(address: str) -> Iterator[Workers]:
                 "'dask scheduler' and its workers with 'dask worker ADDRESS', or leave --dask out."
             ) from error
         try:
-            _check_workers(client, address)
-            yield _DaskWorkers(client, address)
+            _check_workers(dask_client, address)
+            yield _DaskWorkers(dask_client, address)
         finally:
-            client.close()
+            dask_client.close()
 
 
 @contextmanager
 def _suppress_dask_messages() -> Iterator[None]:
     """Suppress Dask's own messages on failures and different versions, which are reported here."""
     log = logging.getLogger("distributed.client")
-    level = log.level
+    log_level = log.level
     log.setLevel(logging.CRITICAL)
     try:
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", message="(?s).*Mismatched versions")
             yield
     finally:
-        log.setLevel(level)
+        log.setLevel(log_level)
 
 
 def _check_scheduler(address: str) -> None:
@@ -336,10 +353,10 @@ def _check_scheduler(address: str) -> None:
 
     Dask's client would keep trying to connect even after it has reported its failure.
     """
-    location = address.rsplit("://", maxsplit=1)[-1]
+    host_and_port = address.rsplit("://", maxsplit=1)[-1]
     if "://" in address and not address.startswith(("tcp://", "tls://")):
         return
-    host, _, port = location.rpartition(":")
+    host, _, port = host_and_port.rpartition(":")
     if not (host and port.isdecimal()):
         raise ValueError("no host and port")
     socket.create_connection((host.strip("[]"), int(port)), _CONNECTION_TIMEOUT_S).close()
@@ -370,15 +387,19 @@ class _DaskWorkers(Workers):
         except CampaignError:
             raise
         except Exception as error:  # Dask raises many types if a scheduler is lost
-            expected = isinstance(
+            is_expected = isinstance(
                 error, CancelledError | _import_distributed().comm.CommClosedError
             )
-            if self._client.status == "running" and not expected:
+            if self._client.status == "running" and not is_expected:
                 raise
             raise CampaignError(self._cluster_lost_message("went away")) from error
 
     def _check_presence(self, last_seen_s: float) -> float:
-        """Return when workers were last present; raise if scheduler or workers are lost."""
+        """Return the time in s (`time.monotonic`) at which workers were last present.
+
+        Raise `CampaignError` if the scheduler is lost, or if there have been no workers for too
+        long.
+        """
         now = time.monotonic()
         if self._client.status != "running":
             raise CampaignError(self._cluster_lost_message("went away"))
@@ -409,9 +430,9 @@ def versions() -> dict[str, str]:
 
     import rigd
 
-    python = ".".join(platform.python_version_tuple()[:2])
+    python_version = ".".join(platform.python_version_tuple()[:2])
     return {
-        "rigd": rigd.__version__, "Python": python, "numpy": np.__version__,
+        "rigd": rigd.__version__, "Python": python_version, "numpy": np.__version__,
         "distributed": _import_distributed().__version__,
     }  # fmt: skip
 
@@ -425,9 +446,11 @@ def _check_workers(client: Any, address: str) -> None:  # noqa: ANN401 - Dask ha
             f"The Dask scheduler at {address} has no workers; start some with "
             f"'dask worker {address} --nthreads 1'."
         ) from error
-    answers: Mapping[str, dict[str, str] | Exception] = client.run(versions, on_error="return")
+    versions_by_worker: Mapping[str, dict[str, str] | Exception] = client.run(
+        versions, on_error="return"
+    )
     own_versions = versions()
-    for worker, worker_versions in answers.items():
+    for worker, worker_versions in versions_by_worker.items():
         if isinstance(worker_versions, ModuleNotFoundError):
             raise CampaignError(
                 f"The Dask worker at {worker} has no module {worker_versions.name}: install rigd "

@@ -45,7 +45,7 @@ DEFAULT_COMMAND: Final = "default"
 
 
 class DefaultCommandGroup(TyperGroup):
-    """Command group that runs a default command if the first argument is no command's name.
+    """Command group whose default command runs if the first argument names no command.
 
     Usage, help and errors of the default command are then those of a command without subcommands.
     """
@@ -293,7 +293,7 @@ def analyze(
             "--dask": dask is not None,
         }
         _check_campaign_options(
-            [option for option, is_given in campaign_options.items() if is_given], files
+            [option_name for option_name, is_given in campaign_options.items() if is_given], files
         )
     elif jobs is not None and dask is not None:
         raise typer.BadParameter(
@@ -314,7 +314,7 @@ def analyze(
     if method == "record":
         _check_record_method(context, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
-    routes = Routes(
+    run_routes = Routes(
         settings,
         paper=method != "record",
         whole_record=method != "welch",
@@ -323,99 +323,117 @@ def analyze(
         figures=_figure_formats(figures),
         uniformity=None if uniformity is None else _relative_uniformity(uniformity),
     )
-    outputs = Outputs(report, json, overwrite, verbose)
+    output_options = Outputs(report, json, overwrite, verbose)
     try:
-        if json is not None and not outputs.json_to_stdout:
+        if json is not None and not output_options.json_to_stdout:
             check_new_file(json, "--json", overwrite=overwrite)
         if rerun is not None:
             _check_rerun(rerun, files)
         if not is_campaign:
-            code = session_command(files, routes, outputs, rerun)
+            exit_code = session_command(files, run_routes, output_options, rerun)
         else:
             from analysis.campaigns import CampaignError, SingleSessionError
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
 
             try:
-                code = campaign_command(
-                    files, settings, outputs,
-                    structures=tuple(STRUCTURES) if routes.whole_record else (),
-                    fixed=routes.fixed, band_hz=routes.band_hz, jobs=jobs, dask=dask,
-                    uniformity=routes.uniformity, with_paper=paper, formats=routes.figures,
+                exit_code = campaign_command(
+                    files, settings, output_options,
+                    structures=tuple(STRUCTURES) if run_routes.whole_record else (),
+                    fixed=run_routes.fixed, band_hz=run_routes.band_hz, jobs=jobs, dask=dask,
+                    uniformity=run_routes.uniformity, with_paper=paper, formats=run_routes.figures,
                 )  # fmt: skip
             except SingleSessionError as single:
-                code = _report_single_session(single, routes, outputs)
+                exit_code = _report_single_session(single, run_routes, output_options)
             except CampaignError as error:
                 print_error(str(error))
-                code = 1
+                exit_code = 1
     except OutputExistsError as error:
         print_error(str(error))
-        code = 2
+        exit_code = 2
     except OutputError as error:
         print_error(str(error))
-        code = 1
+        exit_code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
-        code = _EXIT_INTERRUPTED
-    raise typer.Exit(code)
+        exit_code = _EXIT_INTERRUPTED
+    raise typer.Exit(exit_code)
 
 
-def _check_campaign_options(options: Sequence[str], files: Sequence[Path]) -> None:
-    """Raise a usage error if there are options that only concern campaigns."""
-    if not options:
+def _check_campaign_options(option_names: Sequence[str], files: Sequence[Path]) -> None:
+    """Raise a usage error if options are given that only concern campaigns."""
+    if not option_names:
         return
     if len(files) == 1:
-        reason = "only for campaigns (two or more sessions); omit it."
+        usage_reason = "only for campaigns (two or more sessions); omit it."
     else:
-        reason = "only for campaigns, so not with --each; omit one of the two."
-    raise typer.BadParameter(reason, param_hint=" and ".join(options))
+        usage_reason = "only for campaigns, so not with --each; omit one of the two."
+    raise typer.BadParameter(usage_reason, param_hint=" and ".join(option_names))
 
 
 def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:
-    """Raise a usage error for a campaign without Welch fits; warn of options without effect."""
+    """Check the options of an analysis by whole-record fits alone.
+
+    Raise a usage error for a campaign, which needs Welch fits. Otherwise print a warning if options
+    of the Welch fits are given, as these have no effect.
+    """
     if is_campaign:
         raise typer.BadParameter(
             "a campaign has the paper's Tables 3 to 5, so record alone is for single files; take "
             "--method all, or add --each.",
             param_hint="--method",
         )
-    sources = {name: context.get_parameter_source(name) for name in _WELCH_OPTIONS}
-    ineffective = [
-        f"--{name}"
-        for name, source in sources.items()
-        if source and source.name == _COMMAND_LINE_SOURCE
+    option_sources = {
+        option_name: context.get_parameter_source(option_name) for option_name in _WELCH_OPTIONS
+    }
+    ineffective_options = [
+        f"--{option_name}"
+        for option_name, option_source in option_sources.items()
+        if option_source and option_source.name == _COMMAND_LINE_SOURCE
     ]
-    if ineffective:
+    if ineffective_options:
         typer.echo(
-            f"Warning: {', '.join(ineffective)} "
-            f"{'concerns' if len(ineffective) == 1 else 'concern'} the Welch "
+            f"Warning: {', '.join(ineffective_options)} "
+            f"{'concerns' if len(ineffective_options) == 1 else 'concern'} the Welch "
             "fits alone, which --method record leaves out: the whole record is fitted by every "
             "type.",
             err=True,
         )
 
 
-def _report_single_session(single: SingleSessionError, routes: Routes, outputs: Outputs) -> int:
-    """Print the errors of the unusable files of a campaign, and report the only usable one."""
-    for failure in single.failures:
+def _report_single_session(
+    single_session_error: SingleSessionError, routes: Routes, outputs: Outputs
+) -> int:
+    """Print the errors of a campaign's unusable files, and report its only usable session."""
+    for failure in single_session_error.failures:
         print_error(failure.message)
-    typer.echo(f"A campaign needs two sessions: {single.path} is reported alone.", err=True)
-    others = {str(failure.path): failure.message for failure in single.failures}
-    return max(1, session_command([single.path], routes, outputs, others=others))
+    typer.echo(
+        f"A campaign needs two sessions: {single_session_error.path} is reported alone.", err=True
+    )
+    other_errors = {str(failure.path): failure.message for failure in single_session_error.failures}
+    return max(
+        1, session_command([single_session_error.path], routes, outputs, others=other_errors)
+    )
 
 
-def _fixed_parameters(text: str) -> tuple[Setting, ...]:
+def _fixed_parameters(option_text: str) -> tuple[Setting, ...]:
     """Return the parameters named in --fix; raise a usage error if one is unknown."""
     from analysis.identify import SETTINGS
 
-    names = [name.strip() for name in text.split(",") if name.strip()]
-    unknown = [name for name in names if name not in SETTINGS]
-    if unknown:
+    parameter_names = [
+        parameter_name.strip()
+        for parameter_name in option_text.split(",")
+        if parameter_name.strip()
+    ]
+    unknown_names = [
+        parameter_name for parameter_name in parameter_names if parameter_name not in SETTINGS
+    ]
+    if unknown_names:
         raise typer.BadParameter(
-            f"there is no {', '.join(unknown)}; choose from {', '.join(SETTINGS)}.",
+            f"there is no {', '.join(unknown_names)}; choose from {', '.join(SETTINGS)}.",
             param_hint="--fix",
         )
-    return tuple(name for name in SETTINGS if name in names)
+    return tuple(parameter_name for parameter_name in SETTINGS if parameter_name in parameter_names)
 
 
 def _relative_uniformity(uniformity_percent: float) -> float:
@@ -430,25 +448,30 @@ def _relative_uniformity(uniformity_percent: float) -> float:
     return uniformity_percent / 100
 
 
-def _figure_formats(text: str) -> tuple[FigureFormat, ...]:
+def _figure_formats(option_text: str) -> tuple[FigureFormat, ...]:
     """Return the figure formats named in --figures; raise a usage error if one is unknown."""
-    names = {name.strip().lower() for name in text.split(",") if name.strip()}
-    unknown = sorted(names.difference(FIGURE_FORMATS))
-    if unknown or not names:
+    format_names = {
+        format_name.strip().lower() for format_name in option_text.split(",") if format_name.strip()
+    }
+    unknown_formats = sorted(format_names.difference(FIGURE_FORMATS))
+    if unknown_formats or not format_names:
         raise typer.BadParameter(
-            f"there is no {', '.join(unknown) or 'format'}; choose from "
+            f"there is no {', '.join(unknown_formats) or 'format'}; choose from "
             f"{', '.join(FIGURE_FORMATS)}.",
             param_hint="--figures",
         )
-    return tuple(figure_format for figure_format in FIGURE_FORMATS if figure_format in names)
+    return tuple(figure_format for figure_format in FIGURE_FORMATS if figure_format in format_names)
 
 
-def _check_rerun(rerun: Path, files: Sequence[Path]) -> None:
-    """Raise a usage error if --rerun has several sessions; raise if its file is taken."""
+def _check_rerun(rerun_file: Path, files: Sequence[Path]) -> None:
+    """Raise a usage error if --rerun is given with several sessions.
+
+    Raise the error of `check_new_file` if its file already exists.
+    """
     from analysis.report import check_rerun_file
 
     if len(files) > 1:
         raise typer.BadParameter(
             f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
         )
-    check_rerun_file(rerun)
+    check_rerun_file(rerun_file)

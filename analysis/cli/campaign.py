@@ -87,33 +87,33 @@ def campaign_command(
     from analysis.report.folder import report_folders, write_new
 
     folder_source = files[0] if outputs.report is not None else files[0].with_name(_DEFAULT_NAME)
-    (folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
+    (report_folder,) = report_folders([folder_source], outputs.report, overwrite=outputs.overwrite)
     run = partial(
         campaign, files, settings, structures=structures, fixed=fixed, band_hz=band_hz, jobs=jobs,
         dask=dask, uniformity=uniformity,
     )  # fmt: skip
-    result = _analyse_and_write(
-        run, len(files), folder, outputs, with_paper=with_paper, formats=formats
+    campaign_result = _analyse_and_write(
+        run, len(files), report_folder, outputs, with_paper=with_paper, formats=formats
     )
-    lines = [f"Report of the campaign: {folder / 'report.html'}"]
+    text_lines = [f"Report of the campaign: {report_folder / 'report.html'}"]
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
-        text = document_text(campaign_document(result, with_paper=with_paper))
-        write_new(outputs.json, text, overwrite=outputs.overwrite)
-        lines.insert(0, f"All results as JSON: {outputs.json}")
+        json_text = document_text(campaign_document(campaign_result, with_paper=with_paper))
+        write_new(outputs.json, json_text, overwrite=outputs.overwrite)
+        text_lines.insert(0, f"All results as JSON: {outputs.json}")
     console = outputs.console()
-    console.print(campaign_tables(result, with_paper=with_paper, verbose=outputs.verbose))
-    console.print("\n".join(lines), markup=False, soft_wrap=True)
+    console.print(campaign_tables(campaign_result, with_paper=with_paper, verbose=outputs.verbose))
+    console.print("\n".join(text_lines), markup=False, soft_wrap=True)
     if outputs.json_to_stdout:
-        content = campaign_document(result, with_paper=with_paper)
-        print(document_text(content, ascii_only=True), end="")  # noqa: T201 - the requested output
-    return 1 if result.failures or result.lost_trials else 0
+        json_content = campaign_document(campaign_result, with_paper=with_paper)
+        print(document_text(json_content, ascii_only=True), end="")  # noqa: T201 - the requested output
+    return 1 if campaign_result.failures or campaign_result.lost_trials else 0
 
 
 def _analyse_and_write(
     run: Callable[..., CampaignResult],
-    files: int,
-    folder: Path,
+    file_count: int,
+    report_folder: Path,
     outputs: Outputs,
     *,
     with_paper: bool,
@@ -126,22 +126,26 @@ def _analyse_and_write(
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
-        bar = progress.add_task("starting", total=2 * files + _MOST_FIGURES)
+        bar = progress.add_task("starting", total=2 * file_count + _MOST_FIGURES)
 
-        def on_progress(done: int, total: int, name: str) -> None:
-            progress.update(bar, completed=done, total=total + _MOST_FIGURES, description=name)
+        def on_progress(done_steps: int, total_steps: int, file_name: str) -> None:
+            progress.update(
+                bar, completed=done_steps, total=total_steps + _MOST_FIGURES, description=file_name
+            )
 
-        with new_folder(folder, overwrite=outputs.overwrite) as partial_folder:
-            result = run(on_progress=on_progress)
-            if len(result.sessions) == 1:
-                raise SingleSessionError(result.sessions[0].path, result.failures)
+        with new_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:
+            campaign_result = run(on_progress=on_progress)
+            if len(campaign_result.sessions) == 1:
+                raise SingleSessionError(campaign_result.sessions[0].path, campaign_result.failures)
             write_campaign(
-                result, partial_folder, with_paper=with_paper, formats=formats,
-                on_step=lambda done: progress.update(bar, advance=1, description=done),
+                campaign_result, partial_folder, with_paper=with_paper, formats=formats,
+                on_step=lambda done_steps: progress.update(bar, advance=1, description=done_steps),
             )  # fmt: skip
     report_error = partial(print_readable, progress.console)
-    for failure in result.failures:
-        report_error(f"Error: {failure.message}")
-    for lost in result.lost_trials:
-        report_error(f"Error: {lost.path} is not predicted from the others: {lost.reason}")
-    return result
+    for session_failure in campaign_result.failures:
+        report_error(f"Error: {session_failure.message}")
+    for lost_trial in campaign_result.lost_trials:
+        report_error(
+            f"Error: {lost_trial.path} is not predicted from the others: {lost_trial.reason}"
+        )
+    return campaign_result

@@ -67,8 +67,8 @@ _Binary = Annotated[
 
 def _channel_option(help_text: str) -> OptionInfo:
     """Return an option that takes a channel and its unit, with a help text."""
-    option: OptionInfo = typer.Option(metavar="CHANNEL:UNIT", help=help_text)
-    return option
+    channel_option: OptionInfo = typer.Option(metavar="CHANNEL:UNIT", help=help_text)
+    return channel_option
 
 
 def import_command(
@@ -183,29 +183,29 @@ def import_command(
         "ty_nm": ("--ty", ty),
         "tz_nm": ("--tz", tz),
     }
-    channels = {
-        field: _parse_channel(option, text, QUANTITIES[field])
-        for field, (option, text) in options.items()
-        if text is not None
+    channel_choices = {
+        field_name: _parse_channel(option, option_text, QUANTITIES[field_name])
+        for field_name, (option, option_text) in options.items()
+        if option_text is not None
     }
-    times = None if time is None else _parse_channel("--time", time, "time")
-    segments = {
-        name: _parse_interval(option, text)
-        for name, option, text in (
+    time_choice = None if time is None else _parse_channel("--time", time, "time")
+    segments_s = {
+        name: _parse_interval(option, option_text)
+        for name, option, option_text in (
             ("rest", "--rest", rest),
             ("sweep", "--sweep", sweep),
             ("ring_down", "--ring-down", ring_down),
         )
-        if text is not None
+        if option_text is not None
     }
 
     def run() -> None:
-        plan = ImportPlan(
-            channels,
+        import_plan = ImportPlan(
+            channel_choices,
             read_specimen(profile),
-            times,
+            time_choice,
             rate_hz,
-            segments,
+            segments_s,
             angle_delay_s,
             torque_delay_s,
             reverse_torque,
@@ -214,12 +214,17 @@ def import_command(
             operator,
             ignore_file_metadata,
         )
-        imported = import_record(source, session, plan)
-        for warning in imported.warnings:
-            typer.echo(f"Warning: {warning}", err=True)
+        imported_record = import_record(source, session, import_plan)
+        for warning_text in imported_record.warnings:
+            typer.echo(f"Warning: {warning_text}", err=True)
         typer.echo(
-            f"{imported.samples} samples at {imported.rate_hz:g} Hz from {source}: {session}"
-            + ("" if "sweep" in imported.segments else "; the whole record counts as the sweep")
+            f"{imported_record.samples} samples at {imported_record.rate_hz:g} Hz from {source}: "
+            f"{session}"
+            + (
+                ""
+                if "sweep" in imported_record.segments
+                else "; the whole record counts as the sweep"
+            )
         )
 
     raise typer.Exit(_exit_code(run))
@@ -234,8 +239,8 @@ def export_record_command(session: _Session, target: _Target, binary: _Binary = 
     from analysis.exchange import export_record
 
     def run() -> None:
-        table = export_record(session, target, binary=binary)
-        typer.echo(f"{len(table.axis.values)} samples of {session}: {target}")
+        export_table = export_record(session, target, binary=binary)
+        typer.echo(f"{len(export_table.axis.values)} samples of {session}: {target}")
 
     raise typer.Exit(_exit_code(run))
 
@@ -257,12 +262,14 @@ def export_frf_command(
     """
     from analysis.exchange import export_frf
 
-    settings = welch_settings("I", "const", frf, segment, overlap, nfft)
-    requested_hz = band_hz(band)
+    estimate_settings = welch_settings("I", "const", frf, segment, overlap, nfft)
+    requested_band_hz = band_hz(band)
 
     def run() -> None:
-        table = export_frf(session, target, settings, requested_hz, binary=binary)
-        typer.echo(f"{len(table.axis.values)} frequencies of {session}: {target}")
+        export_table = export_frf(
+            session, target, estimate_settings, requested_band_hz, binary=binary
+        )
+        typer.echo(f"{len(export_table.axis.values)} frequencies of {session}: {target}")
 
     raise typer.Exit(_exit_code(run))
 
@@ -317,7 +324,7 @@ def export_model_command(
     from analysis.linear_model import DEFAULT_SAMPLES, INPUT_KINDS, ModelOptions
     from rigd.printable import progress_bar
 
-    options = ModelOptions(
+    model_options = ModelOptions(
         beam,
         parse_option_choice(input_kind, INPUT_KINDS, "--input"),
         _parse_order(order),
@@ -326,77 +333,89 @@ def export_model_command(
     )
 
     def run() -> None:
-        with progress_bar() as progress:
-            task = progress.add_task("", total=None)
-            model = export_model(
+        with progress_bar() as step_progress:
+            progress_task = step_progress.add_task("", total=None)
+            linear_model = export_model(
                 source,
                 target,
-                options,
-                lambda step: progress.update(task, description=f"{source.name}: {step}"),
+                model_options,
+                lambda step: step_progress.update(
+                    progress_task, description=f"{source.name}: {step}"
+                ),
             )
-        for line in _model_lines(model, source, target):
-            typer.echo(line)
+        for summary_line in _model_lines(linear_model, source, target):
+            typer.echo(summary_line)
 
     raise typer.Exit(_exit_code(run))
 
 
 def _model_lines(model: LinearModel, source: Path, target: Path) -> list[str]:
     """Return the printed summary of an exported model, one statement per line."""
-    system, accuracy = model.system, model.accuracy
-    status, p_value = model.identified.gate
-    uniformity_text = status if p_value is None else f"{status}, p = {p_value:.2g}"
-    name = "exact beam" if model.kind == "beam" else "modal model"
-    relaxations = sum(name.startswith("relaxation") for name in system.states.names)
+    state_space, accuracy = model.system, model.accuracy
+    test_status, p_value = model.identified.gate
+    uniformity_text = test_status if p_value is None else f"{test_status}, p = {p_value:.2g}"
+    model_name = "exact beam" if model.kind == "beam" else "modal model"
+    relaxation_count = sum(
+        model_name.startswith("relaxation") for model_name in state_space.states.names
+    )
     time_text = "continuous time"
-    if system.period_s:
-        time_text = f"{1 / system.period_s:g} Hz, input held between samples"
+    if state_space.period_s:
+        time_text = f"{1 / state_space.period_s:g} Hz, input held between samples"
     low_hz, high_hz = accuracy.band_hz
-    band = f"{low_hz:g} to {high_hz:g} Hz"
-    inputs = ", ".join(map("{} ({})".format, system.inputs.names, system.inputs.units))
-    lines = [
-        f"Model: {name} of {source} (uniform beam: {uniformity_text}): {target}",
-        f"Order: {system.order} states ({model.structure.pairs} pairs of poles, {relaxations} real "
-        f"poles); {time_text}",
-        f"Input: {inputs}",
-        f"Output: coupling_torque (N.m), delayed by {1e3 * system.delay_s:.4g} ms; the delay is "
-        "not in the matrices",
+    band_text = f"{low_hz:g} to {high_hz:g} Hz"
+    inputs_text = ", ".join(
+        map("{} ({})".format, state_space.inputs.names, state_space.inputs.units)
+    )
+    text_lines = [
+        f"Model: {model_name} of {source} (uniform beam: {uniformity_text}): {target}",
+        f"Order: {state_space.order} states ({model.structure.pairs} pairs of poles, "
+        f"{relaxation_count} real poles); {time_text}",
+        f"Input: {inputs_text}",
+        f"Output: coupling_torque (N.m), delayed by {1e3 * state_space.delay_s:.4g} ms; the delay "
+        "is not in the matrices",
         f"Error: at most {accuracy.error_max:.1e} of the response, median "
-        f"{accuracy.error_median:.1e}, {band}",
+        f"{accuracy.error_median:.1e}, {band_text}",
     ]
     if math.isnan(accuracy.std_max):
-        lines.append("Data: the standard deviation is not known without a covariance")
+        text_lines.append("Data: the standard deviation is not known without a covariance")
     else:
-        lines.append(
+        text_lines.append(
             f"Data: standard deviation at most {accuracy.std_max:.1e} of the response, median "
-            f"{accuracy.std_median:.1e}, {band}"
+            f"{accuracy.std_median:.1e}, {band_text}"
         )
-    lines.append(f"Samples: {len(model.posterior.systems)} of the posterior, with the same states")
-    return [*lines, *(f"Note: {note}" for note in model.notes)]
+    text_lines.append(
+        f"Samples: {len(model.posterior.systems)} of the posterior, with the same states"
+    )
+    return [*text_lines, *(f"Note: {note_text}" for note_text in model.notes)]
 
 
-def _parse_order(text: str) -> int | None:
+def _parse_order(option_text: str) -> int | None:
     """Return the number of states in --order, or None for auto; raise if invalid."""
-    if text == "auto":
+    if option_text == "auto":
         return None
-    if not (text.isascii() and text.isdecimal() and 1 <= int(text[:6]) <= _MOST_STATES):
+    if not (
+        option_text.isascii()
+        and option_text.isdecimal()
+        and 1 <= int(option_text[:6]) <= _MOST_STATES
+    ):
         raise typer.BadParameter(
-            f"'{text}' is neither auto nor a number of states from 1 to {_MOST_STATES}.",
+            f"'{option_text}' is neither auto nor a number of states from 1 to {_MOST_STATES}.",
             param_hint="--order",
         )
-    return int(text)
+    return int(option_text)
 
 
-def _parse_rate(text: str) -> float | None:
+def _parse_rate(option_text: str) -> float | None:
     """Return the rate in Hz in --rate, or None for continuous; raise if invalid."""
-    if text == "continuous":
+    if option_text == "continuous":
         return None
     try:
-        rate_hz = float(text)
+        rate_hz = float(option_text)
     except ValueError:
         rate_hz = math.nan
     if not _RATE_RANGE_HZ[0] <= rate_hz <= _RATE_RANGE_HZ[1]:
         raise typer.BadParameter(
-            f"'{text}' is neither continuous nor a rate from {_RATE_RANGE_HZ[0]:g} to "
+            f"'{option_text}' is neither continuous nor a rate from {_RATE_RANGE_HZ[0]:g} to "
             f"{_RATE_RANGE_HZ[1]:g} Hz.",
             param_hint="--rate",
         )
@@ -409,8 +428,8 @@ _RATE_RANGE_HZ: Final = (1.0, 1e6)
 """Range of sampling rates in Hz that --rate accepts."""
 
 
-def _exit_code(run: Callable[[], None]) -> int:
-    """Run a function and return the exit code; print an error in one or two sentences."""
+def _exit_code(run_command: Callable[[], None]) -> int:
+    """Run a command's function, print its error if it raises one, and return the exit code."""
     from numpy.linalg import LinAlgError
 
     from analysis.exchange import ExchangeError, TargetError
@@ -423,7 +442,7 @@ def _exit_code(run: Callable[[], None]) -> int:
     from rigd.session import SessionError, SessionExistsError
 
     try:
-        run()
+        run_command()
     except (SettingsError, TargetError, OutputExistsError, SessionExistsError) as error:
         print_error(str(error))
         return 2
@@ -442,12 +461,12 @@ def _exit_code(run: Callable[[], None]) -> int:
     return 0
 
 
-def _parse_channel(option: str, text: str, quantity: str) -> ChannelChoice:
+def _parse_channel(option: str, option_text: str, quantity: str) -> ChannelChoice:
     """Return the channel and unit of an option; raise a usage error for an invalid text."""
     from analysis.exchange import ExchangeError, parse_choice
 
     try:
-        return parse_choice(text, quantity)
+        return parse_choice(option_text, quantity)
     except ExchangeError as error:
         raise typer.BadParameter(str(error), param_hint=option) from error
 
@@ -456,15 +475,15 @@ _LATEST_END_S: Final = 1e6
 """Latest end of a segment in seconds, more than the duration of any record that is read."""
 
 
-def _parse_interval(option: str, text: str) -> tuple[float, float]:
+def _parse_interval(option: str, option_text: str) -> tuple[float, float]:
     """Return begin and end of a segment in seconds, from an option; raise if invalid."""
     try:
-        begin_s, end_s = (float(number_text) for number_text in text.split(","))
+        begin_s, end_s = (float(number_text) for number_text in option_text.split(","))
     except ValueError:
         begin_s = end_s = math.nan
     if not 0.0 <= begin_s < end_s <= _LATEST_END_S:
         raise typer.BadParameter(
-            f"'{text}' is not two times in s with 0 <= T0 < T1 <= 1e6, such as 1,121.",
+            f"'{option_text}' is not two times in s with 0 <= T0 < T1 <= 1e6, such as 1,121.",
             param_hint=option,
         )
     return begin_s, end_s

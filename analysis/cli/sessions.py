@@ -82,8 +82,10 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
         if not path.is_dir():
             session_paths.append(path)
             continue
-        sessions = sorted(file for file in path.glob("*.mcap") if file.is_file())
-        if not sessions:
+        folder_sessions = sorted(
+            session_file for session_file in path.glob("*.mcap") if session_file.is_file()
+        )
+        if not folder_sessions:
             any_incomplete = any(path.glob("*.mcap.part"))
             raise NoSessionsError(
                 f"{path}: there is no session (*.mcap) in this folder; give session files, or the "
@@ -94,7 +96,7 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
                     else ""
                 )
             )
-        session_paths += sessions
+        session_paths += folder_sessions
     return session_paths
 
 
@@ -135,40 +137,45 @@ def session_command(
     from analysis.report.folder import report_folders, write_new
 
     folders = report_folders(files, outputs.report, overwrite=outputs.overwrite)
-    record_results, errors, code = _analyse_all(files, folders, routes, rerun, outputs)
+    record_results, errors, exit_code = _analyse_all(files, folders, routes, rerun, outputs)
     if not record_results:
-        return code
-    results = document(record_results, {**(others or {}), **errors})
+        return exit_code
+    results_document = document(record_results, {**(others or {}), **errors})
     if outputs.json is not None and not outputs.json_to_stdout:
         # The file is written before any output, because the streams may be closed.
-        write_new(outputs.json, document_text(results), overwrite=outputs.overwrite)
+        write_new(outputs.json, document_text(results_document), overwrite=outputs.overwrite)
     console = outputs.console()
     _print_tables(console, record_results, single=len(files) == 1, verbose=outputs.verbose)
     if outputs.json_to_stdout:
-        typer.echo(document_text(results, ascii_only=True), nl=False)
+        typer.echo(document_text(results_document, ascii_only=True), nl=False)
     elif outputs.json is not None:
         _print_plain(console, f"All results as JSON: {outputs.json}")
     if rerun is not None:
         _print_plain(console, f"Session and fits for Rerun: {rerun} (rigd replay {rerun})")
-    for file, folder in zip(files, folders, strict=True):
-        if str(file) not in errors:
-            page = folder / "report.html"
-            _print_plain(console, f"Report of {file}: {page if page.exists() else folder}")
-    return code
+    for session_file, folder in zip(files, folders, strict=True):
+        if str(session_file) not in errors:
+            report_page = folder / "report.html"
+            _print_plain(
+                console,
+                f"Report of {session_file}: {report_page if report_page.exists() else folder}",
+            )
+    return exit_code
 
 
 def _print_tables(
-    console: Console, results: Sequence[RecordResult], *, single: bool, verbose: bool
+    console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
     from analysis.report import result_text, summary_table
 
-    by_welch = [result for result in results if result.welch is not None]
-    if single or not by_welch:
-        for result in results:
-            console.print(result_text(result, verbose=verbose))
+    welch_results = [
+        record_result for record_result in record_results if record_result.welch is not None
+    ]
+    if single or not welch_results:
+        for record_result in record_results:
+            console.print(result_text(record_result, verbose=verbose))
     else:
-        console.print(summary_table(by_welch))
+        console.print(summary_table(welch_results))
         console.print("")
 
 
@@ -176,7 +183,7 @@ def _analyse_all(
     files: Sequence[Path],
     folders: Sequence[Path],
     routes: Routes,
-    rerun: Path | None,
+    rerun_file: Path | None,
     outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
     """Analyse and report each file; return results, error messages by file, and exit code."""
@@ -189,26 +196,30 @@ def _analyse_all(
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    results: list[RecordResult] = []
-    errors: dict[str, str] = {}
-    code = 0
-    with progress_bar() as progress:
-        print_message = partial(print_readable, progress.console)
-        steps = _count_steps(routes, rerun)
-        task = progress.add_task("", total=len(files) * steps)
-        for number, (file, folder) in enumerate(zip(files, folders, strict=True), start=1):
+    record_results: list[RecordResult] = []
+    error_messages: dict[str, str] = {}
+    exit_code = 0
+    with progress_bar() as file_progress:
+        print_message = partial(print_readable, file_progress.console)
+        step_count = _count_steps(routes, rerun_file)
+        progress_task = file_progress.add_task("", total=len(files) * step_count)
+        for file_number, (session_file, report_folder) in enumerate(
+            zip(files, folders, strict=True), start=1
+        ):
 
-            def on_step(done: str, name: str = file.name) -> None:
-                weight = _STEPS_PER_FIGURE if done.startswith("figure") else 1
-                progress.update(task, advance=weight, description=f"{name}: {done}")
+            def on_step(done: str, name: str = session_file.name) -> None:
+                step_weight = _STEPS_PER_FIGURE if done.startswith("figure") else 1
+                file_progress.update(
+                    progress_task, advance=step_weight, description=f"{name}: {done}"
+                )
 
             try:
-                results.append(
+                record_results.append(
                     _analyse_file(
-                        file,
-                        folder,
+                        session_file,
+                        report_folder,
                         routes,
-                        rerun,
+                        rerun_file,
                         on_step,
                         print_message,
                         overwrite=outputs.overwrite,
@@ -218,42 +229,44 @@ def _analyse_all(
                 SessionError, RecordError, FrequencyResponseError, MeasurementError, OutputError,
                 MemoryError, LinAlgError,
             ) as error:  # fmt: skip
-                code = max(code, 2 if isinstance(error, SettingsError) else 1)
-                errors[str(file)] = message = _error_message(file, error)
-                progress.update(task, completed=number * steps)
-                print_message(f"Error: {message}")
-    return results, errors, code
+                exit_code = max(exit_code, 2 if isinstance(error, SettingsError) else 1)
+                error_messages[str(session_file)] = error_text = _error_message(session_file, error)
+                file_progress.update(progress_task, completed=file_number * step_count)
+                print_message(f"Error: {error_text}")
+    return record_results, error_messages, exit_code
 
 
-def _error_message(file: Path, error: Exception) -> str:
+def _error_message(session_file: Path, error: Exception) -> str:
     """Return the message that is printed for an error in the analysis of a file."""
     from numpy.linalg import LinAlgError
 
     if isinstance(error, MemoryError):
-        return f"{file}: not enough memory to analyse it; close other programs."
+        return f"{session_file}: not enough memory to analyse it; close other programs."
     if isinstance(error, LinAlgError):
-        return f"{file}: the estimate failed ({error}); is this a record of the rig?"
+        return f"{session_file}: the estimate failed ({error}); is this a record of the rig?"
     return str(error)
 
 
-def _count_steps(routes: Routes, rerun: Path | None) -> int:
+def _count_steps(routes: Routes, rerun_file: Path | None) -> int:
     """Return the number of progress steps of the analysis of one file."""
     from analysis.report import FIGURES as RECORD_FIGURES
     from analysis.report.record_report import welch_figure_names
 
-    figures = welch_figure_names(
+    figure_names = welch_figure_names(
         with_paper_figures=routes.paper, has_whole_record=routes.whole_record
     )
-    figure_count = len(figures) + routes.whole_record * len(RECORD_FIGURES) + (rerun is not None)
-    steps = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
-    return steps + _STEPS_PER_FIGURE * figure_count
+    figure_count = (
+        len(figure_names) + routes.whole_record * len(RECORD_FIGURES) + (rerun_file is not None)
+    )
+    step_count = 1 + routes.whole_record + routes.paper * (1 + len(routes.settings.types))
+    return step_count + _STEPS_PER_FIGURE * figure_count
 
 
 def _analyse_file(
-    file: Path,
-    folder: Path,
+    session_file: Path,
+    report_folder: Path,
     routes: Routes,
-    rerun: Path | None,
+    rerun_file: Path | None,
     on_step: Callable[[str], None],
     print_message: Callable[[str], None],
     *,
@@ -264,18 +277,18 @@ def _analyse_file(
     from analysis.report.record_report import write_report
     from analysis.results import record_result
 
-    result = record_result(
-        file, routes, on_step=on_step,
-        warn=lambda text: print_message(f"Warning: {text}"),
+    file_result = record_result(
+        session_file, routes, on_step=on_step,
+        warn=lambda warning_text: print_message(f"Warning: {warning_text}"),
     )  # fmt: skip
-    with new_folder(folder, overwrite=overwrite) as partial_folder:
-        write_report(result, partial_folder, on_step, formats=routes.figures)
-    if rerun is not None:
+    with new_folder(report_folder, overwrite=overwrite) as partial_folder:
+        write_report(file_result, partial_folder, on_step, formats=routes.figures)
+    if rerun_file is not None:
         from analysis.report import write_rerun_file
 
-        write_rerun_file(result, rerun)
+        write_rerun_file(file_result, rerun_file)
         on_step("figure for Rerun")
-    return result
+    return file_result
 
 
 def _print_plain(console: Console, text: str) -> None:

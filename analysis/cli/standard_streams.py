@@ -61,14 +61,14 @@ def standard_streams() -> Iterator[None]:
     A character that the stream's encoding lacks becomes a question mark. If a stream cannot be
     written, as on a full disk, the process ends with exit code 1.
     """
-    for name in _STREAM_NAMES:
-        stream = getattr(sys, name)
+    for stream_name in _STREAM_NAMES:
+        stream = getattr(sys, stream_name)
         if not isinstance(stream, io.TextIOWrapper):  # closed, or replaced by a test
             continue
         stream.reconfigure(errors="replace")
         # A terminal cannot lose its reader, and it is not just a file on Windows.
         if not stream.isatty():
-            setattr(sys, name, _pipe_tolerant_stream(stream))
+            setattr(sys, stream_name, _pipe_tolerant_stream(stream))
     try:
         try:
             yield
@@ -79,8 +79,8 @@ def standard_streams() -> Iterator[None]:
             sys.stderr.write(f"Error: the output cannot be written ({error.strerror}).\n")
             sys.stderr.flush()
         # Python would try to write the buffered text again, and print an error.
-        for number in (1, 2):
-            os.dup2(os.open(os.devnull, os.O_WRONLY), number)
+        for descriptor_number in (1, 2):
+            os.dup2(os.open(os.devnull, os.O_WRONLY), descriptor_number)
         sys.exit(_EXIT_FAILED)
 
 
@@ -99,7 +99,7 @@ def _pipe_tolerant_stream(stream: io.TextIOWrapper) -> io.TextIOWrapper:
 
 def _flush_streams() -> None:
     """Write the buffered text of both standard streams."""
-    for name in _STREAM_NAMES:
-        stream = getattr(sys, name)
+    for stream_name in _STREAM_NAMES:
+        stream = getattr(sys, stream_name)
         if stream is not None:
             stream.flush()

@@ -60,27 +60,27 @@ def touch_command(
     )
     from rigd.identified_beam import IdentifiedBeamError
 
-    outputs = Outputs(report, json)
+    output_options = Outputs(report, json)
     try:
         files = session_files(files)
-        if json is not None and not outputs.json_to_stdout:
+        if json is not None and not output_options.json_to_stdout:
             check_new_file(json, "--json")
         if report is not None:
             report_folders(files[:1], report)
-        code = _run_analysis(files, model, outputs)
+        exit_code = _run_analysis(files, model, output_options)
     except (OutputExistsError, IdentifiedBeamError) as error:
         print_error(str(error))
-        code = 2
+        exit_code = 2
     except (NoSessionsError, OutputError) as error:
         print_error(str(error))
-        code = 1
+        exit_code = 1
     except KeyboardInterrupt:
         typer.echo("Stopped.", err=True)
-        code = 130
-    raise typer.Exit(code)
+        exit_code = 130
+    raise typer.Exit(exit_code)
 
 
-def _run_analysis(files: Sequence[Path], model: Path | None, outputs: Outputs) -> int:
+def _run_analysis(files: Sequence[Path], model_file: Path | None, outputs: Outputs) -> int:
     """Analyse the files, print and write the results, and return the exit code."""
     from analysis.report import document_text
     from analysis.report.folder import new_folder, write_new
@@ -92,30 +92,30 @@ def _run_analysis(files: Sequence[Path], model: Path | None, outputs: Outputs) -
         write_touch_report,
     )
 
-    sessions, errors = _analyse_sessions(files, model)
-    document = touches_document(sessions, errors)
+    touched_sessions, error_messages = _analyse_sessions(files, model_file)
+    json_document = touches_document(touched_sessions, error_messages)
     if outputs.json is not None and not outputs.json_to_stdout:
-        write_new(outputs.json, document_text(document))
-    if outputs.report is not None and sessions:
+        write_new(outputs.json, document_text(json_document))
+    if outputs.report is not None and touched_sessions:
         with new_folder(outputs.report) as partial_folder:
-            write_touch_report(sessions, errors, partial_folder)
+            write_touch_report(touched_sessions, error_messages, partial_folder)
     console = outputs.console()
     print_plain = partial(console.print, markup=False, highlight=False, soft_wrap=True)
-    for session in sessions:
-        for line in session_lines(session):
-            print_plain(line)
-    if any(session.touches for session in sessions):
+    for touched_session in touched_sessions:
+        for table_line in session_lines(touched_session):
+            print_plain(table_line)
+    if any(touched_session.touches for touched_session in touched_sessions):
         print_plain("")
-        console.print(terminal_table(touches_table(sessions)))
+        console.print(terminal_table(touches_table(touched_sessions)))
     if outputs.json_to_stdout:
-        typer.echo(document_text(document, ascii_only=True), nl=False)
-    if outputs.report is not None and sessions:
+        typer.echo(document_text(json_document, ascii_only=True), nl=False)
+    if outputs.report is not None and touched_sessions:
         print_plain(f"Report: {outputs.report / 'report.html'}")
-    return 1 if errors else 0
+    return 1 if error_messages else 0
 
 
 def _analyse_sessions(
-    files: Sequence[Path], model: Path | None
+    files: Sequence[Path], model_file: Path | None
 ) -> tuple[list[TouchedSession], dict[str, str]]:
     """Analyse the touches in each file; return the results, and error messages by file."""
     from analysis.record import RecordError
@@ -123,21 +123,23 @@ def _analyse_sessions(
     from rigd.printable import progress_bar
     from rigd.session import SessionError
 
-    sessions: list[TouchedSession] = []
-    errors: dict[str, str] = {}
-    analysis = TouchAnalysis(model)
-    with progress_bar() as progress:
-        task = progress.add_task("", total=len(files))
-        for number, file in enumerate(files):
+    touched_sessions: list[TouchedSession] = []
+    error_messages: dict[str, str] = {}
+    touch_analysis = TouchAnalysis(model_file)
+    with progress_bar() as file_progress:
+        progress_task = file_progress.add_task("", total=len(files))
+        for file_number, session_file in enumerate(files):
 
-            def on_step(step: str, name: str = file.name) -> None:
-                progress.update(task, description=f"{name}: {step}")
+            def on_step(step: str, name: str = session_file.name) -> None:
+                file_progress.update(progress_task, description=f"{name}: {step}")
 
             try:
-                sessions.append(analysis.session(file, on_step))
+                touched_sessions.append(touch_analysis.session(session_file, on_step))
             except (SessionError, RecordError, MemoryError) as error:
-                message = str(error) or f"{file}: not enough memory; close other programs."
-                errors[str(file)] = message
-                print_readable(progress.console, f"Error: {message}")
-            progress.update(task, completed=number + 1)
-    return sessions, errors
+                error_text = (
+                    str(error) or f"{session_file}: not enough memory; close other programs."
+                )
+                error_messages[str(session_file)] = error_text
+                print_readable(file_progress.console, f"Error: {error_text}")
+            file_progress.update(progress_task, completed=file_number + 1)
+    return touched_sessions, error_messages

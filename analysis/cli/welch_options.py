@@ -95,62 +95,70 @@ def welch_settings(
     )
 
 
-def parse_option_choice(text: str, choices: Sequence[_ChoiceName], option: str) -> _ChoiceName:
+def parse_option_choice(
+    option_text: str, choices: Sequence[_ChoiceName], option_name: str
+) -> _ChoiceName:
     """Return the choice that a text names, ignoring case; raise a usage error for others."""
     for candidate in choices:
-        if candidate == text.lower():
+        if candidate == option_text.lower():
             return candidate
     raise typer.BadParameter(
-        f"there is no '{text}'; choose from {', '.join(choices)}.", param_hint=option
+        f"there is no '{option_text}'; choose from {', '.join(choices)}.", param_hint=option_name
     )
 
 
-def band_hz(text: str | None) -> tuple[float, float] | None:
+def band_hz(option_text: str | None) -> tuple[float, float] | None:
     """Return the band in Hz stated by --band, or None without it; raise if invalid."""
-    if text is None:
+    if option_text is None:
         return None
     try:
-        first_hz, last_hz = (float(frequency_text) for frequency_text in text.split(","))
+        first_hz, last_hz = (float(frequency_text) for frequency_text in option_text.split(","))
     except ValueError:
         first_hz = last_hz = math.nan
     if not 0.0 <= first_hz < last_hz < math.inf:
         raise typer.BadParameter(
-            f"'{text}' is not two frequencies in Hz with 0 <= F0 < F1, such as 0.5875,50.",
+            f"'{option_text}' is not two frequencies in Hz with 0 <= F0 < F1, such as 0.5875,50.",
             param_hint="--band",
         )
     return first_hz, last_hz
 
 
-def _parse_types(text: str) -> tuple[str, ...]:
+def _parse_types(option_text: str) -> tuple[str, ...]:
     """Return the model types named in --types; raise a usage error if one is unknown."""
     from analysis.models import STRUCTURES
 
-    names = _split_list(text.upper())
-    unknown = [name for name in names if name not in STRUCTURES]
-    if unknown or not names:
+    type_names = _split_list(option_text.upper())
+    unknown_types = [type_name for type_name in type_names if type_name not in STRUCTURES]
+    if unknown_types or not type_names:
         raise typer.BadParameter(
-            f"there is no model type '{(unknown or [text])[0]}'; "
+            f"there is no model type '{(unknown_types or [option_text])[0]}'; "
             f"choose from {', '.join(STRUCTURES)}.",
             param_hint="--types",
         )
-    return names
+    return type_names
 
 
-def _parse_weightings(text: str) -> tuple[str, ...]:
+def _parse_weightings(option_text: str) -> tuple[str, ...]:
     """Return the weightings named in --weights; raise a usage error if one is unknown."""
     from analysis.models import WeightingError, weighting_name
 
     try:
-        names = tuple(weighting_name(name) for name in _split_list(text))
+        weighting_names = tuple(
+            weighting_name(listed_name) for listed_name in _split_list(option_text)
+        )
     except WeightingError as error:
         raise typer.BadParameter(str(error), param_hint="--weights") from error
-    if not names:
+    if not weighting_names:
         raise typer.BadParameter(
             "no weighting was named; choose from const, omega, omega^K.", param_hint="--weights"
         )
-    return names
+    return weighting_names
 
 
-def _split_list(text: str) -> tuple[str, ...]:
-    """Return the names in a comma-separated list, each once, in their order."""
-    return tuple(dict.fromkeys(entry.strip() for entry in text.split(",") if entry.strip()))
+def _split_list(list_text: str) -> tuple[str, ...]:
+    """Return the different names in a comma-separated list, in their order."""
+    return tuple(
+        dict.fromkeys(
+            list_entry.strip() for list_entry in list_text.split(",") if list_entry.strip()
+        )
+    )

@@ -72,19 +72,19 @@ _BRACKETS_PATTERN: Final = re.compile(r"[\[(]([^\[\]()]*)[\])]\s*$")
 """Pattern of a text in brackets at the end of a name."""
 
 
-def canonical_unit(text: str) -> str | None:
+def canonical_unit(unit_text: str) -> str | None:
     """Return a unit as spelled in `UNIT_SIZES`, or None if it is unknown.
 
     ``Nm``, ``N·m`` and ``N*m`` become ``N.m``, words such as ``degrees`` and ``msec`` their units.
     The case of letters matters: ``mN.m`` is a thousandth of a newton metre, and ``nm`` is no
     torque.
     """
-    spelling = _plain_spelling(text)
-    return _UNITS_BY_SPELLING.get(spelling) or _UNITS_BY_WORD.get(spelling.lower())
+    plain_spelling = _plain_spelling(unit_text)
+    return _UNITS_BY_SPELLING.get(plain_spelling) or _UNITS_BY_WORD.get(plain_spelling.lower())
 
 
 def unit_factor(quantity: str, unit: str) -> float:
-    """Return the size of a unit in rad, N·m, N or s.
+    """Return the size of a unit of a quantity in the base unit: rad, N·m, N or s.
 
     Parameters
     ----------
@@ -99,47 +99,51 @@ def unit_factor(quantity: str, unit: str) -> float:
     ExchangeError
         If it is no unit of that quantity, or if the number is not finite or is 0.
     """
-    size, name = _split_number(unit)
-    known_unit = canonical_unit(name)
+    unit_count, unit_name = _split_number(unit)
+    canonical_name = canonical_unit(unit_name)
     if (
-        known_unit is None
-        or known_unit not in UNIT_SIZES[quantity]
-        or not math.isfinite(size)
-        or size == 0.0
+        canonical_name is None
+        or canonical_name not in UNIT_SIZES[quantity]
+        or not math.isfinite(unit_count)
+        or unit_count == 0.0
     ):
-        base = next(iter(UNIT_SIZES[quantity]))
+        base_unit = next(iter(UNIT_SIZES[quantity]))
         raise ExchangeError(
             f"'{unit}' is not a unit of {quantity} that is known here; choose from "
             f"{', '.join(UNIT_SIZES[quantity])}. Of a signal in volts, counts or the like, state "
             "what "
-            f"one of them stands for, as a number and a unit: CHANNEL:0.02 {base}."
+            f"one of them stands for, as a number and a unit: CHANNEL:0.02 {base_unit}."
         )
-    return size * UNIT_SIZES[quantity][known_unit]
+    return unit_count * UNIT_SIZES[quantity][canonical_name]
 
 
 def stated_unit(unit: str) -> str:
     """Return a unit as spelled in `UNIT_SIZES`, with its number unless this is 1."""
-    size, name = _split_number(unit)
-    known_unit = canonical_unit(name) or name
-    return known_unit if size == 1.0 else f"{size!r} {known_unit}"
+    unit_count, stated_name = _split_number(unit)
+    unit_name = canonical_unit(stated_name) or stated_name
+    return unit_name if unit_count == 1.0 else f"{unit_count!r} {unit_name}"
 
 
-def unit_in_brackets(name: str) -> str | None:
+def unit_in_brackets(channel_name: str) -> str | None:
     """Return the unit in brackets after a name, as in ``Angle [deg]``; None without one."""
-    match = _BRACKETS_PATTERN.search(name)
-    return canonical_unit(match[1]) if match else None
+    bracket_match = _BRACKETS_PATTERN.search(channel_name)
+    return canonical_unit(bracket_match[1]) if bracket_match else None
 
 
-def unit_in_suffix(name: str) -> str | None:
+def unit_in_suffix(channel_name: str) -> str | None:
     """Return the unit that the last word of a name suggests, as in ``angle_rad``, or None."""
-    _, underscore, last_word = name.strip().rpartition("_")
+    _, underscore, last_word = channel_name.strip().rpartition("_")
     return _NAME_SUFFIXES.get(last_word) if underscore else None
 
 
 def _split_number(unit: str) -> tuple[float, str]:
     """Split a text such as ``0.02 N.m`` into number and unit; the number is 1 by default."""
-    match = _NUMBER_PATTERN.match(unit.strip())
-    return (float(match[0]), unit.strip()[match.end() :]) if match else (1.0, unit)
+    number_match = _NUMBER_PATTERN.match(unit.strip())
+    return (
+        (float(number_match[0]), unit.strip()[number_match.end() :])
+        if number_match
+        else (1.0, unit)
+    )
 
 
 def _plain_spelling(text: str) -> str:
@@ -247,8 +251,8 @@ def parse_choice(text: str, quantity: str) -> ChannelChoice:
             f"'{text}' does not say channel and unit; write CHANNEL:UNIT with one of the units "
             f"{', '.join(UNIT_SIZES[quantity])}. A unit is never guessed."
         )
-    size = unit_factor(quantity, unit)
-    return ChannelChoice(channel.strip(), stated_unit(unit), size)
+    unit_size = unit_factor(quantity, unit)
+    return ChannelChoice(channel.strip(), stated_unit(unit), unit_size)
 
 
 # Time base
@@ -320,28 +324,29 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
     ExchangeError
         If times are not finite, do not increase, or are not equidistant apart from gaps.
     """
-    not_finite = np.flatnonzero(~np.isfinite(time_s))
-    if not_finite.size:
+    not_finite_indices = np.flatnonzero(~np.isfinite(time_s))
+    if not_finite_indices.size:
         raise ExchangeError(
-            f"{path}: the time '{channel}' of sample {not_finite[0] + 1} is "
-            f"{time_s[not_finite[0]]}, so its "
+            f"{path}: the time '{channel}' of sample {not_finite_indices[0] + 1} is "
+            f"{time_s[not_finite_indices[0]]}, so its "
             "position is unknown; repair the times, or give --rate-hz instead of --time if no "
             "sample is missing."
         )
     steps_s = np.diff(time_s)
-    not_increasing = np.flatnonzero(steps_s <= 0.0)
-    if not_increasing.size:
-        index = int(not_increasing[0])
+    decreasing_indices = np.flatnonzero(steps_s <= 0.0)
+    if decreasing_indices.size:
+        first_bad_index = int(decreasing_indices[0])
         raise ExchangeError(
-            f"{path}: the time '{channel}' does not increase from sample {index + 1} "
-            f"({time_s[index]:.9g} s) to sample {index + 2} ({time_s[index + 1]:.9g} s); repair "
+            f"{path}: the time '{channel}' does not increase from sample {first_bad_index + 1} "
+            f"({time_s[first_bad_index]:.9g} s) to sample {first_bad_index + 2} "
+            f"({time_s[first_bad_index + 1]:.9g} s); repair "
             "the times, or give --rate-hz instead of --time if the samples are equidistant."
         )
     # The median distinguishes a step of one tick from a gap. The mean over all steps of one tick,
     # unlike the median, does not depend on the number of digits of the times.
     is_one_tick = steps_s < 1.5 * np.median(steps_s)
-    steps = np.round(steps_s / steps_s[is_one_tick].mean())
-    gap_fraction = np.count_nonzero(steps > 1) / len(steps)
+    tick_steps = np.round(steps_s / steps_s[is_one_tick].mean())
+    gap_fraction = np.count_nonzero(tick_steps > 1) / len(tick_steps)
     if gap_fraction > MAX_GAP_FRACTION:
         raise ExchangeError(
             f"{path}: the times '{channel}' advance unevenly, by {steps_s.min():.6g} to "
@@ -350,7 +355,7 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
             "times with more digits, resample the record to one rate, or give --rate-hz instead of "
             "--time if the samples are equidistant."
         )
-    ticks = np.concatenate(([0.0], np.cumsum(steps)))
+    ticks = np.concatenate(([0.0], np.cumsum(tick_steps)))
     if ticks[-1] + 1 > MAX_TICKS_PER_SAMPLE * len(ticks):
         raise ExchangeError(
             f"{path}: the times '{channel}' of the {len(ticks)} samples span {ticks[-1] + 1:.0f} "
@@ -359,17 +364,17 @@ def timebase_from_stamps(path: Path, channel: str, time_s: NDArray[np.float64]) 
     period_s = _regression_slope(ticks, time_s)
     rate_hz = float(f"{1 / period_s:.{_RATE_DIGITS}g}")
     _check_rate(path, rate_hz)
-    deviation = (time_s - time_s[0]) * rate_hz - ticks
-    deviation = np.abs(deviation - np.median(deviation))
-    worst_index = int(np.argmax(deviation))
-    if deviation[worst_index] > MAX_JITTER:
+    tick_deviation = (time_s - time_s[0]) * rate_hz - ticks
+    tick_deviation = np.abs(tick_deviation - np.median(tick_deviation))
+    worst_index = int(np.argmax(tick_deviation))
+    if tick_deviation[worst_index] > MAX_JITTER:
         raise ExchangeError(
             f"{path}: the times '{channel}' are not equidistant: sample {worst_index + 1} lies "
-            f"{deviation[worst_index]:.2g} periods from where {rate_hz:g} Hz would have it. "
+            f"{tick_deviation[worst_index]:.2g} periods from where {rate_hz:g} Hz would have it. "
             "Resample the "
             "record to one rate, or give --rate-hz instead of --time if only the stamps are off."
         )
-    return Timebase(ticks.astype(np.int64), rate_hz, float(deviation[worst_index]))
+    return Timebase(ticks.astype(np.int64), rate_hz, float(tick_deviation[worst_index]))
 
 
 def _regression_slope(x: NDArray[np.float64], y: NDArray[np.float64]) -> float:

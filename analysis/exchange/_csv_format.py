@@ -37,19 +37,19 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             table = read_table(stream, names, most_rows=MAX_SAMPLES)
     except TableError as error:
         raise ExchangeError(f"{path}: {error}") from error
-    times = None
+    file_times = None
     if table.times is not None:
-        times = FileTimes(table.times.title, table.times.values, table.times.unit_s)
+        file_times = FileTimes(table.times.title, table.times.values, table.times.unit_s)
     channels = {
-        name: SourceChannel(
+        channel_name: SourceChannel(
             column.values,
             unit_label=column.unit,
             rate_hz=column.rate_hz,
             start_ns=column.start_ns,
-            times=times,
+            times=file_times,
             remark=table.remark,
         )
-        for name, column in table.columns.items()
+        for channel_name, column in table.columns.items()
     }
     check_samples(path, "The file", len(next(iter(channels.values())).values))
     return channels
@@ -63,25 +63,26 @@ _BLOCK_ROWS: Final = 20_000
 
 def write_csv(table: ExportTable, stream: BinaryIO) -> None:
     """Write a table as CSV in UTF-8; a complex column becomes a real and an imaginary column."""
-    columns = [
+    real_columns = [
         real_column
         for column in (table.axis, *table.columns)
         for real_column in _real_parts(column)
     ]
-    stream.write((",".join(column.name for column in columns) + "\n").encode("utf-8"))
-    for begin in range(0, len(table.axis.values), _BLOCK_ROWS):
-        texts = [
-            map(repr, column.values[begin : begin + _BLOCK_ROWS].tolist()) for column in columns
+    stream.write((",".join(column.name for column in real_columns) + "\n").encode("utf-8"))
+    for first_row in range(0, len(table.axis.values), _BLOCK_ROWS):
+        cell_texts = [
+            map(repr, column.values[first_row : first_row + _BLOCK_ROWS].tolist())
+            for column in real_columns
         ]
-        lines = "\n".join(map(",".join, zip(*texts, strict=True)))
-        stream.write((lines + "\n").encode("ascii"))
+        csv_lines = "\n".join(map(",".join, zip(*cell_texts, strict=True)))
+        stream.write((csv_lines + "\n").encode("ascii"))
 
 
 def _real_parts(column: ExportColumn) -> Iterator[ExportColumn]:
-    """Yield a column, or the real and the imaginary part of a complex column."""
+    """Yield a real column itself, or the real and the imaginary part of a complex column."""
     if not np.iscomplexobj(column.values):
         yield column
         return
-    quantity, _, unit = column.name.partition("_")
-    for part_name, values in (("real", column.values.real), ("imaginary", column.values.imag)):
-        yield replace(column, name=f"{quantity}_{part_name}_{unit}", values=values)
+    quantity_name, _, unit = column.name.partition("_")
+    for part_name, part_values in (("real", column.values.real), ("imaginary", column.values.imag)):
+        yield replace(column, name=f"{quantity_name}_{part_name}_{unit}", values=part_values)

@@ -103,7 +103,7 @@ def export_model(
     options: ModelOptions,
     on_step: Callable[[str], None] = lambda _step: None,
 ) -> LinearModel:
-    """Write a linear model of the antenna to a file: modal model and state-space matrices.
+    """Write a linear model of the flexible beam to a file: modal model and state-space matrices.
 
     Parameters
     ----------
@@ -136,10 +136,12 @@ def export_model(
 
     _check_suffix(target, MODEL_FORMATS)
     check_new_file(target, "The file")
-    is_session = source.suffix.lower() == ".mcap"
-    on_step("analysis" if is_session else "document")
-    identified = identified_in_session(source) if is_session else identified_in_document(source)
-    model = linear_model(identified, options, on_step)
+    is_session_file = source.suffix.lower() == ".mcap"
+    on_step("analysis" if is_session_file else "document")
+    identified_models = (
+        identified_in_session(source) if is_session_file else identified_in_document(source)
+    )
+    model = linear_model(identified_models, options, on_step)
     on_step("file")
     variables = {**model.variables(), "exported_by": f"rigd {rigd.__version__}"}
     with _new_file(target) as stream:
@@ -148,7 +150,11 @@ def export_model(
 
 
 def check_target(target: Path, *, binary: bool) -> None:
-    """Raise if a record or response cannot be written to a file, before computing it."""
+    """Raise an error if a record or response cannot be written to a file.
+
+    The error is TargetError for an unsuitable suffix, or that of `check_new_file`. The check is
+    made before anything is computed.
+    """
     _check_suffix(target, SUFFIXES)
     suffix = target.suffix.lower()
     if binary and suffix not in _UNIVERSAL_SUFFIXES:
@@ -160,7 +166,7 @@ def check_target(target: Path, *, binary: bool) -> None:
 
 
 def _check_suffix(target: Path, suffixes: Collection[str]) -> None:
-    """Raise if the suffix of a file is not one of the given suffixes."""
+    """Raise TargetError if the suffix of a file is not one of the given suffixes."""
     if target.suffix.lower() not in suffixes:
         raise TargetError(
             f"{target}: the ending selects the format; choose one of {', '.join(suffixes)}."

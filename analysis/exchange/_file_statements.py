@@ -106,24 +106,26 @@ class FileStatements:
             If the file clearly states another unit.
         """
         for choice in self.plan.choices:
-            label = channels[choice.channel].unit_label.strip()
-            stated_unit = canonical_unit(label) if label else unit_in_brackets(choice.channel)
+            unit_label = channels[choice.channel].unit_label.strip()
+            stated_unit = (
+                canonical_unit(unit_label) if unit_label else unit_in_brackets(choice.channel)
+            )
             if stated_unit is not None and stated_unit != choice.unit:
                 self.report_contradiction(
                     f"the file says that '{choice.channel}' is in {stated_unit}, and {choice.unit} "
                     "was stated",
                     f"state '{choice.channel}:{stated_unit}', or correct the file",
                 )
-            if stated_unit is None and label not in _NO_UNIT_TEXTS:
+            if stated_unit is None and unit_label not in _NO_UNIT_TEXTS:
                 self.warnings.append(
-                    f"The file states '{printable(label, 20)}' for '{choice.channel}'; "
+                    f"The file states '{printable(unit_label, 20)}' for '{choice.channel}'; "
                     f"{choice.unit} was used as stated."
                 )
-            suffix = unit_in_suffix(choice.channel)
-            if stated_unit is None and suffix not in (None, choice.unit):
+            suffix_unit = unit_in_suffix(choice.channel)
+            if stated_unit is None and suffix_unit not in (None, choice.unit):
                 self.warnings.append(
-                    f"The name '{choice.channel}' suggests {suffix}; {choice.unit} was used as "
-                    "stated."
+                    f"The name '{choice.channel}' suggests {suffix_unit}; {choice.unit} was used "
+                    "as stated."
                 )
 
     def check_scales(self, channels: Mapping[str, SourceChannel]) -> None:
@@ -144,7 +146,7 @@ class FileStatements:
         ExchangeError
             If the times are no time base, or the file states another rate than the user.
         """
-        time = self.plan.time
+        time_choice = self.plan.time
         timebase = plan_timebase(self.path, self.plan, channels)
         for name, channel in channels.items():
             file_rate_hz = channel.rate_hz
@@ -154,32 +156,36 @@ class FileStatements:
             ):
                 self._report_rate_difference(name, file_rate_hz, timebase.rate_hz)
         times_by_name = {c.times.name: c.times for c in channels.values() if c.times is not None}
-        if time is None:
+        if time_choice is None:
             for file_times in times_by_name.values():
                 self._check_times(file_times, timebase.rate_hz)
         return timebase
 
-    def _report_rate_difference(self, name: str, file_rate_hz: float, rate_hz: float) -> None:
+    def _report_rate_difference(
+        self, source_name: str, file_rate_hz: float, rate_hz: float
+    ) -> None:
         """Warn of a rate in the file that differs from the one used, or raise an error."""
-        time = self.plan.time
-        statement = f"the file says that '{name}' was sampled at {file_rate_hz:.6g} Hz"
+        time_choice = self.plan.time
+        statement = f"the file says that '{source_name}' was sampled at {file_rate_hz:.6g} Hz"
         is_default = file_rate_hz == _DEFAULT_RATE_HZ
-        ratio = max(file_rate_hz / rate_hz, rate_hz / file_rate_hz)
-        wrong_unit = any(
-            abs(ratio / unit_ratio - 1) < _RATE_TOLERANCE for unit_ratio in _UNIT_RATIOS
+        rate_ratio = max(file_rate_hz / rate_hz, rate_hz / file_rate_hz)
+        is_wrong_unit = any(
+            abs(rate_ratio / unit_ratio - 1) < _RATE_TOLERANCE for unit_ratio in _UNIT_RATIOS
         )
         if is_default:
             statement += ", which programs write where no rate was given"
-        if time is not None and (time.channel == name or is_default or not wrong_unit):
+        if time_choice is not None and (
+            time_choice.channel == source_name or is_default or not is_wrong_unit
+        ):
             self.warnings.append(
-                f"T{statement[1:]}; {rate_hz:.6g} Hz was used, as the times in '{time.channel}' "
-                "show."
+                f"T{statement[1:]}; {rate_hz:.6g} Hz was used, as the times in "
+                f"'{time_choice.channel}' show."
             )
-        elif time is not None:
+        elif time_choice is not None:
             self.report_contradiction(
-                f"{statement}, and the times in '{time.channel}' as {time.unit} show "
+                f"{statement}, and the times in '{time_choice.channel}' as {time_choice.unit} show "
                 f"{rate_hz:.6g} Hz",
-                f"state the unit of '{time.channel}' (s, ms, us, ns)",
+                f"state the unit of '{time_choice.channel}' (s, ms, us, ns)",
             )
         else:
             self.report_contradiction(
@@ -190,66 +196,76 @@ class FileStatements:
                 "--time",
             )
 
-    def _check_times(self, times: FileTimes, rate_hz: float) -> None:
+    def _check_times(self, file_times: FileTimes, rate_hz: float) -> None:
         """Compare the rate stated by the user with the times in the file."""
-        values = times.values[np.isfinite(times.values)]
-        if len(values) < 2:
+        finite_times = file_times.values[np.isfinite(file_times.values)]
+        if len(finite_times) < 2:
             return
-        if len(values) < len(times.values):
-            row_number = int(np.argmin(np.isfinite(times.values))) + 1
+        if len(finite_times) < len(file_times.values):
+            row_number = int(np.argmin(np.isfinite(file_times.values))) + 1
             self.report_contradiction(
-                f"the times '{printable(times.name, 60)}' are missing from sample {row_number} on, "
-                f"in {len(times.values) - len(values)} samples, so that these may be none",
+                f"the times '{printable(file_times.name, 60)}' are missing from sample "
+                f"{row_number} on, "
+                f"in {len(file_times.values) - len(finite_times)} samples, so that these may be "
+                "none",
                 "repair or remove their lines",
             )
             return
-        units_s = _TIME_UNITS_S if times.unit_s is None else (times.unit_s,)
-        steps = np.diff(values)
-        name = f"'{printable(times.name, 60)}'"
-        if (steps < 0.0).any():
-            row_number = int(np.argmax(steps < 0.0)) + 2
-            if (steps < 0.0).all():
+        units_s = _TIME_UNITS_S if file_times.unit_s is None else (file_times.unit_s,)
+        time_steps = np.diff(finite_times)
+        times_name = f"'{printable(file_times.name, 60)}'"
+        if (time_steps < 0.0).any():
+            row_number = int(np.argmax(time_steps < 0.0)) + 2
+            if (time_steps < 0.0).all():
                 return  # decreasing values are no times, but an index or a countdown
             self.report_contradiction(
-                f"the times {name} go back at sample {row_number}, so that another record begins "
-                "there",
+                f"the times {times_name} go back at sample {row_number}, so that another record "
+                "begins there",
                 "cut one record out of the file",
             )
             return
-        typical_step = float(np.median(steps[steps > 0.0])) if (steps > 0.0).any() else 0.0
-        if (steps == 0.0).any() and any(
-            abs(rate_hz * typical_step * unit_s - 1) < _COARSE_TOLERANCE for unit_s in units_s
+        typical_step = (
+            float(np.median(time_steps[time_steps > 0.0])) if (time_steps > 0.0).any() else 0.0
+        )
+        if (time_steps == 0.0).any() and any(
+            abs(rate_hz * typical_step * best_unit_s - 1) < _COARSE_TOLERANCE
+            for best_unit_s in units_s
         ):
             self.report_contradiction(
-                f"the time {name} of sample {int(np.argmax(steps == 0.0)) + 2} is that of the one "
-                "before it",
+                f"the time {times_name} of sample {int(np.argmax(time_steps == 0.0)) + 2} is that "
+                "of the one before it",
                 "remove what is stated twice",
             )
             return
-        step = float(values[-1] - values[0]) / (len(values) - 1)
-        if step == 0.0 or (times.name == "#1" and step == 1.0):
+        mean_step = float(finite_times[-1] - finite_times[0]) / (len(finite_times) - 1)
+        if mean_step == 0.0 or (file_times.name == "#1" and mean_step == 1.0):
             return  # the values are constant or sample numbers
-        unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * step * unit)))
-        tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(values[-1] - values[0])
-        missing = 0
-        file_rate_hz = 1 / (step * unit_s)
+        best_unit_s = min(units_s, key=lambda unit: abs(np.log(rate_hz * mean_step * unit)))
+        rate_tolerance = _COARSE_TOLERANCE + 2 * typical_step / float(
+            finite_times[-1] - finite_times[0]
+        )
+        missing_ticks = 0
+        file_rate_hz = 1 / (mean_step * best_unit_s)
         try:
-            file_timebase = timebase_from_stamps(self.path, times.name, values * unit_s)
+            file_timebase = timebase_from_stamps(
+                self.path, file_times.name, finite_times * best_unit_s
+            )
         except ExchangeError:
             pass
         else:
-            file_rate_hz, missing = file_timebase.rate_hz, file_timebase.missing
-            tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(values)
-        if missing:
+            file_rate_hz, missing_ticks = file_timebase.rate_hz, file_timebase.missing
+            rate_tolerance = _RATE_TOLERANCE + 2 * file_timebase.jitter / len(finite_times)
+        if missing_ticks:
             self.report_contradiction(
-                f"the times {name} have gaps of {missing} samples in all, and a record without "
-                "gaps was stated",
-                f"give --time '{times.name}:UNIT' instead of --rate-hz",
+                f"the times {times_name} have gaps of {missing_ticks} samples in all, and a record "
+                "without gaps was stated",
+                f"give --time '{file_times.name}:UNIT' instead of --rate-hz",
             )
-        elif abs(file_rate_hz / rate_hz - 1) > tolerance:
+        elif abs(file_rate_hz / rate_hz - 1) > rate_tolerance:
             self.report_contradiction(
-                f"the times {name} show {file_rate_hz:.6g} Hz, and {rate_hz:.6g} Hz was stated",
-                f"give --time '{times.name}:UNIT' instead of --rate-hz",
+                f"the times {times_name} show {file_rate_hz:.6g} Hz, and {rate_hz:.6g} Hz was "
+                "stated",
+                f"give --time '{file_times.name}:UNIT' instead of --rate-hz",
             )
 
     def align(
@@ -270,40 +286,40 @@ class FileStatements:
         ExchangeError
             If the channels have no common interval, or different lengths without a reason.
         """
-        time, plan = self.plan.time, self.plan
-        starts = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}
-        measured = {choice.channel for choice in plan.channels.values()}
-        if len(set(starts.values())) < 2:
-            unknown = sorted(measured - set(starts))
-            start_ns = next(iter(starts.values()), 0)
-            if unknown and start_ns and abs(start_ns) < _EARLIEST_DATE_NS:
+        time_choice, plan = self.plan.time, self.plan
+        starts_ns = {n: c.start_ns for n, c in channels.items() if c.start_ns is not None}
+        measured_channels = {choice.channel for choice in plan.channels.values()}
+        if len(set(starts_ns.values())) < 2:
+            unknown_starts = sorted(measured_channels - set(starts_ns))
+            start_ns = next(iter(starts_ns.values()), 0)
+            if unknown_starts and start_ns and abs(start_ns) < _EARLIEST_DATE_NS:
                 self.report_contradiction(
-                    f"the file says that '{next(iter(starts))}' begins at {_time_text(start_ns)}, "
-                    f"and does not say when '{unknown[0]}' begins",
+                    f"the file says that '{next(iter(starts_ns))}' begins at "
+                    f"{_time_text(start_ns)}, and does not say when '{unknown_starts[0]}' begins",
                     "give channels that begin together, or cut them to the same samples",
                 )
-            elif starts and unknown:
+            elif starts_ns and unknown_starts:
                 self.warnings.append(
-                    f"The file states when '{next(iter(starts))}' begins, but not "
-                    f"'{unknown[0]}'; they were taken to begin together."
+                    f"The file states when '{next(iter(starts_ns))}' begins, but not "
+                    f"'{unknown_starts[0]}'; they were taken to begin together."
                 )
             check_lengths(self.path, channels)
             return channels, {}
         first_channel, last_channel = (
-            min(starts, key=starts.__getitem__),
-            max(starts, key=starts.__getitem__),
+            min(starts_ns, key=starts_ns.__getitem__),
+            max(starts_ns, key=starts_ns.__getitem__),
         )
         statement = (
-            f"the file says that '{first_channel}' begins at {_time_text(starts[first_channel])} "
-            f"and '{last_channel}' at "
-            f"{_time_text(starts[last_channel])}"
+            f"the file says that '{first_channel}' begins at "
+            f"{_time_text(starts_ns[first_channel])} and '{last_channel}' at "
+            f"{_time_text(starts_ns[last_channel])}"
         )
         if plan.ignore_file_metadata:
             self.report_contradiction(statement, "")
             check_lengths(self.path, channels)
             return channels, {}
         remedy = "give channels that begin together, or cut them to the same samples"
-        without_start = sorted(set(channels) - set(starts))
+        without_start = sorted(set(channels) - set(starts_ns))
         if without_start:
             self.report_contradiction(
                 f"{statement}, and does not say when '{without_start[0]}' begins", remedy
@@ -311,30 +327,43 @@ class FileStatements:
         if timebase.missing:
             self.report_contradiction(f"{statement}, and the times have gaps", remedy)
         period_ns = 1e9 / timebase.rate_hz
-        skips = {
-            n: round((starts[last_channel] - start) / period_ns) for n, start in starts.items()
+        skipped_samples = {
+            n: round((starts_ns[last_channel] - channel_start_ns) / period_ns)
+            for n, channel_start_ns in starts_ns.items()
         }
-        common_length = min(len(channel.values) - skips[n] for n, channel in channels.items())
+        common_length = min(
+            len(channel.values) - skipped_samples[n] for n, channel in channels.items()
+        )
         if common_length < 2:
             self.report_contradiction(f"{statement}, so that they have no time in common", remedy)
-        angle = plan.channels["angle_rad"].channel
+        angle_channel = plan.channels["angle_rad"].channel
         delays_s = {
-            n: (starts[angle] - starts[n] + (skips[angle] - skips[n]) * period_ns) / 1e9
+            n: (
+                starts_ns[angle_channel]
+                - starts_ns[n]
+                + (skipped_samples[angle_channel] - skipped_samples[n]) * period_ns
+            )
+            / 1e9
             for n in channels
         }
-        self._report_shift(statement, skips, delays_s, timebase.rate_hz)
-        aligned = {
-            n: replace(channel, values=channel.values[skips[n] : skips[n] + common_length])
+        self._report_shift(statement, skipped_samples, delays_s, timebase.rate_hz)
+        aligned_channels = {
+            n: replace(
+                channel,
+                values=channel.values[skipped_samples[n] : skipped_samples[n] + common_length],
+            )
             for n, channel in channels.items()
         }
-        if time is not None and len(set(skips.values())) > 1:
-            self.warnings.append(f"The times in '{time.channel}' were cut like the channels.")
-        return aligned, delays_s
+        if time_choice is not None and len(set(skipped_samples.values())) > 1:
+            self.warnings.append(
+                f"The times in '{time_choice.channel}' were cut like the channels."
+            )
+        return aligned_channels, delays_s
 
     def _report_shift(
         self,
         statement: str,
-        skips: Mapping[str, int],
+        skipped_samples: Mapping[str, int],
         delays_s: Mapping[str, float],
         rate_hz: float,
     ) -> None:
@@ -343,16 +372,20 @@ class FileStatements:
             self.plan.channels[name].channel for name in ("angle_rad", "coupling_torque_nm")
         }
         for name, delay_s in delays_s.items():
-            remainder = abs(delay_s) * rate_hz
+            rest_s = abs(delay_s) * rate_hz
             is_time = self.plan.time is not None and name == self.plan.time.channel
-            if remainder > MAX_JITTER and name not in channels_with_delay and not is_time:
+            if rest_s > MAX_JITTER and name not in channels_with_delay and not is_time:
                 self.report_contradiction(
-                    f"{statement}, and '{name}' lies {remainder:.2g} periods between the samples "
+                    f"{statement}, and '{name}' lies {rest_s:.2g} periods between the samples "
                     "of the "
                     "angle",
                     "leave this channel out: no analysis needs it",
                 )
-        shifted = ", ".join(f"{skip} of '{name}'" for name, skip in skips.items() if skip)
+        skips_text = ", ".join(
+            f"{skip_count} of '{name}'"
+            for name, skip_count in skipped_samples.items()
+            if skip_count
+        )
         delays_text = ", ".join(
             f"{delay_s:.6g} s of '{name}'"
             for name, delay_s in delays_s.items()
@@ -360,7 +393,7 @@ class FileStatements:
         )
         self.warnings.append(
             f"T{statement[1:]}."
-            + (f" Samples left out at the beginning: {shifted}." if shifted else "")
+            + (f" Samples left out at the beginning: {skips_text}." if skips_text else "")
             + (f" Delay added: {delays_text}." if delays_text else "")
         )
 
@@ -371,7 +404,10 @@ record."""
 
 
 def _time_text(time_ns: int) -> str:
-    """Format a time in nanoseconds as a date, or in seconds if it is relative to the record."""
+    """Format a start time in nanoseconds.
+
+    It is shown as a date if it counts from 1970, and in seconds if it is an offset.
+    """
     if abs(time_ns) < _EARLIEST_DATE_NS:
         return f"{time_ns / 1e9:.9g} s"
     return str(np.datetime64(time_ns, "ns")).rstrip("0").rstrip(".")

@@ -145,10 +145,12 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     rigd.session.SessionError
         If the session exists or cannot be written.
     """
-    names = list(dict.fromkeys(choice.channel for choice in plan.choices))
-    file_format, channels = read_source(source, names)
-    remarks = dict.fromkeys(channel.remark for channel in channels.values() if channel.remark)
-    statements = FileStatements(source, plan, [*remarks])
+    channel_names = list(dict.fromkeys(choice.channel for choice in plan.choices))
+    file_format, channels = read_source(source, channel_names)
+    channel_remarks = dict.fromkeys(
+        channel.remark for channel in channels.values() if channel.remark
+    )
+    statements = FileStatements(source, plan, [*channel_remarks])
     statements.check_scales(channels)
     statements.check_units(channels)
     timebase = statements.timebase(channels)
@@ -159,25 +161,25 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
     segments = _segment_ticks(
         source, plan.segments_s, timebase.rate_hz, int(timebase.ticks[-1]) + 1
     )
-    columns = _si_columns(plan, channels)
+    si_columns = _si_columns(plan, channels)
     del channels  # frees up to a quarter of a gigabyte
-    titles = {name: choice.channel for name, choice in plan.channels.items()}
-    columns, status, first_sample = hold_last_values(source, titles, columns)
+    channel_titles = {column_name: choice.channel for column_name, choice in plan.channels.items()}
+    si_columns, status_bits, first_sample = hold_last_values(source, channel_titles, si_columns)
     ticks = timebase.ticks[first_sample:]
     is_after_gap = np.diff(ticks, prepend=-1) > 1
     if timebase.jitter > _REPORTED_JITTER:
         warnings.append(
             f"The time stamps lie up to {timebase.jitter:.2g} periods from equidistant ones."
         )
-    warnings += _describe_missing_samples(titles, status, first_sample, ticks)
-    anomaly = torque_anomaly(
-        _interpolate_gaps(ticks, columns["angle_rad"]),
-        _interpolate_gaps(ticks, columns["coupling_torque_nm"]),
+    warnings += _describe_missing_samples(channel_titles, status_bits, first_sample, ticks)
+    anomaly_text = torque_anomaly(
+        _interpolate_gaps(ticks, si_columns["angle_rad"]),
+        _interpolate_gaps(ticks, si_columns["coupling_torque_nm"]),
         timebase.rate_hz,
         plan.specimen,
     )
-    warnings += [anomaly] if anomaly else []
-    status[is_after_gap] |= np.uint32(Status.AFTER_LOST)
+    warnings += [anomaly_text] if anomaly_text else []
+    status_bits[is_after_gap] |= np.uint32(Status.AFTER_LOST)
     start_utc_ns, start_warning = _session_start(source, int(ticks[-1]) / timebase.rate_hz)
     warnings += [start_warning] if start_warning else []
     metadata = _session_metadata(source, target, file_format, plan, timebase.rate_hz)
@@ -191,7 +193,7 @@ def import_record(source: Path, target: Path, plan: ImportPlan) -> ImportedRecor
         metadata["import_ignored"] = "; ".join(statements.ignored)
     write_session(
         target,
-        {**columns, "tick": ticks, "status": status},
+        {**si_columns, "tick": ticks, "status": status_bits},
         timebase.rate_hz,
         start_utc_ns,
         metadata,
@@ -210,21 +212,21 @@ def _session_start(source: Path, duration_s: float) -> tuple[int, str]:
     changed_ns = source.stat().st_mtime_ns
     if changed_ns >= 0 and changed_ns + duration_s * 1e9 < _LATEST_START_NS:
         return changed_ns, ""
-    year = 1970 + changed_ns / (365.2425 * 86_400e9)
+    modification_year = 1970 + changed_ns / (365.2425 * 86_400e9)
     return time.time_ns(), (
-        f"By its time stamp the file was changed about the year {year:.0f}, which a session cannot "
-        "state; the time of this import is used as the session's start."
+        f"By its time stamp the file was changed about the year {modification_year:.0f}, which a "
+        "session cannot state; the time of this import is used as the session's start."
     )
 
 
 def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[str]:
     """Raise if the rate is too low for the beam's first mode; warn if the record is very short."""
-    beam, times = plan.specimen.beam, plan.time
+    beam, time_choice = plan.specimen.beam, plan.time
     first_hz, duration_s = first_mode_hz(beam), (int(timebase.ticks[-1]) + 1) / timebase.rate_hz
-    remedy = (
-        f"state the unit of '{times.channel}', which was taken to be {times.unit}, with --time "
-        f"{times.channel}:UNIT (s, ms, us, ns)"
-        if times
+    unit_remedy = (
+        f"state the unit of '{time_choice.channel}', which was taken to be {time_choice.unit}, "
+        f"with --time {time_choice.channel}:UNIT (s, ms, us, ns)"
+        if time_choice
         else "state the true rate with --rate-hz"
     )
     if first_hz >= timebase.rate_hz / 2:
@@ -232,13 +234,13 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
             f"{path}: the record lasts {duration_s:.6g} s at {timebase.rate_hz:g} Hz, but the "
             "first "
             f"mode of this beam is at {first_hz:.3g} Hz, beyond the Nyquist frequency of "
-            f"{timebase.rate_hz / 2:g} Hz; {remedy}, or correct the beam in --profile."
+            f"{timebase.rate_hz / 2:g} Hz; {unit_remedy}, or correct the beam in --profile."
         )
     if duration_s * first_hz < 1:
         return [
             f"The record lasts {duration_s:.3g} s at {timebase.rate_hz:g} Hz, less than one period "
             "of "
-            f"the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {remedy}."
+            f"the first mode of this beam, {first_hz:.3g} Hz; if that is wrong, {unit_remedy}."
         ]
     return []
 
@@ -246,15 +248,15 @@ def _check_duration(path: Path, plan: ImportPlan, timebase: Timebase) -> list[st
 def _si_columns(
     plan: ImportPlan, channels: Mapping[str, SourceChannel]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the fields of the samples in SI units, including values that are not finite."""
-    columns = {}
+    """Return the channels of the record in SI units, including values that are not finite."""
+    si_columns = {}
     with np.errstate(over="ignore"):
-        for name, choice in plan.channels.items():
-            is_reversed = plan.reverse_torque and name == "coupling_torque_nm"
-            factor = -choice.factor if is_reversed else choice.factor
-            values = channels[choice.channel].values
-            columns[name] = values if factor == 1.0 else values * factor
-    return columns
+        for field_name, choice in plan.channels.items():
+            is_reversed = plan.reverse_torque and field_name == "coupling_torque_nm"
+            unit_factor = -choice.factor if is_reversed else choice.factor
+            si_values = channels[choice.channel].values
+            si_columns[field_name] = si_values if unit_factor == 1.0 else si_values * unit_factor
+    return si_columns
 
 
 def _segment_ticks(
@@ -262,50 +264,57 @@ def _segment_ticks(
 ) -> dict[str, tuple[int, int]]:
     """Return first and end tick of each segment; raise if one is not inside the record."""
     ticks_by_name = {}
-    for name, (begin_s, end_s) in segments_s.items():
-        first_tick, end = round(begin_s * rate_hz), round(end_s * rate_hz)
+    for segment_name, (start_s, end_s) in segments_s.items():
+        first_tick, end = round(start_s * rate_hz), round(end_s * rate_hz)
         if not 0 <= first_tick < end <= ticks:
             raise ExchangeError(
-                f"{path}: the segment {name} from {begin_s:g} to {end_s:g} s is not inside the "
-                f"record, which lasts {ticks / rate_hz:g} s; count from the first sample."
+                f"{path}: the segment {segment_name} from {start_s:g} to {end_s:g} s is not inside "
+                f"the record, which lasts {ticks / rate_hz:g} s; count from the first sample."
             )
-        ticks_by_name[name] = (first_tick, end)
+        ticks_by_name[segment_name] = (first_tick, end)
     return ticks_by_name
 
 
 def _describe_missing_samples(
-    titles: Mapping[str, str], status: NDArray[np.uint32], omitted: int, ticks: NDArray[np.int64]
+    channel_titles: Mapping[str, str],
+    status_bits: NDArray[np.uint32],
+    omitted_samples: int,
+    ticks: NDArray[np.int64],
 ) -> list[str]:
     """Return sentences on missing samples and on values that are not finite."""
     sentences = []
-    if omitted:
+    if omitted_samples:
         sentences.append(
-            f"The first {omitted} samples were left out: angle or torque is not finite there."
+            f"The first {omitted_samples} samples were left out: angle or torque is not finite "
+            "there."
         )
-    for flag, name in (
-        (Status.ANGLE_STALE, titles["angle_rad"]),
-        (Status.WRENCH_STALE, titles["coupling_torque_nm"]),
+    for stale_flag, field_name in (
+        (Status.ANGLE_STALE, channel_titles["angle_rad"]),
+        (Status.WRENCH_STALE, channel_titles["coupling_torque_nm"]),
     ):
-        count = int(np.count_nonzero(status & flag))
-        if count:
+        flagged_count = int(np.count_nonzero(status_bits & stale_flag))
+        if flagged_count:
             sentences.append(
-                f"{count} samples of '{name}' are not finite; they were flagged as stale."
+                f"{flagged_count} samples of '{field_name}' are not finite; they were flagged as "
+                "stale."
             )
-    steps = np.diff(ticks)
-    missing = int(steps.sum()) - len(steps)
-    if missing:
+    tick_steps = np.diff(ticks)
+    missing_count = int(tick_steps.sum()) - len(tick_steps)
+    if missing_count:
         sentences.append(
-            f"{missing} samples are missing in {np.count_nonzero(steps > 1)} gaps of the time, the "
-            f"longest of {int(steps.max()) - 1}."
+            f"{missing_count} samples are missing in {np.count_nonzero(tick_steps > 1)} gaps of "
+            f"the time, the longest of {int(tick_steps.max()) - 1}."
         )
     return sentences
 
 
-def _interpolate_gaps(ticks: NDArray[np.int64], values: NDArray[np.float64]) -> NDArray[np.float64]:
+def _interpolate_gaps(
+    ticks: NDArray[np.int64], known_values: NDArray[np.float64]
+) -> NDArray[np.float64]:
     """Return the values at all ticks, interpolated in gaps."""
     if ticks[-1] - ticks[0] + 1 == len(ticks):
-        return values
-    return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, values)
+        return known_values
+    return np.interp(np.arange(ticks[0], ticks[-1] + 1), ticks, known_values)
 
 
 def _session_metadata(
@@ -313,7 +322,7 @@ def _session_metadata(
 ) -> dict[str, str]:
     """Return the metadata of the new session, including those of its source file."""
     beam = plan.specimen.beam
-    numbers = {
+    rig_numbers = {
         "rate_hz": rate_hz,
         "beam_length_m": beam.length_m,
         "beam_density_kg_per_m": beam.density_kg_per_m,
@@ -324,32 +333,37 @@ def _session_metadata(
         **{f"uncertainty_{k}_percent": v for k, v in plan.specimen.uncertainty_percent.items()},
     }
     for key in ("uniformity_percent", "tip_mass_kg", "axis_tilt_deg"):
-        stated = getattr(plan.specimen, key)
-        if stated is not None:
-            numbers[key] = stated
+        stated_texts = getattr(plan.specimen, key)
+        if stated_texts is not None:
+            rig_numbers[key] = stated_texts
     with source.open("rb") as stream:
-        digest = hashlib.file_digest(stream, "sha256").hexdigest()
-    mapping = {f"import_{name}": str(choice) for name, choice in plan.channels.items()}
+        file_digest = hashlib.file_digest(stream, "sha256").hexdigest()
+    channel_texts = {
+        f"import_{field_name}": str(choice) for field_name, choice in plan.channels.items()
+    }
     if plan.reverse_torque:
-        mapping["import_coupling_torque_nm"] += ", reversed"
+        channel_texts["import_coupling_torque_nm"] += ", reversed"
     return {
         "id": target.stem,
-        **{name: repr(float(value)) for name, value in numbers.items()},
         **{
-            key: text
-            for key, text in (
+            field_name: repr(float(number_value))
+            for field_name, number_value in rig_numbers.items()
+        },
+        **{
+            key: stated_text
+            for key, stated_text in (
                 ("operator", plan.operator),
                 ("specimen", plan.label),
                 ("note", plan.note),
             )
-            if text
+            if stated_text
         },
         "software": f"rigd {rigd.__version__}",
         "imported_from": source.name.encode("utf-8", "replace").decode("utf-8"),
         "import_format": file_format,
-        "import_sha256": digest,
+        "import_sha256": file_digest,
         "import_time": "rate stated" if plan.time is None else str(plan.time),
-        **mapping,
+        **channel_texts,
     }
 
 
@@ -363,44 +377,53 @@ _STALE_FLAGS: Final = {
 
 
 def hold_last_values(
-    path: Path, names: Mapping[str, str], columns: Mapping[str, NDArray[np.float64]]
+    path: Path, channel_names: Mapping[str, str], si_columns: Mapping[str, NDArray[np.float64]]
 ) -> tuple[dict[str, NDArray[np.float64]], NDArray[np.uint32], int]:
     """Replace values that are not finite by the last finite value, and flag them as stale.
 
-    `names` are the names of the fields' channels in the file. Return the fields, shape
+    `channel_names` are the names of the fields' channels in the file. Return the fields, shape
     (n - first_sample,), the bits of `rigd.session.layout.Status`, and the number
     `first_sample` of initial samples that are left out because no finite value precedes them. Raise
     ExchangeError if too many values are not finite, or if the field of such a value has no flag.
     """
-    bad = {name: ~np.isfinite(values) for name, values in columns.items()}
-    for name, mask in bad.items():
-        count = int(mask.sum())
-        if count and name not in _STALE_FLAGS:
+    bad = {
+        field_name: ~np.isfinite(field_values) for field_name, field_values in si_columns.items()
+    }
+    for field_name, is_bad in bad.items():
+        bad_count = int(is_bad.sum())
+        if bad_count and field_name not in _STALE_FLAGS:
             raise ExchangeError(
-                f"{path}: '{names[name]}' is not finite in {count} of {len(mask)} samples, first "
-                f"in sample {int(np.argmax(mask)) + 1}; repair it, or leave this channel out: no "
+                f"{path}: '{channel_names[field_name]}' is not finite in {bad_count} of "
+                f"{len(is_bad)} samples, first "
+                f"in sample {int(np.argmax(is_bad)) + 1}; repair it, or leave this channel out: no "
                 "analysis needs it."
             )
-        problem = unknown_fraction_message(f"'{names[name]}'", count, len(mask))
-        if problem:
+        bad_message = unknown_fraction_message(
+            f"'{channel_names[field_name]}'", bad_count, len(is_bad)
+        )
+        if bad_message:
             raise ExchangeError(
-                f"{path}: {problem} Or choose another channel, or cut the session out of the file."
+                f"{path}: {bad_message} Or choose another channel, or cut the session out of the "
+                "file."
             )
-    first_sample = max(int(np.argmin(mask)) for mask in bad.values())
-    held = {name: _hold_last(values, bad[name])[first_sample:] for name, values in columns.items()}
-    status = np.zeros(len(next(iter(held.values()))), dtype=np.uint32)
-    for name, flag in _STALE_FLAGS.items():
-        if name in bad:
-            status[bad[name][first_sample:]] |= np.uint32(flag)
-    return held, status, first_sample
+    first_sample = max(int(np.argmin(is_bad)) for is_bad in bad.values())
+    filled_columns = {
+        field_name: _hold_last(field_values, bad[field_name])[first_sample:]
+        for field_name, field_values in si_columns.items()
+    }
+    status_bits = np.zeros(len(next(iter(filled_columns.values()))), dtype=np.uint32)
+    for field_name, stale_flag in _STALE_FLAGS.items():
+        if field_name in bad:
+            status_bits[bad[field_name][first_sample:]] |= np.uint32(stale_flag)
+    return filled_columns, status_bits, first_sample
 
 
-def _hold_last(values: NDArray[np.float64], bad: NDArray[np.bool_]) -> NDArray[np.float64]:
+def _hold_last(samples: NDArray[np.float64], is_bad: NDArray[np.bool_]) -> NDArray[np.float64]:
     """Return the values with each bad value replaced by the last good value before it."""
-    if not bad.any():
-        return values
-    last_good = np.maximum.accumulate(np.where(bad, 0, np.arange(len(values))))
-    return values[last_good]
+    if not is_bad.any():
+        return samples
+    last_good_index = np.maximum.accumulate(np.where(is_bad, 0, np.arange(len(samples))))
+    return samples[last_good_index]
 
 
 # Plausibility of the torque
@@ -437,35 +460,40 @@ def torque_anomaly(
     """
     frequency_hz = np.fft.rfftfreq(len(angle_rad), 1 / rate_hz)
     first_hz = undamped_frequencies_rad_s(specimen.beam, 1)[0] / (2 * np.pi)
-    band = np.zeros(frequency_hz.shape, dtype=np.bool_)
-    for low, high in _CHECK_BANDS:
-        band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high * first_hz)
-    s = 2j * np.pi * frequency_hz[band]
-    distance = np.abs(np.linspace(-1.0, 1.0, len(angle_rad)))  # 0 in the middle, 1 at either end
-    window = np.sin(np.pi / 2 * np.minimum((1 - distance) / (2 * _TAPER_FRACTION), 1)) ** 2
+    in_band = np.zeros(frequency_hz.shape, dtype=np.bool_)
+    for low, high_ratio in _CHECK_BANDS:
+        in_band |= (frequency_hz >= low * first_hz) & (frequency_hz <= high_ratio * first_hz)
+    s = 2j * np.pi * frequency_hz[in_band]
+    centre_distance = np.abs(
+        np.linspace(-1.0, 1.0, len(angle_rad))
+    )  # 0 in the middle, 1 at either end
+    taper = np.sin(np.pi / 2 * np.minimum((1 - centre_distance) / (2 * _TAPER_FRACTION), 1)) ** 2
     with np.errstate(over="ignore", invalid="ignore"):
-        angle, torque = (
-            np.fft.rfft(window * (values - values.mean()))[band]
-            for values in (angle_rad, torque_nm)
+        angle_spectrum, torque_spectrum = (
+            np.fft.rfft(taper * (channel_values - channel_values.mean()))[in_band]
+            for channel_values in (angle_rad, torque_nm)
         )
-        model = (transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2) * angle
+        model_spectrum = (
+            transfer(s, specimen.beam, Damping()) + specimen.tool_inertia_kg_m2 * s**2
+        ) * angle_spectrum
         model_power, torque_power = (
-            float(np.vdot(spectrum, spectrum).real) for spectrum in (model, torque)
+            float(np.vdot(spectrum, spectrum).real)
+            for spectrum in (model_spectrum, torque_spectrum)
         )
         if not (0.0 < model_power < np.inf and 0.0 < torque_power < np.inf):
             return None
-        ratio = complex(np.vdot(model, torque) / model_power)
-    magnitude = abs(ratio)
-    explained = magnitude**2 * model_power
-    unexplained_per_bin = max(torque_power - explained, 0.0) / np.count_nonzero(band)
-    if explained < _SIGNIFICANT_STDS**2 * unexplained_per_bin:
+        torque_ratio = complex(np.vdot(model_spectrum, torque_spectrum) / model_power)
+    ratio_magnitude = abs(torque_ratio)
+    explained_power = ratio_magnitude**2 * model_power
+    noise_per_bin = max(torque_power - explained_power, 0.0) / np.count_nonzero(in_band)
+    if explained_power < _SIGNIFICANT_STDS**2 * noise_per_bin:
         return None
-    if not 1 / _LARGEST_RATIO < magnitude < _LARGEST_RATIO:
+    if not 1 / _LARGEST_RATIO < ratio_magnitude < _LARGEST_RATIO:
         return (
-            f"The torque is {magnitude:.3g} times that of this beam: check the units of "
+            f"The torque is {ratio_magnitude:.3g} times that of this beam: check the units of "
             "angle and torque, and the beam's length and density."
         )
-    if ratio.real < 0.0:
+    if torque_ratio.real < 0.0:
         return (
             "The torque has the opposite sign to that of this beam: import a sensor that measures "
             "the reaction with --reverse-torque."
@@ -515,15 +543,18 @@ def write_session(
         writer.begin(start_utc_ns, metadata, segments, {})
         for warning in warnings:
             writer.log(0, "warning", warning, "import")
-        for begin in range(0, len(ticks), _BLOCK_SAMPLES):
-            rows = slice(begin, begin + _BLOCK_SAMPLES)
-            block = {name: values[rows] for name, values in samples.items()}
-            block["t_ns"] = np.rint(np.multiply(block["tick"], 1e9 / rate_hz))
-            writer.write_samples(encode_samples(block))
-        scheduled = int(ticks[-1]) + 1
-        counts = {"scheduled": scheduled, "recorded": len(ticks), "missed": 0}
-        counts["lost"] = scheduled - len(ticks)
-        writer.close({name: str(count) for name, count in counts.items()})
+        for first_row in range(0, len(ticks), _BLOCK_SAMPLES):
+            row_slice = slice(first_row, first_row + _BLOCK_SAMPLES)
+            sample_block = {
+                segment_name: column_values[row_slice]
+                for segment_name, column_values in samples.items()
+            }
+            sample_block["t_ns"] = np.rint(np.multiply(sample_block["tick"], 1e9 / rate_hz))
+            writer.write_samples(encode_samples(sample_block))
+        scheduled_ticks = int(ticks[-1]) + 1
+        counts = {"scheduled": scheduled_ticks, "recorded": len(ticks), "missed": 0}
+        counts["lost"] = scheduled_ticks - len(ticks)
+        writer.close({segment_name: str(row_count) for segment_name, row_count in counts.items()})
     except BaseException:
         # The source still exists, so an incomplete copy of it is useless.
         try:

@@ -48,19 +48,22 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     with path.open("rb") as stream:
         first_bytes = stream.read(max(_HDF5_OFFSETS) + len(_HDF5_MAGIC))
     if any(
-        first_bytes[offset : offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC for offset in _HDF5_OFFSETS
+        first_bytes[magic_offset : magic_offset + len(_HDF5_MAGIC)] == _HDF5_MAGIC
+        for magic_offset in _HDF5_OFFSETS
     ):
         return _read_hdf5(path, names)
     return _read_mat(path, names)
 
 
-def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def _read_mat(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file of version 4 to 7."""
     from scipy.io import loadmat, whosmat
 
     try:
         with bounded_memory():
-            return _read_channels(path, names, whosmat(path), partial(loadmat, spmatrix=False))
+            return _read_channels(
+                path, channel_names, whosmat(path), partial(loadmat, spmatrix=False)
+            )
     except (ExchangeError, OSError, MemoryError):
         raise
     except Exception as error:  # scipy raises many types on a damaged file
@@ -72,71 +75,96 @@ def _read_mat(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 def _read_channels(
     path: Path,
-    names: Sequence[str],
+    channel_names: Sequence[str],
     variable_list: Sequence[tuple[str, tuple[int, ...], str]],
-    load: Callable[..., Mapping[str, Any]],
+    load_variables: Callable[..., Mapping[str, Any]],
 ) -> dict[str, SourceChannel]:
     """Load the requested variables after checking their listed sizes, and return the channels."""
-    shapes = {name: shape for name, shape, _ in variable_list}
-    variables = {name: _split_element(_split_name(name, shapes)[0])[0] for name in names}
-    for name, variable in variables.items():
-        if variable not in shapes:
-            raise no_such_channel_error(path, name, shapes)
-        check_samples(path, f"The variable '{variable}'", max(shapes[variable], default=0))
-    time_variables = {
-        n for n in shapes if states_time(n) and max(shapes[n], default=0) <= MAX_SAMPLES
+    shape_by_name = {
+        channel_name: variable_shape for channel_name, variable_shape, _ in variable_list
     }
-    contents = load(path, variable_names=sorted(time_variables | set(variables.values())))
-    loaded = {name: contents[name] for name in shapes if name in contents}
+    variables = {
+        channel_name: _split_element(_split_name(channel_name, shape_by_name)[0])[0]
+        for channel_name in channel_names
+    }
+    for channel_name, variable_name in variables.items():
+        if variable_name not in shape_by_name:
+            raise no_such_channel_error(path, channel_name, shape_by_name)
+        check_samples(
+            path, f"The variable '{variable_name}'", max(shape_by_name[variable_name], default=0)
+        )
+    time_variables = {
+        n
+        for n in shape_by_name
+        if states_time(n) and max(shape_by_name[n], default=0) <= MAX_SAMPLES
+    }
+    file_variables = load_variables(
+        path, variable_names=sorted(time_variables | set(variables.values()))
+    )
+    loaded_variables = {
+        channel_name: file_variables[channel_name]
+        for channel_name in shape_by_name
+        if channel_name in file_variables
+    }
 
     def names_in(parent: str) -> Sequence[str]:
         """Return the names of the fields of a struct, or of all loaded variables."""
         if not parent:
-            return list(loaded)
-        value = _find_value(path, parent, loaded)
-        return getattr(getattr(value, "dtype", None), "names", None) or ()
+            return list(loaded_variables)
+        parent_value = _find_value(path, parent, loaded_variables)
+        return getattr(getattr(parent_value, "dtype", None), "names", None) or ()
 
     channels = {}
-    for name in names:
-        values = _read_vector(path, name, loaded)
-        label = _timeseries_unit(path, name, loaded)
-        rate_hz, times = stated_times(
-            name, names, len(values), names_in, partial(_vector_from, path, loaded)
+    for channel_name in channel_names:
+        channel_values = _read_vector(path, channel_name, loaded_variables)
+        unit_label = _timeseries_unit(path, channel_name, loaded_variables)
+        rate_hz, file_times = stated_times(
+            channel_name,
+            channel_names,
+            len(channel_values),
+            names_in,
+            partial(_vector_from, path, loaded_variables),
         )
-        channels[name] = SourceChannel(values, unit_label=label, rate_hz=rate_hz, times=times)
+        channels[channel_name] = SourceChannel(
+            channel_values, unit_label=unit_label, rate_hz=rate_hz, times=file_times
+        )
     return channels
 
 
-def _vector_from(path: Path, contents: Mapping[str, Any], name: str) -> NDArray[Any]:
-    """Return the values of a channel; the argument order allows `functools.partial`."""
-    return _read_vector(path, name, contents)
+def _vector_from(path: Path, variables: Mapping[str, Any], channel_name: str) -> NDArray[Any]:
+    """Return the values of a channel; `functools.partial` fills the arguments before its name."""
+    return _read_vector(path, channel_name, variables)
 
 
 _UNIT_FIELDS: Final = {"Time": "TimeInfo", "Data": "DataInfo"}
 """Field of a timeseries struct that states the unit of another field."""
 
 
-def _timeseries_unit(path: Path, name: str, contents: Mapping[str, Any]) -> str:
+def _timeseries_unit(path: Path, channel_name: str, variables: Mapping[str, Any]) -> str:
     """Return the unit stated in a struct with the fields of a timeseries, or an empty text."""
-    parent, _, field = name.rpartition(".")
-    if field not in _UNIT_FIELDS:
+    parent_name, _, field_name = channel_name.rpartition(".")
+    if field_name not in _UNIT_FIELDS:
         return ""
     try:
-        value = _find_value(path, f"{parent}.{_UNIT_FIELDS[field]}.Units", contents)
+        unit_value = _find_value(path, f"{parent_name}.{_UNIT_FIELDS[field_name]}.Units", variables)
     except ExchangeError:
         return ""
-    return str(value.reshape(-1)[0]) if value.dtype.kind == "U" and value.size == 1 else ""
+    return (
+        str(unit_value.reshape(-1)[0])
+        if unit_value.dtype.kind == "U" and unit_value.size == 1
+        else ""
+    )
 
 
 def _split_name(name: str, variables: Container[str]) -> tuple[str, list[str], int | None]:
     """Split a channel's name ``log.angle#2`` into variable, fields and column index (from 0)."""
-    column = None
+    column_index = None
     if name not in variables:
-        name_part, separator, number = name.rpartition("#")
-        if separator and number.isdecimal() and int(number) > 0:
-            name, column = name_part, int(number) - 1
-    variable, *fields = name.split(".")
-    return variable, fields, column
+        name_part, separator, column_number = name.rpartition("#")
+        if separator and column_number.isdecimal() and int(column_number) > 0:
+            name, column_index = name_part, int(column_number) - 1
+    variable, *field_names = name.split(".")
+    return variable, field_names, column_index
 
 
 _ELEMENT_PATTERN: Final = re.compile(r"(.+)\((\d+)\)")
@@ -145,34 +173,37 @@ _ELEMENT_PATTERN: Final = re.compile(r"(.+)\((\d+)\)")
 
 def _split_element(text: str) -> tuple[str, int | None]:
     """Split ``log(2)`` into name and element index (from 0); the index is None without one."""
-    match = _ELEMENT_PATTERN.fullmatch(text)
-    return (match[1], int(match[2]) - 1) if match else (text, None)
+    element_match = _ELEMENT_PATTERN.fullmatch(text)
+    return (element_match[1], int(element_match[2]) - 1) if element_match else (text, None)
 
 
-def _read_vector(path: Path, name: str, contents: Mapping[str, Any]) -> NDArray[Any]:
+def _read_vector(path: Path, channel_name: str, variables: Mapping[str, Any]) -> NDArray[Any]:
     """Return the values of a channel, given its name in the file."""
     return _vector_or_column(
-        path, name, _find_value(path, name, contents), _split_name(name, contents)[2]
+        path,
+        channel_name,
+        _find_value(path, channel_name, variables),
+        _split_name(channel_name, variables)[2],
     )
 
 
-def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def _find_value(path: Path, name: str, variables: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return a variable, or a field of a struct or of an element of a struct array."""
-    variable, fields, _ = _split_name(name, contents)
-    value: Any = None
+    variable, field_names, _ = _split_name(name, variables)
+    found_value: Any = None
     parent_name = ""
-    for depth, component in enumerate((variable, *fields)):
-        key, element = _split_element(component)
-        if depth:
-            dtype = getattr(value, "dtype", None)
+    for component_index, name_component in enumerate((variable, *field_names)):
+        key, element_index = _split_element(name_component)
+        if component_index:
+            dtype = getattr(found_value, "dtype", None)
             if dtype is None or dtype.names is None:
                 raise ExchangeError(
                     f"{path}: '{name}' asks for a field '{key}', but its parent '{parent_name}' is "
                     "not "
                     "one struct."
                 )
-            if value.size != 1:
-                shape_text = "×".join(map(str, value.shape))
+            if found_value.size != 1:
+                shape_text = "×".join(map(str, found_value.shape))
                 raise ExchangeError(
                     f"{path}: '{parent_name}' is a struct array of {shape_text}, not one struct; "
                     "name one of "
@@ -183,63 +214,72 @@ def _find_value(path: Path, name: str, contents: Mapping[str, Any]) -> Any:  # n
                 raise no_such_channel_error(
                     path, name, (f"{parent_name}.{field}" for field in dtype.names)
                 )
-            value = value.reshape(-1)[0][key]
-        elif key not in contents:
-            raise no_such_channel_error(path, name, contents)
+            found_value = found_value.reshape(-1)[0][key]
+        elif key not in variables:
+            raise no_such_channel_error(path, name, variables)
         else:
-            value = contents[key]
-        parent_name = f"{parent_name}.{component}" if depth else component
-        if element is not None:
-            count = getattr(value, "size", 0)
-            if not 0 <= element < count:
+            found_value = variables[key]
+        parent_name = f"{parent_name}.{name_component}" if component_index else name_component
+        if element_index is not None:
+            element_count = getattr(found_value, "size", 0)
+            if not 0 <= element_index < element_count:
                 raise ExchangeError(
-                    f"{path}: '{parent_name}' is not there; '{key}' has {count} elements."
+                    f"{path}: '{parent_name}' is not there; '{key}' has {element_count} elements."
                 )
-            value = value.reshape(-1, order="F")[element : element + 1]
-    return value
+            found_value = found_value.reshape(-1, order="F")[element_index : element_index + 1]
+    return found_value
 
 
 _OBJECT_TYPES: Final = ("MatlabOpaque", "MatlabObject", "MatlabFunction")
 """Types by which scipy represents MATLAB objects that it cannot read."""
 
 
-def _vector_or_column(path: Path, name: str, value: Any, column: int | None) -> NDArray[Any]:  # noqa: ANN401
+def _vector_or_column(
+    path: Path,
+    channel_name: str,
+    array: Any,  # noqa: ANN401
+    column_index: int | None,
+) -> NDArray[Any]:
     """Return an array as a vector of floats, or one column of it; raise if it is neither."""
-    shape = getattr(value, "shape", None)
-    if type(value).__name__ in _OBJECT_TYPES:
+    array_shape = getattr(array, "shape", None)
+    if type(array).__name__ in _OBJECT_TYPES:
         raise ExchangeError(
-            f"{path}: '{name}' is an object of MATLAB (timeseries, table, datetime or the like); "
-            "save its values as vectors, such as t = x.Time; angle = x.Data."
+            f"{path}: '{channel_name}' is an object of MATLAB (timeseries, table, datetime or the "
+            "like); save its values as vectors, such as t = x.Time; angle = x.Data."
         )
-    names = getattr(getattr(value, "dtype", None), "names", None)
-    if names:
-        field_names = ", ".join(f"{name}.{field}" for field in names[:12])
+    dtype_names = getattr(getattr(array, "dtype", None), "names", None)
+    if dtype_names:
+        field_names = ", ".join(f"{channel_name}.{field_name}" for field_name in dtype_names[:12])
         raise ExchangeError(
-            f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
+            f"{path}: '{channel_name}' is a struct; choose one of its fields: {field_names}."
         )
-    if shape is None or getattr(value, "dtype", None) is None or hasattr(value, "tocoo"):
-        raise ExchangeError(f"{path}: '{name}' is not a full array of numbers; save it as one.")
-    check_samples(path, f"'{name}'", max(shape, default=0))
-    if column is None:
-        if value.size != max(shape, default=0):
-            shape_text = "×".join(map(str, shape))
+    if array_shape is None or getattr(array, "dtype", None) is None or hasattr(array, "tocoo"):
+        raise ExchangeError(
+            f"{path}: '{channel_name}' is not a full array of numbers; save it as one."
+        )
+    check_samples(path, f"'{channel_name}'", max(array_shape, default=0))
+    if column_index is None:
+        if array.size != max(array_shape, default=0):
+            shape_text = "×".join(map(str, array_shape))
             raise ExchangeError(
-                f"{path}: '{name}' is a matrix of {shape_text}; name one of its columns, such as "
-                f"{name}#1."
+                f"{path}: '{channel_name}' is a matrix of {shape_text}; name one of its columns, "
+                f"such as {channel_name}#1."
             )
-        return real_vector(path, name, value.reshape(-1))
-    if value.ndim != 2 or column >= value.shape[1]:
-        shape_text = "×".join(map(str, shape))
-        raise ExchangeError(f"{path}: '{name}' is not a column of it, its size is {shape_text}.")
-    if value.shape[0] < value.shape[1]:
+        return real_vector(path, channel_name, array.reshape(-1))
+    if array.ndim != 2 or column_index >= array.shape[1]:
+        shape_text = "×".join(map(str, array_shape))
         raise ExchangeError(
-            f"{path}: '{name}' has {value.shape[0]} values, fewer than there are columns "
-            f"({value.shape[1]}); channels are columns: save the matrix transposed."
+            f"{path}: '{channel_name}' is not a column of it, its size is {shape_text}."
         )
-    return real_vector(path, name, value[:, column])
+    if array.shape[0] < array.shape[1]:
+        raise ExchangeError(
+            f"{path}: '{channel_name}' has {array.shape[0]} values, fewer than there are columns "
+            f"({array.shape[1]}); channels are columns: save the matrix transposed."
+        )
+    return real_vector(path, channel_name, array[:, column_index])
 
 
-def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
+def _read_hdf5(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
     """Read vectors from a MATLAB file of version 7.3, which is an HDF5 file."""
     try:
         import h5py
@@ -249,8 +289,11 @@ def _read_hdf5(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
             "package h5py."
         ) from error
     try:
-        with bounded_memory(), h5py.File(path, "r") as file:
-            return {name: _read_hdf5_channel(path, file, name, names, h5py) for name in names}
+        with bounded_memory(), h5py.File(path, "r") as hdf5_file:
+            return {
+                channel_name: _read_hdf5_channel(path, hdf5_file, channel_name, channel_names, h5py)
+                for channel_name in channel_names
+            }
     except (ExchangeError, MemoryError):
         raise
     except Exception as error:  # h5py raises many types on a damaged file
@@ -269,47 +312,55 @@ _NUMERIC_CLASSES: Final = (
 
 def _read_hdf5_channel(
     path: Path,
-    file: Any,  # noqa: ANN401
-    name: str,
-    names: Sequence[str],
+    hdf5_file: Any,  # noqa: ANN401
+    channel_name: str,
+    channel_names: Sequence[str],
     h5py: Any,  # noqa: ANN401
 ) -> SourceChannel:
     """Return one channel of a MATLAB file of version 7.3."""
 
     def names_in(parent: str) -> Sequence[str]:
         """Return the names of the members of a group of the file."""
-        group = file[parent.replace(".", "/")] if parent else file
+        group = hdf5_file[parent.replace(".", "/")] if parent else hdf5_file
         return list(group) if isinstance(group, h5py.Group) else ()
 
-    values = _read_hdf5_vector(path, file, name, h5py)
-    rate_hz, times = stated_times(
-        name, names, len(values), names_in, lambda other: _read_hdf5_vector(path, file, other, h5py)
+    channel_values = _read_hdf5_vector(path, hdf5_file, channel_name, h5py)
+    rate_hz, file_times = stated_times(
+        channel_name,
+        channel_names,
+        len(channel_values),
+        names_in,
+        lambda other: _read_hdf5_vector(path, hdf5_file, other, h5py),
     )
-    return SourceChannel(values, rate_hz=rate_hz, times=times)
+    return SourceChannel(channel_values, rate_hz=rate_hz, times=file_times)
 
 
-def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
-    """Return the values of one vector of a MATLAB file of version 7.3."""
-    variables = list(file)  # only names, as a link may lead into another file
-    variable, fields, column = _split_name(name, variables)
-    dataset = file
-    for component in (variable, *fields):
-        link = _hdf5_link(dataset, component, h5py)
+def _read_hdf5_vector(path: Path, hdf5_file: Any, channel_name: str, h5py: Any) -> NDArray[Any]:  # noqa: ANN401
+    """Return the values of the named vector of a MATLAB file of version 7.3."""
+    variable_names = list(hdf5_file)  # only names, as a link may lead into another file
+    variable, path_names, column_index = _split_name(channel_name, variable_names)
+    dataset = hdf5_file
+    for name_component in (variable, *path_names):
+        link = _hdf5_link(dataset, name_component, h5py)
         if link is None:
             raise no_such_channel_error(
-                path, name, (member for member in variables if not member.startswith("#"))
+                path,
+                channel_name,
+                (member_name for member_name in variable_names if not member_name.startswith("#")),
             )
         if not isinstance(link, h5py.HardLink):
-            raise _external_data_error(path, name)
-        dataset = dataset[component]
+            raise _external_data_error(path, channel_name)
+        dataset = dataset[name_component]
     if not isinstance(dataset, h5py.Dataset):
-        field_names = ", ".join(f"{name}.{member}" for member in list(dataset)[:12])
+        field_names = ", ".join(
+            f"{channel_name}.{member_name}" for member_name in list(dataset)[:12]
+        )
         raise ExchangeError(
-            f"{path}: '{name}' is a struct; choose one of its fields: {field_names}."
+            f"{path}: '{channel_name}' is a struct; choose one of its fields: {field_names}."
         )
     if dataset.is_virtual or dataset.external:
-        raise _external_data_error(path, name)
-    check_samples(path, f"'{name}'", max(dataset.shape or (), default=0))
+        raise _external_data_error(path, channel_name)
+    check_samples(path, f"'{channel_name}'", max(dataset.shape or (), default=0))
     matlab_class = dataset.attrs.get("MATLAB_class", b"double")
     matlab_class = (
         matlab_class.decode("ascii", "replace")
@@ -322,19 +373,19 @@ def _read_hdf5_vector(path: Path, file: Any, name: str, h5py: Any) -> NDArray[An
         or "MATLAB_empty" in dataset.attrs
     ):
         raise ExchangeError(
-            f"{path}: '{name}' holds no numbers but is of MATLAB's class {matlab_class}, a struct "
-            "array or "
+            f"{path}: '{channel_name}' holds no numbers but is of MATLAB's class {matlab_class}, a "
+            "struct array or "
             "empty; save the values of one record as vectors, such as angle = log(1).angle."
         )
     # HDF5 stores dimensions in the reverse order, so that MATLAB's columns are its rows.
-    return _vector_or_column(path, name, dataset[()].T, column)
+    return _vector_or_column(path, channel_name, dataset[()].T, column_index)
 
 
-def _hdf5_link(group: Any, name: str, h5py: Any) -> object:  # noqa: ANN401
+def _hdf5_link(hdf5_group: Any, member_name: str, h5py: Any) -> object:  # noqa: ANN401
     """Return the link to a member of a group, not followed; None without such a member."""
-    if not isinstance(group, h5py.Group) or "/" in name or name in ("", "."):
+    if not isinstance(hdf5_group, h5py.Group) or "/" in member_name or member_name in ("", "."):
         return None
-    return group.get(name, getlink=True)
+    return hdf5_group.get(member_name, getlink=True)
 
 
 def _external_data_error(path: Path, name: str) -> ExchangeError:
@@ -356,11 +407,11 @@ def write_mat(table: ExportTable, stream: BinaryIO) -> None:
     """
     from scipy.io import savemat
 
-    variables = {column.name: column.values for column in (table.axis, *table.columns)}
+    mat_variables = {column.name: column.values for column in (table.axis, *table.columns)}
     savemat(
         stream,
         {
-            **variables,
+            **mat_variables,
             "information": {
                 _field_name(k): _metadata_value(k, v) for k, v in table.information.items()
             },
@@ -381,12 +432,12 @@ _LARGEST_EXACT: Final = 2**53
 
 def _metadata_value(key: str, text: str) -> str | float | NDArray[Any]:
     """Return the value of a metadata text: a number, a row of numbers, or the text."""
-    entries = [entry.strip() for entry in text.split(",")]
+    text_entries = [entry.strip() for entry in text.split(",")]
     is_text = key in _TEXT_KEYS or (key.startswith(META_PREFIX) and not unit_of(key))
-    if is_text or not all(map(_NUMBER_PATTERN.fullmatch, entries)):
+    if is_text or not all(map(_NUMBER_PATTERN.fullmatch, text_entries)):
         return text
-    if len(entries) > 1:
-        return np.array([list(map(float, entries))])
+    if len(text_entries) > 1:
+        return np.array([list(map(float, text_entries))])
     if text.strip().isdecimal() and _LARGEST_EXACT < int(text) < 2**63:
         return np.array([[int(text)]], dtype=np.int64)
     return float(text)
@@ -394,5 +445,5 @@ def _metadata_value(key: str, text: str) -> str | float | NDArray[Any]:
 
 def _field_name(key: str) -> str:
     """Return a valid MATLAB field name for a key."""
-    name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in key)
-    return (name if name[:1].isalpha() else f"x{name}")[:63]
+    field_name = "".join(c if c.isascii() and (c.isalnum() or c == "_") else "_" for c in key)
+    return (field_name if field_name[:1].isalpha() else f"x{field_name}")[:63]

@@ -23,44 +23,54 @@ _PERIOD_NAMES: Final = (
 """Names, in lower case, of variables with a sample period in seconds."""
 
 
-def states_time(name: str) -> bool:
+def states_time(field_name: str) -> bool:
     """Return whether a variable or field with this name has times, a rate or a period."""
-    return is_title_of_times(name) or name.lower() in _RATE_NAMES + _PERIOD_NAMES
+    return is_title_of_times(field_name) or field_name.lower() in _RATE_NAMES + _PERIOD_NAMES
 
 
 def stated_times(
-    name: str,
-    names: Sequence[str],
-    length: int,
-    siblings: Callable[[str], Iterable[str]],
-    vector: Callable[[str], NDArray[Any]],
+    channel_name: str,
+    channel_names: Sequence[str],
+    sample_count: int,
+    sibling_names: Callable[[str], Iterable[str]],
+    read_vector: Callable[[str], NDArray[Any]],
 ) -> tuple[float | None, FileTimes | None]:
     """Return sampling rate and times of a channel, from its struct or the structs that contain it.
 
-    `names` are the requested channels, which are not searched. `length` is the channel's number of
-    samples. `siblings` returns the names of the fields of a struct, or of the variables of the file
-    for an empty name. `vector` returns the values of a name. Both results are None without such a
-    statement in the file.
+    `channel_names` are the requested channels, which are not searched. `sample_count` is the
+    channel's number of samples. `sibling_names` returns the names of the fields of a struct, or of
+    the variables of the file for an empty name. `read_vector` returns the values of the variable
+    or field of a name. The rate in Hz or the times are None if the file does not state them.
     """
-    parent = name.rpartition("#")[0] or name
-    while parent:
-        parent = parent.rpartition(".")[0]
+    parent_name = channel_name.rpartition("#")[0] or channel_name
+    while parent_name:
+        parent_name = parent_name.rpartition(".")[0]
         rate_hz: float | None = None
-        times: FileTimes | None = None
-        for field in siblings(parent):
-            sibling = f"{parent}.{field}" if parent else field
-            if sibling in names or not states_time(field):
+        file_times: FileTimes | None = None
+        for field_name in sibling_names(parent_name):
+            sibling_name = f"{parent_name}.{field_name}" if parent_name else field_name
+            if sibling_name in channel_names or not states_time(field_name):
                 continue
             try:
-                values = vector(sibling)
+                sibling_values = read_vector(sibling_name)
             except ExchangeError:  # the variable is a text or a struct
                 continue
-            if len(values) == 1 and values[0] > 0 and field.lower() in _RATE_NAMES:
-                rate_hz = float(values[0])
-            elif len(values) == 1 and values[0] > 0 and field.lower() in _PERIOD_NAMES:
-                rate_hz = 1 / float(values[0])
-            elif len(values) == length and is_title_of_times(field):
-                times = FileTimes(sibling, values, time_unit_s(field.rpartition("_")[2]))
-        if rate_hz is not None or times is not None:
-            return rate_hz, times
+            if (
+                len(sibling_values) == 1
+                and sibling_values[0] > 0
+                and field_name.lower() in _RATE_NAMES
+            ):
+                rate_hz = float(sibling_values[0])
+            elif (
+                len(sibling_values) == 1
+                and sibling_values[0] > 0
+                and field_name.lower() in _PERIOD_NAMES
+            ):
+                rate_hz = 1 / float(sibling_values[0])
+            elif len(sibling_values) == sample_count and is_title_of_times(field_name):
+                file_times = FileTimes(
+                    sibling_name, sibling_values, time_unit_s(field_name.rpartition("_")[2])
+                )
+        if rate_hz is not None or file_times is not None:
+            return rate_hz, file_times
     return None, None

@@ -26,12 +26,15 @@ def write_json(variables: Variables, stream: BinaryIO) -> None:
     """
     from analysis.results import finite
 
-    content = finite({name: _json_value(value) for name, value in variables.items()})
-    lines = (
-        f"{json.dumps(name)}: {json.dumps(value, ensure_ascii=False, allow_nan=False)}"
-        for name, value in content.items()
+    json_content = finite(
+        {variable_name: _json_value(json_value) for variable_name, json_value in variables.items()}
     )
-    stream.write(("{\n" + ",\n".join(lines) + "\n}\n").encode())
+    json_lines = (
+        f"{json.dumps(variable_name)}: "
+        f"{json.dumps(json_value, ensure_ascii=False, allow_nan=False)}"
+        for variable_name, json_value in json_content.items()
+    )
+    stream.write(("{\n" + ",\n".join(json_lines) + "\n}\n").encode())
 
 
 def write_npz(variables: Variables, stream: BinaryIO) -> None:
@@ -46,7 +49,10 @@ def write_npz(variables: Variables, stream: BinaryIO) -> None:
     """
     np.savez_compressed(
         stream,
-        **{name: _string_array(value, np.str_) for name, value in variables.items()},
+        **{
+            variable_name: _string_array(variable_value, np.str_)
+            for variable_name, variable_value in variables.items()
+        },
     )
 
 
@@ -66,7 +72,10 @@ def write_mat(variables: Variables, stream: BinaryIO) -> None:
 
     savemat(
         stream,
-        {name: _string_array(value, np.object_) for name, value in variables.items()},
+        {
+            variable_name: _string_array(variable_value, np.object_)
+            for variable_name, variable_value in variables.items()
+        },
         do_compression=True,
         oned_as="column",
     )

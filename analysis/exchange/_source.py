@@ -111,7 +111,9 @@ _FORMATS: Final = {
 """File format by the suffix of the file's name."""
 
 
-def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, SourceChannel]]:
+def read_source(
+    path: Path, channel_names: Sequence[str]
+) -> tuple[str, Mapping[str, SourceChannel]]:
     """Read some channels of a measurement file of another program.
 
     Parameters
@@ -119,7 +121,7 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
     path : Path
         File whose suffix selects the format: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff,
         .unv or .uf58.
-    names : sequence of str
+    channel_names : sequence of str
         Names of the channels, as in docs/exchange.md.
 
     Returns
@@ -141,10 +143,10 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
             f"{', '.join(_FORMATS)}."
         )
     _check_file(path, file_format)
-    read: Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
-    read = import_module(f"analysis.exchange.{file_format.module}").read
+    read_format: Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
+    read_format = import_module(f"analysis.exchange.{file_format.module}").read
     try:
-        channels = read(path, names)
+        channels = read_format(path, channel_names)
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except MemoryError as error:
@@ -153,25 +155,27 @@ def read_source(path: Path, names: Sequence[str]) -> tuple[str, Mapping[str, Sou
             "read, so it is "
             "damaged or holds far more than a session; export the session's channels alone."
         ) from error
-    for name, channel in channels.items():
-        length = len(channel.values)
-        if length < 2:
-            raise ExchangeError(f"{path}: '{name}' has {length} samples, too few for a record.")
-        check_samples(path, f"The channel '{name}'", length)
+    for channel_name, channel in channels.items():
+        sample_count = len(channel.values)
+        if sample_count < 2:
+            raise ExchangeError(
+                f"{path}: '{channel_name}' has {sample_count} samples, too few for a record."
+            )
+        check_samples(path, f"The channel '{channel_name}'", sample_count)
     return file_format.name, channels
 
 
 def _check_file(path: Path, file_format: _Format) -> None:
     """Raise if a path is no regular file, or if the file is too large for its format."""
     try:
-        status = path.stat()
+        file_status = path.stat()
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
-    if not stat.S_ISREG(status.st_mode):
+    if not stat.S_ISREG(file_status.st_mode):
         raise ExchangeError(f"{path}: is not a file; give a file of measurements.")
-    if status.st_size > file_format.max_bytes:
+    if file_status.st_size > file_format.max_bytes:
         raise ExchangeError(
-            f"{path}: has {status.st_size / _MEGABYTE:.0f} MB, more than the "
+            f"{path}: has {file_status.st_size / _MEGABYTE:.0f} MB, more than the "
             f"{file_format.max_bytes / _MEGABYTE:.0f} "
             f"MB of {file_format.name} that are read; export the session's channels alone."
         )
@@ -179,12 +183,16 @@ def _check_file(path: Path, file_format: _Format) -> None:
 
 def check_lengths(path: Path, channels: Mapping[str, SourceChannel]) -> None:
     """Raise if channels have different numbers of samples."""
-    lengths = {name: len(channel.values) for name, channel in channels.items()}
-    if len(set(lengths.values())) > 1:
-        listed = ", ".join(f"{name} {length}" for name, length in lengths.items())
+    sample_counts = {
+        channel_name: len(channel.values) for channel_name, channel in channels.items()
+    }
+    if len(set(sample_counts.values())) > 1:
+        counts_text = ", ".join(
+            f"{channel_name} {sample_count}" for channel_name, sample_count in sample_counts.items()
+        )
         raise ExchangeError(
-            f"{path}: the channels have different numbers of samples ({listed}); choose channels "
-            "that were sampled together, or cut them to the same samples."
+            f"{path}: the channels have different numbers of samples ({counts_text}); choose "
+            "channels that were sampled together, or cut them to the same samples."
         )
 
 
@@ -210,16 +218,18 @@ def bounded_memory(extra_bytes: int = MAX_MEMORY_BYTES) -> Iterator[None]:
         yield
         return
     try:
-        pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+        page_count = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     except OSError:
         yield
         return
     soft_limit, hard_limit = resource.getrlimit(resource.RLIMIT_AS)
-    new_limit = pages * resource.getpagesize() + extra_bytes
-    limits = [
-        limit for limit in (soft_limit, hard_limit, new_limit) if limit != resource.RLIM_INFINITY
+    new_limit = page_count * resource.getpagesize() + extra_bytes
+    memory_limits = [
+        memory_limit
+        for memory_limit in (soft_limit, hard_limit, new_limit)
+        if memory_limit != resource.RLIM_INFINITY
     ]
-    resource.setrlimit(resource.RLIMIT_AS, (min(limits), hard_limit))
+    resource.setrlimit(resource.RLIMIT_AS, (min(memory_limits), hard_limit))
     try:
         yield
     finally:
@@ -244,22 +254,34 @@ _MOST_NAME_CHARACTERS: Final = 60
 """Largest number of characters of each channel name in a message."""
 
 
-def no_such_channel_error(path: Path, name: str, available: Iterable[str]) -> ExchangeError:
+def no_such_channel_error(
+    path: Path, requested_name: str, available: Iterable[str]
+) -> ExchangeError:
     """Return the error for a channel that is missing, with the names of the available channels."""
-    names = list(available)
-    listed = ", ".join(
-        repr(printable(channel, _MOST_NAME_CHARACTERS)) for channel in names[:_MOST_NAMES_LISTED]
+    available_names = list(available)
+    listed_text = ", ".join(
+        repr(printable(channel_name, _MOST_NAME_CHARACTERS))
+        for channel_name in available_names[:_MOST_NAMES_LISTED]
     )
-    more = f" and {len(names) - _MOST_NAMES_LISTED} more" if len(names) > _MOST_NAMES_LISTED else ""
+    more_text = (
+        f" and {len(available_names) - _MOST_NAMES_LISTED} more"
+        if len(available_names) > _MOST_NAMES_LISTED
+        else ""
+    )
     return ExchangeError(
-        f"{path}: has no channel '{name}'; it has {listed}{more}."
-        if names
-        else f"{path}: has no channel '{name}', and no other either."
+        f"{path}: has no channel '{requested_name}'; it has {listed_text}{more_text}."
+        if available_names
+        else f"{path}: has no channel '{requested_name}', and no other either."
     )
 
 
 def channel_index(
-    path: Path, name: str, titles: Sequence[str], duplicates_text: str, *, numbered: bool = False
+    path: Path,
+    channel_name: str,
+    titles: Sequence[str],
+    duplicates_text: str,
+    *,
+    numbered: bool = False,
 ) -> int:
     """Return the index of a channel that is given by its title or by its number, as ``#3``.
 
@@ -268,21 +290,27 @@ def channel_index(
     a message lists the titles with their numbers. Raise ExchangeError without exactly one such
     channel.
     """
-    count = titles.count(name)
-    if count == 1:
-        return titles.index(name)
-    if count > 1:
+    title_count = titles.count(channel_name)
+    if title_count == 1:
+        return titles.index(channel_name)
+    if title_count > 1:
         raise ExchangeError(
-            f"{path}: {count} {duplicates_text} '{name}'; give the number, such as "
-            f"#{titles.index(name) + 1} for the first of them."
+            f"{path}: {title_count} {duplicates_text} '{channel_name}'; give the number, such as "
+            f"#{titles.index(channel_name) + 1} for the first of them."
         )
-    number = name.removeprefix("#")
-    if name != number and number.isdecimal() and 0 < int(number) <= len(titles):
-        return int(number) - 1
-    listed = (
-        [f"#{number} {title}" for number, title in enumerate(titles, 1)] if numbered else titles
+    channel_number = channel_name.removeprefix("#")
+    if (
+        channel_name != channel_number
+        and channel_number.isdecimal()
+        and 0 < int(channel_number) <= len(titles)
+    ):
+        return int(channel_number) - 1
+    listed_titles = (
+        [f"#{channel_number} {title}" for channel_number, title in enumerate(titles, 1)]
+        if numbered
+        else titles
     )
-    raise no_such_channel_error(path, name, listed)
+    raise no_such_channel_error(path, channel_name, listed_titles)
 
 
 def real_vector(path: Path, name: str, values: NDArray[np.generic]) -> NDArray[np.float64]:
@@ -306,9 +334,9 @@ def not_in_time_error(path: Path, name: str) -> ExchangeError:
     )
 
 
-def missing_library_error(path: Path, library: str) -> ExchangeError:
+def missing_library_error(path: Path, library_name: str) -> ExchangeError:
     """Return the error for a library that is not installed."""
     return ExchangeError(
-        f"{path}: needs the package {library}, which is not installed; install all packages for "
-        "import and export with `pip install 'rigd[exchange]'`."
+        f"{path}: needs the package {library_name}, which is not installed; install all packages "
+        "for import and export with `pip install 'rigd[exchange]'`."
     )

@@ -56,9 +56,10 @@ class SpecimenFile:
 def read_specimen(path: Path) -> SpecimenFile:
     """Read beam, tool inertia, tilt and uncertainties of a specimen from a TOML file.
 
-    Only ``[beam]`` is required. A number is plain or, as in a profile, ``{ value = 0.98, source =
-    "measured" }``. Other entries of a profile are not used, because delays, rate and limits are
-    those of the rig's own recorder.
+    Only ``[beam]`` is required. A number is given alone or, as in a profile, with the statement
+    where it comes from: ``{ value = 0.98, source = "measured" }``. Other entries of a profile are
+    not used, because delays, rate and limits are those of the rig's own
+    recorder.
 
     Raises
     ------
@@ -73,16 +74,17 @@ def read_specimen(path: Path) -> SpecimenFile:
     0.98
     """
     try:
-        content = parse_toml(read_text(path))
+        file_content = parse_toml(read_text(path))
     except DocumentError as error:
         raise ExchangeError(f"{path}: {error}.") from error
-    rig, beam, sensor, uncertainty = (
-        _read_section(path, content, name) for name in ("rig", "beam", "sensor", "uncertainty")
+    rig_section, beam_section, sensor_section, uncertainty_section = (
+        _read_section(path, file_content, quantity)
+        for quantity in ("rig", "beam", "sensor", "uncertainty")
     )
-    percent = partial(_number_in_range, path, "uncertainty", uncertainty, low=0.0)
+    percent_number = partial(_number_in_range, path, "uncertainty", uncertainty_section, low=0.0)
     tool_inertia_kg_m2 = 0.0
-    if "tool_inertia_kg_m2" in sensor:
-        tool_inertia_kg_m2 = _required_number(path, "sensor", sensor, "tool_inertia_kg_m2")
+    if "tool_inertia_kg_m2" in sensor_section:
+        tool_inertia_kg_m2 = _required_number(path, "sensor", sensor_section, "tool_inertia_kg_m2")
         if tool_inertia_kg_m2 < 0.0:
             raise ExchangeError(
                 f"{path}: sensor.tool_inertia_kg_m2 is {tool_inertia_kg_m2:g} kg·m², but an "
@@ -90,65 +92,84 @@ def read_specimen(path: Path) -> SpecimenFile:
             )
     return SpecimenFile(
         Beam(
-            length_m=_positive_number(path, beam, "length_m"),
-            density_kg_per_m=_positive_number(path, beam, "density_kg_per_m"),
-            bending_stiffness_n_m2=_positive_number(path, beam, "bending_stiffness_n_m2"),
+            length_m=_positive_number(path, beam_section, "length_m"),
+            density_kg_per_m=_positive_number(path, beam_section, "density_kg_per_m"),
+            bending_stiffness_n_m2=_positive_number(path, beam_section, "bending_stiffness_n_m2"),
         ),
         tool_inertia_kg_m2,
         {
-            name: value
-            for name in UNCERTAIN_QUANTITIES
-            if (value := percent(f"{name}_percent", high=MAX_UNCERTAINTY_PERCENT)) is not None
+            quantity: percent_value
+            for quantity in UNCERTAIN_QUANTITIES
+            if (
+                percent_value := percent_number(f"{quantity}_percent", high=MAX_UNCERTAINTY_PERCENT)
+            )
+            is not None
         },
-        percent("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
-        _number_in_range(path, "beam", beam, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
+        percent_number("uniformity_percent", high=MAX_UNIFORMITY_PERCENT),
+        _number_in_range(path, "beam", beam_section, "tip_mass_kg", low=0.0, high=MAX_TIP_MASS_KG),
         _number_in_range(
-            path, "rig", rig, "axis_tilt_deg", low=-MAX_AXIS_TILT_DEG, high=MAX_AXIS_TILT_DEG
+            path,
+            "rig",
+            rig_section,
+            "axis_tilt_deg",
+            low=-MAX_AXIS_TILT_DEG,
+            high=MAX_AXIS_TILT_DEG,
         ),
     )
 
 
-def _read_section(path: Path, content: Mapping[str, Any], name: str) -> Mapping[str, Any]:
+def _read_section(path: Path, content: Mapping[str, Any], section_name: str) -> Mapping[str, Any]:
     """Return a section of the file, empty if absent; raise if the entry is no section."""
-    section = content.get(name, {})
+    section = content.get(section_name, {})
     if not isinstance(section, dict):
-        raise ExchangeError(f"{path}: {name} is not a section; write [{name}] with its keys below.")
+        raise ExchangeError(
+            f"{path}: {section_name} is not a section; write [{section_name}] with its keys below."
+        )
     return section
 
 
 def _positive_number(path: Path, section: Mapping[str, Any], key: str) -> float:
     """Return a positive number of the beam; raise if it is missing or not positive."""
-    value = _required_number(path, "beam", section, key)
-    if not value > 0.0:
+    number = _required_number(path, "beam", section, key)
+    if not number > 0.0:
         raise ExchangeError(
-            f"{path}: beam.{key} is {value:g} {unit_of(key)}, but must be positive."
+            f"{path}: beam.{key} is {number:g} {unit_of(key)}, but must be positive."
         )
-    return value
+    return number
 
 
 def _number_in_range(
-    path: Path, name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
+    path: Path, section_name: str, section: Mapping[str, Any], key: str, *, low: float, high: float
 ) -> float | None:
     """Return an optional number of a section within a range, or None if it is not stated."""
     if key not in section:
         return None
-    value = _required_number(path, name, section, key)
-    if not low <= value <= high:
+    number = _required_number(path, section_name, section, key)
+    if not low <= number <= high:
         raise ExchangeError(
-            f"{path}: {name}.{key} is {value:g} {unit_of(key)}, but must lie between {low:g} and "
-            f"{high:g}."
+            f"{path}: {section_name}.{key} is {number:g} {unit_of(key)}, but must lie between "
+            f"{low:g} and {high:g}."
         )
-    return value
+    return number
 
 
-def _required_number(path: Path, name: str, section: Mapping[str, Any], key: str) -> float:
-    """Return a required number of a section, plain or with its source."""
-    value, unit = section.get(key), unit_of(key)
-    if isinstance(value, dict):
-        value = value.get("value")
-    if value is None:
-        raise ExchangeError(f"{path}: has no {name}.{key}; state it in {unit} in section [{name}].")
-    number = finite_number(value)
+def _required_number(path: Path, section_name: str, section: Mapping[str, Any], key: str) -> float:
+    """Return a required number of a section; raise ExchangeError without a finite number.
+
+    The entry is the number, or a table with the key ``value`` for it, as in a profile.
+    """
+    section_value, unit_text = section.get(key), unit_of(key)
+    if isinstance(section_value, dict):
+        section_value = section_value.get("value")
+    if section_value is None:
+        raise ExchangeError(
+            f"{path}: has no {section_name}.{key}; state it in {unit_text} in section "
+            f"[{section_name}]."
+        )
+    number = finite_number(section_value)
     if number is None:
-        raise ExchangeError(f"{path}: {name}.{key} is {value!r}, but must be a number in {unit}.")
+        raise ExchangeError(
+            f"{path}: {section_name}.{key} is {section_value!r}, but must be a number in "
+            f"{unit_text}."
+        )
     return number

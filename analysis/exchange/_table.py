@@ -49,7 +49,7 @@ class ExportColumn:
 
 @dataclass(frozen=True, slots=True)
 class ExportTable:
-    """Table for export: columns over a common axis.
+    """Table to be exported: columns of values over a common axis of times or frequencies.
 
     Attributes
     ----------
@@ -99,16 +99,19 @@ def record_table(path: Path) -> ExportTable:
             f"{path}: the session has {len(session.samples)} samples at {rate_hz:g} Hz; there is "
             "nothing to export."
         )
-    samples = session.samples
+    session_samples = session.samples
     return ExportTable(
         path.name,
-        ExportColumn("time_s", "Time", "s", samples["tick"] / rate_hz),
+        ExportColumn("time_s", "Time", "s", session_samples["tick"] / rate_hz),
         tuple(
             ExportColumn(
-                name, _COLUMN_TITLES[name], _ascii_unit(name), np.ascontiguousarray(samples[name])
+                field_name,
+                _COLUMN_TITLES[field_name],
+                _ascii_unit(field_name),
+                np.ascontiguousarray(session_samples[field_name]),
             )
-            for name in SAMPLE_FIELDS
-            if name in _COLUMN_TITLES
+            for field_name in SAMPLE_FIELDS
+            if field_name in _COLUMN_TITLES
         ),
         {**session.metadata, **_segment_texts(session.segments), **_origin_information(path)},
     )
@@ -131,21 +134,24 @@ def frf_table(
     record = load_record(path)
     settings = welch_settings(record, settings, band_hz)
     response, _ = estimate(record, settings)
-    columns = [
+    export_columns = [
         ExportColumn("response_nm_per_rad", "Coupling torque / Angle", "N.m/rad", response.response)
     ]
     if response.coherence is not None:
-        columns.append(ExportColumn("coherence", "Coherence", "", response.coherence))
+        export_columns.append(ExportColumn("coherence", "Coherence", "", response.coherence))
     segmentation = settings.segmentation(record.rate_hz)
     welch_lengths = {} if settings.estimator == "fft" else asdict(segmentation)
     return ExportTable(
         path.name,
         ExportColumn("frequency_hz", "Frequency", "Hz", response.frequency_hz),
-        tuple(columns),
+        tuple(export_columns),
         {
             "estimator": response.estimator,
             "segments": str(response.segments),
-            **{f"{name}_samples": str(value) for name, value in welch_lengths.items()},
+            **{
+                f"{column_name}_samples": str(column_values)
+                for column_name, column_values in welch_lengths.items()
+            },
             "rate_hz": repr(record.rate_hz),
             "angle_delay_removed_s": repr(record.angle_delay_s),
             "torque_delay_removed_s": repr(record.torque_delay_s),
@@ -166,8 +172,8 @@ def _ascii_unit(name: str) -> str:
 def _segment_texts(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     """Return first and end tick of each segment as text."""
     return {
-        f"segment_{name}_ticks": f"{first_tick},{end}"
-        for name, (first_tick, end) in segments.items()
+        f"segment_{segment_name}_ticks": f"{first_tick},{end_tick}"
+        for segment_name, (first_tick, end_tick) in segments.items()
     }
 
 

@@ -58,22 +58,31 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
     try:
         with path.open("rb") as stream:
             _check_entries(path, stream)
-            with bounded_memory(), TdmsFile.open(stream) as file:
-                channels = {
-                    f"{group.name}/{channel.name}": channel
-                    for group in file.groups()
-                    for channel in group.channels()
+            with bounded_memory(), TdmsFile.open(stream) as tdms_file:
+                channels_by_name = {
+                    f"{tdms_group.name}/{channel.name}": channel
+                    for tdms_group in tdms_file.groups()
+                    for channel in tdms_group.channels()
                 }
-                is_cut_off = file.file_status.incomplete_final_segment
+                is_cut_off = tdms_file.file_status.incomplete_final_segment
                 source_channels = {
-                    name: _read_channel(path, name, channels, is_cut_off) for name in names
+                    channel_name: _read_channel(path, channel_name, channels_by_name, is_cut_off)
+                    for channel_name in names
                 }
-                for name in names:
-                    levels = (channels[name], file[channels[name].group_name], file)
-                    scale = _unapplied_scale([level.properties for level in levels])
-                    times = _group_times(path, name, names, channels)
-                    source_channels[name] = replace(
-                        source_channels[name], unapplied_scale=scale, times=times
+                for channel_name in names:
+                    property_levels = (
+                        channels_by_name[channel_name],
+                        tdms_file[channels_by_name[channel_name].group_name],
+                        tdms_file,
+                    )
+                    unapplied_scale = _unapplied_scale(
+                        [property_level.properties for property_level in property_levels]
+                    )
+                    group_times = _group_times(path, channel_name, names, channels_by_name)
+                    source_channels[channel_name] = replace(
+                        source_channels[channel_name],
+                        unapplied_scale=unapplied_scale,
+                        times=group_times,
                     )
                 return _drop_relative_starts(source_channels)
     except (ExchangeError, OSError, MemoryError):
@@ -87,22 +96,24 @@ def read(path: Path, names: Sequence[str]) -> Mapping[str, SourceChannel]:
 
 def _check_entries(path: Path, stream: BinaryIO) -> None:
     """Raise if the table of contents would take minutes or gigabytes to read."""
-    size = path.stat().st_size
-    offset = channels = entries = 0
-    while offset + _LEAD_IN_BYTES <= size and entries <= _MOST_LISTED_CHANNELS:
-        stream.seek(offset)
+    file_bytes = path.stat().st_size
+    segment_offset = total_channels = entry_count = 0
+    while segment_offset + _LEAD_IN_BYTES <= file_bytes and entry_count <= _MOST_LISTED_CHANNELS:
+        stream.seek(segment_offset)
         lead_in = stream.read(_LEAD_IN_BYTES + 4)
-        contents = int.from_bytes(lead_in[4:8], "little")
-        byte_order = ">" if contents & _BIG_ENDIAN else "<"
-        (length,) = struct.unpack(f"{byte_order}Q", lead_in[12:20])
-        if contents & _HAS_METADATA and len(lead_in) == _LEAD_IN_BYTES + 4:
+        contents_mask = int.from_bytes(lead_in[4:8], "little")
+        byte_order = ">" if contents_mask & _BIG_ENDIAN else "<"
+        (segment_bytes,) = struct.unpack(f"{byte_order}Q", lead_in[12:20])
+        if contents_mask & _HAS_METADATA and len(lead_in) == _LEAD_IN_BYTES + 4:
             (channel_count,) = struct.unpack(f"{byte_order}L", lead_in[_LEAD_IN_BYTES:])
-            channels = channel_count if contents & _NEW_LIST else channels + channel_count
-            entries += channels
-        entries += 1
-        offset += _LEAD_IN_BYTES + length
+            total_channels = (
+                channel_count if contents_mask & _NEW_LIST else total_channels + channel_count
+            )
+            entry_count += total_channels
+        entry_count += 1
+        segment_offset += _LEAD_IN_BYTES + segment_bytes
     stream.seek(0)
-    if entries > _MOST_LISTED_CHANNELS:
+    if entry_count > _MOST_LISTED_CHANNELS:
         raise ExchangeError(
             f"{path}: its segments list more than {_MOST_LISTED_CHANNELS} channels in all, so it "
             "is "
@@ -113,25 +124,31 @@ def _check_entries(path: Path, stream: BinaryIO) -> None:
 def _read_channel(
     path: Path, name: str, channels: Mapping[str, Any], is_cut_off: bool
 ) -> SourceChannel:
-    """Return one channel; `is_cut_off` states that the end of the file is missing."""
+    """Return one channel of a TDMS file.
+
+    `is_cut_off` states that the end of the file is missing, which is remarked in the channel.
+    """
     channel = channels.get(name)
     if channel is None:
         raise no_such_channel_error(path, name, channels)
     check_samples(path, f"The channel '{name}'", len(channel))
     properties = channel.properties
-    values, label = channel[:], str(properties.get("unit_string", ""))
-    if values.dtype.kind == "M":  # LabVIEW's time stamps
-        values, label = (values - values[:1]) / np.timedelta64(1, "s"), "s"
-    axis = str(properties.get("wf_xunit_string", "")).strip()
-    if _plain_lower_case(axis) in _FREQUENCY_UNITS:
-        raise ExchangeError(
-            f"{path}: '{name}' is a function of frequency (its wf_xunit_string is '{axis}'), not "
-            "of time; give measured samples."
+    channel_values, unit_label = channel[:], str(properties.get("unit_string", ""))
+    if channel_values.dtype.kind == "M":  # LabVIEW's time stamps
+        channel_values, unit_label = (
+            (channel_values - channel_values[:1]) / np.timedelta64(1, "s"),
+            "s",
         )
-    unit_s = time_unit_s(axis) or 1.0
+    axis_unit = str(properties.get("wf_xunit_string", "")).strip()
+    if _plain_lower_case(axis_unit) in _FREQUENCY_UNITS:
+        raise ExchangeError(
+            f"{path}: '{name}' is a function of frequency (its wf_xunit_string is '{axis_unit}'), "
+            "not of time; give measured samples."
+        )
+    unit_s = time_unit_s(axis_unit) or 1.0
     return SourceChannel(
-        real_vector(path, name, values),
-        unit_label=label or str(properties.get("NI_UnitDescription", "")),
+        real_vector(path, name, channel_values),
+        unit_label=unit_label or str(properties.get("NI_UnitDescription", "")),
         rate_hz=_rate_hz(properties.get("wf_increment"), unit_s),
         remark="The file's end is missing: its recording was cut off." if is_cut_off else "",
         start_ns=_start_ns(properties, unit_s),
@@ -148,7 +165,7 @@ def _plain_lower_case(text: str) -> str:
 
 
 def _rate_hz(increment: object, unit_s: float) -> float | None:
-    """Return the sampling rate in Hz for a time increment; None if it is not valid."""
+    """Return the sampling rate in Hz for an increment of time in `unit_s`; None if not valid."""
     if not isinstance(increment, int | float) or not 0 < increment < math.inf:
         return None
     return 1 / (increment * unit_s)
@@ -156,64 +173,64 @@ def _rate_hz(increment: object, unit_s: float) -> float | None:
 
 def _start_ns(properties: Mapping[str, Any], unit_s: float) -> int | None:
     """Return the time of the first sample in ns, from start time and offset; None without them."""
-    start, offset = properties.get("wf_start_time"), properties.get("wf_start_offset")
+    start_time, offset_s = properties.get("wf_start_time"), properties.get("wf_start_offset")
     start_time_ns = 0
-    if isinstance(start, np.datetime64) and start >= _EARLIEST_START:
-        start_time_ns = int(start.astype("datetime64[ns]").astype(np.int64))
-    elif offset is None and "wf_increment" not in properties:
+    if isinstance(start_time, np.datetime64) and start_time >= _EARLIEST_START:
+        start_time_ns = int(start_time.astype("datetime64[ns]").astype(np.int64))
+    elif offset_s is None and "wf_increment" not in properties:
         return None
-    if not isinstance(offset, int | float) or not math.isfinite(offset):
-        offset = 0.0
-    return start_time_ns + round(offset * unit_s * 1e9)
+    if not isinstance(offset_s, int | float) or not math.isfinite(offset_s):
+        offset_s = 0.0
+    return start_time_ns + round(offset_s * unit_s * 1e9)
 
 
 def _drop_relative_starts(channels: dict[str, SourceChannel]) -> dict[str, SourceChannel]:
     """Remove start times that are only offsets, if other channels have absolute start times."""
-    starts = [channel.start_ns or 0 for channel in channels.values()]
-    if max(starts) < _EARLIEST_START_NS:
+    starts_ns = [channel.start_ns or 0 for channel in channels.values()]
+    if max(starts_ns) < _EARLIEST_START_NS:
         return channels
     return {
-        name: channel
+        channel_name: channel
         if channel.start_ns is None or channel.start_ns >= _EARLIEST_START_NS
         else replace(channel, start_ns=None)
-        for name, channel in channels.items()
+        for channel_name, channel in channels.items()
     }
 
 
-def _unapplied_scale(levels: Sequence[Mapping[str, Any]]) -> str:
+def _unapplied_scale(property_levels: Sequence[Mapping[str, Any]]) -> str:
     """Return the types of scales stated in the properties that npTDMS does not apply."""
     from nptdms.scaling import get_scaling
 
-    for properties in levels:
-        types = [
-            str(value)
-            for key, value in properties.items()
+    for properties in property_levels:
+        scale_types = [
+            str(property_value)
+            for key, property_value in properties.items()
             if key.startswith("NI_Scale[") and key.endswith("]_Scale_Type")
         ]
-        if not types or properties.get("NI_Number_Of_Scales", len(types)) == 0:
+        if not scale_types or properties.get("NI_Number_Of_Scales", len(scale_types)) == 0:
             continue
         if properties.get("NI_Scaling_Status", "unscaled") == "scaled":
             continue
-        return "" if get_scaling(properties, {}, {}) is not None else ", ".join(types)
+        return "" if get_scaling(properties, {}, {}) is not None else ", ".join(scale_types)
     return ""
 
 
 def _group_times(
-    path: Path, name: str, names: Sequence[str], channels: Mapping[str, Any]
+    path: Path, channel_name: str, names: Sequence[str], channels: Mapping[str, Any]
 ) -> FileTimes | None:
     """Return the times in another channel of the same group, unless it was requested, or None."""
-    channel = channels[name]
-    for other, candidate in channels.items():
+    channel = channels[channel_name]
+    for other_name, other_channel in channels.items():
         if (
-            other in names
-            or candidate.group_name != channel.group_name
-            or not is_title_of_times(candidate.name)
-            or len(candidate) != len(channel)
+            other_name in names
+            or other_channel.group_name != channel.group_name
+            or not is_title_of_times(other_channel.name)
+            or len(other_channel) != len(channel)
         ):
             continue
         try:
-            time_channel = _read_channel(path, other, channels, False)
+            time_channel = _read_channel(path, other_name, channels, False)
         except ExchangeError:  # the channel has texts, for example
             continue
-        return FileTimes(other, time_channel.values, time_unit_s(time_channel.unit_label))
+        return FileTimes(other_name, time_channel.values, time_unit_s(time_channel.unit_label))
     return None

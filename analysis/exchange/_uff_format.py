@@ -77,29 +77,37 @@ def _read_channels(
 ) -> dict[str, SourceChannel]:
     """Return the requested channels from their data sets."""
     _check_set_count(path)
-    file = open_file(str(path))
-    set_numbers = [number for number, kind in enumerate(file.get_set_types()) if kind == 58]
-    titles = [file.read_sets(number, header_only=True)["id1"] for number in set_numbers]
-    numbers = {
-        name: channel_index(path, name, titles, "data sets have the title", numbered=True)
-        for name in names
-        if name != ABSCISSA
+    uff_file = open_file(str(path))
+    set_numbers = [
+        set_number for set_number, set_type in enumerate(uff_file.get_set_types()) if set_type == 58
+    ]
+    set_titles = [
+        uff_file.read_sets(set_number, header_only=True)["id1"] for set_number in set_numbers
+    ]
+    number_by_name = {
+        channel_name: channel_index(
+            path, channel_name, set_titles, "data sets have the title", numbered=True
+        )
+        for channel_name in names
+        if channel_name != ABSCISSA
     }
-    if not numbers:
+    if not number_by_name:
         raise ExchangeError(f"{path}: no channel but '{ABSCISSA}' was requested.")
-    channels, times, units = {}, [], []
-    for name, number in numbers.items():
-        function = file.read_sets(set_numbers[number])
-        stamps = np.asarray(function["x"], dtype=np.float64)
-        channels[name] = _source_channel(path, name, function, stamps, timed=ABSCISSA in names)
-        times.append(stamps)
-        units.append(_abscissa_unit(function))
+    channels, abscissae, abscissa_units = {}, [], []
+    for channel_name, set_number in number_by_name.items():
+        data_set = uff_file.read_sets(set_numbers[set_number])
+        set_abscissae = np.asarray(data_set["x"], dtype=np.float64)
+        channels[channel_name] = _source_channel(
+            path, channel_name, data_set, set_abscissae, timed=ABSCISSA in names
+        )
+        abscissae.append(set_abscissae)
+        abscissa_units.append(_abscissa_unit(data_set))
     if ABSCISSA in names:
         first_channel = next(iter(channels.values()))
         channels[ABSCISSA] = SourceChannel(
-            _common_times(path, channels, times),
-            unit_label=units[0],
-            rate_hz=None if units[0] else _even_rate_hz(function, 1.0),
+            _common_times(path, channels, abscissae),
+            unit_label=abscissa_units[0],
+            rate_hz=None if abscissa_units[0] else _even_rate_hz(data_set, 1.0),
             start_ns=first_channel.start_ns,
         )
     return channels
@@ -115,70 +123,80 @@ def _check_set_count(path: Path) -> None:
 
 
 def _source_channel(
-    path: Path, name: str, function: Mapping[str, Any], stamps: NDArray[np.float64], *, timed: bool
+    path: Path,
+    name: str,
+    data_set: Mapping[str, Any],
+    set_abscissae: NDArray[np.float64],
+    *,
+    timed: bool,
 ) -> SourceChannel:
-    """Return one channel; `timed` states whether the user requests the times as a channel."""
-    values = np.asarray(function["data"])
-    if values.dtype.kind == "c":
+    """Return one channel of a data set with the given abscissae `set_abscissae`.
+
+    `timed` states whether the user requests the abscissae as the channel of times.
+    """
+    set_values = np.asarray(data_set["data"])
+    if set_values.dtype.kind == "c":
         raise not_in_time_error(path, name)
-    unit = _abscissa_unit(function)
-    _check_time_response(path, name, function, unit)
-    if len(values) != function["num_pts"]:
+    abscissa_unit = _abscissa_unit(data_set)
+    _check_time_response(path, name, data_set, abscissa_unit)
+    if len(set_values) != data_set["num_pts"]:
         raise ExchangeError(
-            f"{path}: '{name}' has {len(values)} values and states {function['num_pts']}; the file "
-            "is damaged or was written incorrectly; export it again."
+            f"{path}: '{name}' has {len(set_values)} values and states {data_set['num_pts']}; the "
+            "file is damaged or was written incorrectly; export it again."
         )
-    check_samples(path, f"The data set '{name}'", len(values))
-    unit_s = time_unit_s(unit)
-    is_time = unit_s is not None or function["abscissa_spec_data_type"] == _TIME_CODE
-    is_even = function["abscissa_spacing"] == 1
-    start_s = float(stamps[0]) * (unit_s or 1.0) if len(stamps) else math.nan
-    label = _label_text(function, "ordinate_axis_units_lab")
+    check_samples(path, f"The data set '{name}'", len(set_values))
+    unit_s = time_unit_s(abscissa_unit)
+    is_time = unit_s is not None or data_set["abscissa_spec_data_type"] == _TIME_CODE
+    is_even = data_set["abscissa_spacing"] == 1
+    start_s = float(set_abscissae[0]) * (unit_s or 1.0) if len(set_abscissae) else math.nan
+    unit_label = _label_text(data_set, "ordinate_axis_units_lab")
     return SourceChannel(
-        real_vector(path, name, values),
-        unit_label=label or stated_unit_of(_label_text(function, "ordinate_axis_lab")),
-        rate_hz=_even_rate_hz(function, unit_s or 1.0) if is_time and not timed else None,
+        real_vector(path, name, set_values),
+        unit_label=unit_label or stated_unit_of(_label_text(data_set, "ordinate_axis_lab")),
+        rate_hz=_even_rate_hz(data_set, unit_s or 1.0) if is_time and not timed else None,
         start_ns=round(start_s * 1e9) if math.isfinite(start_s) else None,
-        times=FileTimes(ABSCISSA, stamps, unit_s)
+        times=FileTimes(ABSCISSA, set_abscissae, unit_s)
         if is_time and not is_even and not timed
         else None,
     )
 
 
-def _label_text(function: Mapping[str, Any], key: str) -> str:
+def _label_text(data_set: Mapping[str, Any], key: str) -> str:
     """Return a label of a data set, or an empty text without a label."""
-    text = str(function.get(key) or "").strip()
-    return "" if text.upper() == "NONE" else text
+    label_text = str(data_set.get(key) or "").strip()
+    return "" if label_text.upper() == "NONE" else label_text
 
 
-def _abscissa_unit(function: Mapping[str, Any]) -> str:
-    """Return the unit of a data set's abscissa as stated, or an empty text."""
-    return _label_text(function, "abscissa_axis_units_lab") or stated_unit_of(
-        _label_text(function, "abscissa_axis_lab")
+def _abscissa_unit(data_set: Mapping[str, Any]) -> str:
+    """Return the stated unit of a data set's abscissa, or an empty text if none is stated."""
+    return _label_text(data_set, "abscissa_axis_units_lab") or stated_unit_of(
+        _label_text(data_set, "abscissa_axis_lab")
     )
 
 
-def _even_rate_hz(function: Mapping[str, Any], unit_s: float) -> float | None:
+def _even_rate_hz(data_set: Mapping[str, Any], unit_s: float) -> float | None:
     """Return the sampling rate of a data set with a constant increment, else None."""
-    increment_s = function["abscissa_inc"] * unit_s if function["abscissa_spacing"] == 1 else 0.0
+    increment_s = data_set["abscissa_inc"] * unit_s if data_set["abscissa_spacing"] == 1 else 0.0
     return 1 / increment_s if increment_s > 0 else None
 
 
-def _check_time_response(path: Path, name: str, function: Mapping[str, Any], unit: str) -> None:
+def _check_time_response(path: Path, name: str, data_set: Mapping[str, Any], unit: str) -> None:
     """Raise if a data set is a spectrum or another function that is not of time."""
-    function_type, axis = function["func_type"], function["abscissa_spec_data_type"]
-    label = _label_text(function, "abscissa_axis_lab")
+    function_type, axis_type = data_set["func_type"], data_set["abscissa_spec_data_type"]
+    axis_label = _label_text(data_set, "abscissa_axis_lab")
     contradiction = ""
     if function_type not in (_GENERAL_FUNCTION, _TIME_RESPONSE):
         contradiction = (
             f"its function type is {function_type}{_code_name(function_type, _FUNCTION_TYPES)}"
         )
-    elif axis not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_CODE):
-        contradiction = f"its abscissa is of type {axis}{_code_name(axis, _ABSCISSA_TYPES)}"
-    elif axis != _TIME_CODE and (
-        unit.lower() in ("hz", "khz", "rpm", "rad/s") or label.lower().startswith("freq")
+    elif axis_type not in (_UNKNOWN_AXIS, _GENERAL_AXIS, _TIME_CODE):
+        contradiction = (
+            f"its abscissa is of type {axis_type}{_code_name(axis_type, _ABSCISSA_TYPES)}"
+        )
+    elif axis_type != _TIME_CODE and (
+        unit.lower() in ("hz", "khz", "rpm", "rad/s") or axis_label.lower().startswith("freq")
     ):
-        contradiction = f"its abscissa is '{label or unit}'"
+        contradiction = f"its abscissa is '{axis_label or unit}'"
     if contradiction:
         raise ExchangeError(
             f"{path}: '{name}' is not a function of time: {contradiction}. A session is made of "
@@ -211,23 +229,36 @@ _ABSCISSA_TYPES: Final = {18: "frequency", 19: "rpm", 20: "order"}
 """Names of abscissa types that are not times, by their codes."""
 
 
-def _common_times(path: Path, channels: Mapping[str, SourceChannel], times: Sequence[Any]) -> Any:  # noqa: ANN401
-    """Return the times of the first channel; raise if the other channels have other steps."""
-    names = list(channels)
-    for name, set_times in zip(names, times, strict=True):
-        begin, first_begin = channels[name].start_ns, channels[names[0]].start_ns
-        length = min(len(set_times), len(times[0]))
-        step_differences = np.diff(set_times[:length]) - np.diff(times[0][:length])
-        period = np.median(np.diff(times[0])) if len(times[0]) > 1 else 0.0
-        differs = bool(np.abs(step_differences).max(initial=0.0) > _STEP_TOLERANCE * period)
-        if not np.array_equal(set_times, times[0]) and (
-            differs or begin is None or first_begin == begin
+def _common_times(
+    path: Path, channels: Mapping[str, SourceChannel], abscissae_of_sets: Sequence[Any]
+) -> Any:  # noqa: ANN401
+    """Return the abscissae of the first channel.
+
+    Raise ExchangeError if the abscissae of another channel have other increments, or are shifted
+    although both channels state the same start or none.
+    """
+    channel_names = list(channels)
+    for channel_name, set_times in zip(channel_names, abscissae_of_sets, strict=True):
+        set_start, first_start = (
+            channels[channel_name].start_ns,
+            channels[channel_names[0]].start_ns,
+        )
+        sample_count = min(len(set_times), len(abscissae_of_sets[0]))
+        step_differences = np.diff(set_times[:sample_count]) - np.diff(
+            abscissae_of_sets[0][:sample_count]
+        )
+        mean_step = (
+            np.median(np.diff(abscissae_of_sets[0])) if len(abscissae_of_sets[0]) > 1 else 0.0
+        )
+        step_differs = bool(np.abs(step_differences).max(initial=0.0) > _STEP_TOLERANCE * mean_step)
+        if not np.array_equal(set_times, abscissae_of_sets[0]) and (
+            step_differs or set_start is None or first_start == set_start
         ):
             raise ExchangeError(
-                f"{path}: '{name}' has other times than '{names[0]}'; choose channels that were "
-                "sampled together."
+                f"{path}: '{channel_name}' has other times than '{channel_names[0]}'; choose "
+                "channels that were sampled together."
             )
-    return times[0]
+    return abscissae_of_sets[0]
 
 
 # Writing
@@ -282,12 +313,12 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     ExchangeError
         If each abscissa has to be written and the six digits of the text format are not enough.
     """
-    axis = np.asarray(table.axis.values, dtype=np.float64)
+    abscissae = np.asarray(table.axis.values, dtype=np.float64)
     if binary:
-        is_even = _is_reproducible(axis, _BINARY_TOLERANCE) and _is_increment_exact(axis)
+        is_even = _is_reproducible(abscissae, _BINARY_TOLERANCE) and _is_increment_exact(abscissae)
     else:
-        is_even = _is_reproducible(axis, _TEXT_TOLERANCE)
-    if not is_even and not binary and not _are_abscissae_distinct(axis):
+        is_even = _is_reproducible(abscissae, _TEXT_TOLERANCE)
+    if not is_even and not binary and not _are_abscissae_distinct(abscissae):
         raise ExchangeError(
             f"{table.source}: its {table.axis.title.lower()} is not equidistant enough for UFF58 "
             "in text, which has six digits for it; write it with --binary, or as .csv or .mat."
@@ -295,73 +326,94 @@ def write_uff58(table: ExportTable, stream: BinaryIO, *, binary: bool) -> None:
     stream.write(_SI_UNITS_SET.encode("ascii"))
     for column in table.columns:
         if column.values.dtype.kind in "fc":
-            encoded_values = _encode_body(axis, column.values, is_even=is_even, binary=binary)
-            header = _header_text(
-                table, axis, column, is_even, len(encoded_values) if binary else None
+            encoded_values = _encode_body(abscissae, column.values, is_even=is_even, binary=binary)
+            header_text = _header_text(
+                table, abscissae, column, is_even, len(encoded_values) if binary else None
             )
-            stream.write(header.encode("ascii") + encoded_values + b"    -1\n")
+            stream.write(header_text.encode("ascii") + encoded_values + b"    -1\n")
 
 
-def _is_reproducible(axis: NDArray[np.float64], tolerance: float) -> bool:
-    """Return whether first value and increment, with six digits, reproduce every abscissa."""
-    if len(axis) < 2:
+def _is_reproducible(abscissae: NDArray[np.float64], tolerance: float) -> bool:
+    """Return whether first abscissa and increment, with six digits, reproduce each abscissa.
+
+    `tolerance` is the largest permitted error, as a fraction of the increment.
+    """
+    if len(abscissae) < 2:
         return True
-    start, increment = _start_and_increment(axis)
-    reproduced = float(f"{start:.5e}") + float(f"{increment:.5e}") * np.arange(len(axis))
-    return bool(np.abs(reproduced - axis).max() <= tolerance * increment)
+    first_abscissa, increment = _start_and_increment(abscissae)
+    read_abscissae = float(f"{first_abscissa:.5e}") + float(f"{increment:.5e}") * np.arange(
+        len(abscissae)
+    )
+    return bool(np.abs(read_abscissae - abscissae).max() <= tolerance * increment)
 
 
-def _is_increment_exact(axis: NDArray[np.float64]) -> bool:
+def _is_increment_exact(abscissae: NDArray[np.float64]) -> bool:
     """Return whether six digits are enough for the increment of a binary file."""
-    _, increment = _start_and_increment(axis)
+    _, increment = _start_and_increment(abscissae)
     return abs(float(f"{increment:.5e}") - increment) <= _INCREMENT_TOLERANCE * increment
 
 
-def _are_abscissae_distinct(axis: NDArray[np.float64]) -> bool:
+def _are_abscissae_distinct(abscissae: NDArray[np.float64]) -> bool:
     """Return whether six digits are enough to write each abscissa as text."""
-    rounded = np.array([f"{value:.5e}" for value in axis.tolist()], dtype=np.float64)
-    return bool(np.abs(rounded - axis).max() <= _TEXT_TOLERANCE * np.diff(axis).min())
+    read_abscissae = np.array(
+        [f"{abscissa:.5e}" for abscissa in abscissae.tolist()], dtype=np.float64
+    )
+    return bool(
+        np.abs(read_abscissae - abscissae).max() <= _TEXT_TOLERANCE * np.diff(abscissae).min()
+    )
 
 
-def _start_and_increment(axis: NDArray[np.float64]) -> tuple[float, float]:
+def _start_and_increment(abscissae: NDArray[np.float64]) -> tuple[float, float]:
     """Return the first abscissa and the mean increment."""
-    if len(axis) < 2:
-        return float(axis[0]), 0.0
-    return float(axis[0]), float(axis[-1] - axis[0]) / (len(axis) - 1)
+    if len(abscissae) < 2:
+        return float(abscissae[0]), 0.0
+    return float(abscissae[0]), float(abscissae[-1] - abscissae[0]) / (len(abscissae) - 1)
 
 
 def _encode_body(
-    axis: NDArray[np.float64], values: NDArray[np.generic], *, is_even: bool, binary: bool
+    abscissae: NDArray[np.float64],
+    column_values: NDArray[np.generic],
+    *,
+    is_even: bool,
+    binary: bool,
 ) -> bytes:
     """Return the encoded values of a function, with its abscissae unless these are even."""
-    parts: list[NDArray[np.generic]] = [] if is_even else [axis]
-    parts += [values.real, values.imag] if values.dtype.kind == "c" else [values]
-    numbers = np.column_stack(parts).astype("<f8", copy=False)
-    if binary:
-        return numbers.tobytes()
-    formats = ["%20.12E"] * numbers.shape[1]
-    if not is_even:
-        formats[0] = "%13.5E"
-    # A line has four numbers, or three for complex values with their abscissa.
-    rows_per_line = 1 if len(formats) == 3 else 4 // len(formats)
-    full_rows = len(numbers) - len(numbers) % rows_per_line
-    full_line, last_line = (
-        "".join(formats * rows_per_line) + "\n",
-        "".join(formats * (len(numbers) - full_rows)),
+    real_columns: list[NDArray[np.generic]] = [] if is_even else [abscissae]
+    real_columns += (
+        [column_values.real, column_values.imag]
+        if column_values.dtype.kind == "c"
+        else [column_values]
     )
-    text = full_line * (full_rows // rows_per_line) % tuple(numbers[:full_rows].ravel().tolist())
-    text += f"{last_line}\n" % tuple(numbers[full_rows:].ravel().tolist()) if last_line else ""
-    return text.encode("ascii")
+    number_table = np.column_stack(real_columns).astype("<f8", copy=False)
+    if binary:
+        return number_table.tobytes()
+    number_formats = ["%20.12E"] * number_table.shape[1]
+    if not is_even:
+        number_formats[0] = "%13.5E"
+    # A line has four numbers, or three for complex values with their abscissa.
+    rows_per_line = 1 if len(number_formats) == 3 else 4 // len(number_formats)
+    full_rows = len(number_table) - len(number_table) % rows_per_line
+    full_line, last_line = (
+        "".join(number_formats * rows_per_line) + "\n",
+        "".join(number_formats * (len(number_table) - full_rows)),
+    )
+    body_text = (
+        full_line * (full_rows // rows_per_line) % tuple(number_table[:full_rows].ravel().tolist())
+    )
+    body_text += (
+        f"{last_line}\n" % tuple(number_table[full_rows:].ravel().tolist()) if last_line else ""
+    )
+    return body_text.encode("ascii")
 
 
 def _header_text(
     table: ExportTable,
-    axis: NDArray[np.float64],
+    abscissae: NDArray[np.float64],
     column: ExportColumn,
     is_even: bool,
-    size: int | None,
+    body_bytes: int | None,
 ) -> str:
-    """Return the header of a data set; `size` is the length of a binary body in bytes."""
+    """Return the header of a data set; `body_bytes` is the length of a binary body in bytes."""
     is_complex = column.values.dtype.kind == "c"
     if table.axis.unit == "Hz":
         function_type, axis_type = (
@@ -370,46 +422,57 @@ def _header_text(
         )
     else:
         function_type, axis_type = _TIME_RESPONSE, _TIME_AXIS
-    start, increment = _start_and_increment(axis) if is_even else (0.0, 0.0)
+    first_abscissa, increment = _start_and_increment(abscissae) if is_even else (0.0, 0.0)
     set_type = (
         "    58"
-        if size is None
-        else f"    58b{1:6d}{2:6d}{11:12d}{size:12d}{0:6d}{0:6d}{0:12d}{0:12d}"
+        if body_bytes is None
+        else f"    58b{1:6d}{2:6d}{11:12d}{body_bytes:12d}{0:6d}{0:6d}{0:12d}{0:12d}"
     )
     data_type = _COMPLEX_DOUBLE if is_complex else _REAL_DOUBLE
-    title, _, divisor_title = column.title.partition(" / ")
-    unit, _, divisor_unit = column.unit.partition("/")
-    lines = [
+    quantity_title, _, divisor_title = column.title.partition(" / ")
+    quantity_unit, _, divisor_unit = column.unit.partition("/")
+    header_lines = [
         "    -1",
         f"{set_type:80}",
-        *(f"{_ascii_text(text):80.80}" for text in _identification_lines(table, column)),
+        *(f"{_ascii_text(line_text):80.80}" for line_text in _identification_lines(table, column)),
         f"{function_type:5d}{0:10d}{0:5d}{0:10d} {'NONE':10}{0:10d}{0:4d} {'NONE':10}{0:10d}{0:4d}",
-        f"{data_type:10d}{len(axis):10d}{int(is_even):10d}{start:13.5E}{increment:13.5E}{0.0:13.5E}",
+        f"{data_type:10d}{len(abscissae):10d}{int(is_even):10d}{first_abscissa:13.5E}{increment:13.5E}{0.0:13.5E}",
         _axis_line(axis_type, (0, 0), table.axis.title, table.axis.unit),
-        _axis_line(_GENERAL_AXIS, _UNIT_EXPONENTS.get(unit, (0, 0)), title, unit),
+        _axis_line(
+            _GENERAL_AXIS, _UNIT_EXPONENTS.get(quantity_unit, (0, 0)), quantity_title, quantity_unit
+        ),
         _axis_line(
             _GENERAL_AXIS if divisor_unit else _UNKNOWN_AXIS, (0, 0), divisor_title, divisor_unit
         ),
         _axis_line(_UNKNOWN_AXIS, (0, 0), "", ""),
     ]
-    return "\n".join(lines) + "\n"
+    return "\n".join(header_lines) + "\n"
 
 
 def _identification_lines(table: ExportTable, column: ExportColumn) -> tuple[str, ...]:
     """Return the five identification lines: name, source, settings, date (unknown), exporter."""
-    settings = ", ".join(
+    settings_text = ", ".join(
         f"{key} {table.information[key]}"
         for key in ("rate_hz", "estimator", "segments", "segment_length_samples", "overlap_samples")
         if key in table.information
     )
-    return column.name, table.source, settings or "NONE", "NONE", table.information["exported_by"]
-
-
-def _axis_line(axis_type: int, exponents: tuple[int, int], title: str, unit: str) -> str:
-    """Return the line of a header that describes an axis."""
-    length, force = exponents
     return (
-        f"{axis_type:10d}{length:5d}{force:5d}{0:5d} {title or 'NONE':20.20} {unit or 'NONE':20.20}"
+        column.name,
+        table.source,
+        settings_text or "NONE",
+        "NONE",
+        table.information["exported_by"],
+    )
+
+
+def _axis_line(
+    axis_type: int, unit_exponents: tuple[int, int], axis_title: str, axis_unit: str
+) -> str:
+    """Return the line of a header that describes an axis."""
+    length_exponent, force_exponent = unit_exponents
+    return (
+        f"{axis_type:10d}{length_exponent:5d}{force_exponent:5d}{0:5d} "
+        f"{axis_title or 'NONE':20.20} {axis_unit or 'NONE':20.20}"
     )
 
 

@@ -90,7 +90,7 @@ class ReportedValue:
 
     Attributes
     ----------
-    estimated_value : float
+    value : float
         Estimate in SI units.
     std : float or None
         Standard deviation. None if the data do not determine it.

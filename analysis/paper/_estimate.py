@@ -52,7 +52,7 @@ def estimate(
 
     Returns
     -------
-    response, whole_record : FrequencyResponse
+    main_response, whole_record : FrequencyResponse
         Responses in the band of the settings, without the channels' delays. With the estimator
         "fft", both are the same.
 
@@ -68,24 +68,27 @@ def estimate(
     if settings.estimator != "fft":
         _check_segmentation(record, segmentation)
     # A constant angle causes no torque, but would leak into the lowest bins of both responses.
-    angle = record.angle_rad - (record.rest_angle_rad or 0.0)
+    relative_angle_rad = record.angle_rad - (record.rest_angle_rad or 0.0)
     try:
         whole_record = fft_response(
-            angle, record.torque_nm, record.rate_hz, max(segmentation.nfft, len(angle))
+            relative_angle_rad,
+            record.torque_nm,
+            record.rate_hz,
+            max(segmentation.nfft, len(relative_angle_rad)),
         )
         if settings.estimator == "fft":
-            response = whole_record
+            main_response = whole_record
         elif settings.estimator == "iv":
-            response = instrumental_response(
+            main_response = instrumental_response(
                 _relative_reference_rad(record)[record.first_sweep],
-                angle[record.first_sweep],
+                relative_angle_rad[record.first_sweep],
                 record.torque_nm[record.first_sweep],
                 record.rate_hz,
                 **asdict(segmentation),
             )
         else:
-            response = welch_response(
-                angle[record.first_sweep],
+            main_response = welch_response(
+                relative_angle_rad[record.first_sweep],
                 record.torque_nm[record.first_sweep],
                 record.rate_hz,
                 **asdict(segmentation),
@@ -94,22 +97,23 @@ def estimate(
     except SpectralError as error:
         raise FrequencyResponseError(f"{record.path}: {error}") from error
     try:
-        response, whole_record = (
-            estimated.band(*settings.band_hz).without_delays(
+        main_response, whole_record = (
+            estimated_response.band(*settings.band_hz).without_delays(
                 input_delay_s=record.angle_delay_s, output_delay_s=record.torque_delay_s
             )
-            for estimated in (response, whole_record)
+            for estimated_response in (main_response, whole_record)
         )
     except SpectralError as error:
         raise SettingsError(f"{record.path}: {error}") from error
-    not_finite = np.flatnonzero(~np.isfinite(response.response))
-    if not_finite.size:
+    not_finite_bins = np.flatnonzero(~np.isfinite(main_response.response))
+    if not_finite_bins.size:
         raise FrequencyResponseError(
-            f"{record.path}: the angle has no power at {response.frequency_hz[not_finite[0]]:g} "
+            f"{record.path}: the angle has no power at "
+            f"{main_response.frequency_hz[not_finite_bins[0]]:g} "
             "Hz, "
             "so there is no frequency response there; choose a --band that was excited."
         )
-    return response, whole_record
+    return main_response, whole_record
 
 
 def _relative_reference_rad(record: Record) -> NDArray[np.float64]:
@@ -117,13 +121,13 @@ def _relative_reference_rad(record: Record) -> NDArray[np.float64]:
 
     Raise `FrequencyResponseError` if the reference does not move, as in some imported records.
     """
-    reference: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
-    if not reference[record.first_sweep].any():
+    reference_rad: NDArray[np.float64] = record.reference_rad - record.reference_rad[0]
+    if not reference_rad[record.first_sweep].any():
         raise FrequencyResponseError(
             f"{record.path}: the record has no reference that moves, which --frf iv needs; "
             "choose --frf h1."
         )
-    return reference
+    return reference_rad
 
 
 def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
@@ -138,34 +142,41 @@ def _check_band(record: Record, band_hz: tuple[float, float]) -> None:
 
 def _check_segmentation(record: Record, segmentation: Segmentation) -> None:
     """Raise if `welch_response` would not accept the segments; the message names the options."""
-    length, overlap, nfft = segmentation.segment_length, segmentation.overlap, segmentation.nfft
-    if overlap >= length:
+    segment_length, overlap_samples, fft_length = (
+        segmentation.segment_length,
+        segmentation.overlap,
+        segmentation.nfft,
+    )
+    if overlap_samples >= segment_length:
         raise SettingsError(
-            f"The overlap of {overlap} samples must be shorter than a segment of {length}; "
-            "lower --overlap."
+            f"The overlap of {overlap_samples} samples must be shorter than a segment of "
+            f"{segment_length}; lower --overlap."
         )
-    if nfft < length:
+    if fft_length < segment_length:
         raise SettingsError(
-            f"nfft of {nfft} samples is shorter than a segment of {length}, which is padded and "
-            "never cut; raise --nfft."
+            f"nfft of {fft_length} samples is shorter than a segment of {segment_length}, which is "
+            "padded and never cut; raise --nfft."
         )
-    samples = record.first_sweep_samples
-    if segment_count(samples, length, overlap) == 0:
+    sweep_samples = record.first_sweep_samples
+    if segment_count(sweep_samples, segment_length, overlap_samples) == 0:
         raise FrequencyResponseError(
-            f"{record.path}: the sweep has {samples} samples ({samples / record.rate_hz:g} s), "
-            f"fewer than one Welch segment of {length}{_segment_remedy(samples)}"
+            f"{record.path}: the sweep has {sweep_samples} samples "
+            f"({sweep_samples / record.rate_hz:g} s), "
+            f"fewer than one Welch segment of {segment_length}{_segment_remedy(sweep_samples)}"
         )
 
 
-def _segment_remedy(samples: int) -> str:
+def _segment_remedy(sweep_samples: int) -> str:
     """Return the end of a sentence with options that suit a sweep of a number of samples."""
     try:
-        length, overlap = segment_lengths(samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION)
+        segment_length, overlap_samples = segment_lengths(
+            sweep_samples, PAPER_SEGMENTS, PAPER_OVERLAP_FRACTION
+        )
     except SpectralError:
         return "; that is too short for any estimate."
     return (
-        f"; --segment {length} --overlap {overlap} makes {PAPER_SEGMENTS} segments of it, "
-        "and --frf fft needs none."
+        f"; --segment {segment_length} --overlap {overlap_samples} makes {PAPER_SEGMENTS} segments "
+        "of it, and --frf fft needs none."
     )
 
 
@@ -175,16 +186,16 @@ def estimate_warnings(
     """Return sentences on weaknesses of an estimate, such as few segments or a low resolution."""
     sentences = []
     is_welch = settings.estimator != "fft"
-    length = (
+    segment_length = (
         settings.segmentation(record.rate_hz).segment_length if is_welch else len(record.time_s)
     )
     if is_welch and response.segments < PAPER_SEGMENTS:
         sentences.append(
-            f"Only {response.segments} Welch segment(s) of {length} samples fit "
+            f"Only {response.segments} Welch segment(s) of {segment_length} samples fit "
             "the sweep of "
             f"{record.first_sweep_samples}{_segment_remedy(record.first_sweep_samples)}"
         )
-    resolution_hz = record.rate_hz / length
+    resolution_hz = record.rate_hz / segment_length
     first_mode_hz = undamped_frequencies_rad_s(record.beam, 1)[0] / (2 * np.pi)
     if resolution_hz > first_mode_hz:
         sentences.append(

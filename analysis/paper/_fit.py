@@ -186,23 +186,23 @@ def fit_many(
     """
     structures, weightings = tuple(structures), tuple(weightings)
     _check_response(frequency_hz, response, structures)
-    omega = 2 * np.pi * frequency_hz
+    omega_rad_s = 2 * np.pi * frequency_hz
     whole_model = FrequencyResponseModel(frequency_hz, beam, tool_inertia_kg_m2)
-    grids: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
+    grids_by_weighting: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
-        all_weights = weights(omega, weighting)
-        index, point_weights = thinned(response, all_weights, _FEW_POINTS)
-        few_model = FrequencyResponseModel(frequency_hz[index], beam, tool_inertia_kg_m2)
-        grids.append(
+        all_weights = weights(omega_rad_s, weighting)
+        point_index, point_weights = thinned(response, all_weights, _FEW_POINTS)
+        thinned_model = FrequencyResponseModel(frequency_hz[point_index], beam, tool_inertia_kg_m2)
+        grids_by_weighting.append(
             (
-                _FrequencyGrid(few_model, response[index], point_weights),
+                _FrequencyGrid(thinned_model, response[point_index], point_weights),
                 _FrequencyGrid(whole_model, response, all_weights),
             )
         )
     return tuple(
-        _fit(structure, weighting_name(weighting), few, whole)
+        _fit(structure, weighting_name(weighting), few, whole_grid)
         for structure in structures
-        for weighting, (few, whole) in zip(weightings, grids, strict=True)
+        for weighting, (few, whole_grid) in zip(weightings, grids_by_weighting, strict=True)
     )
 
 
@@ -238,20 +238,20 @@ class _FrfProblem:
 
     def _linearize(self, x: NDArray[np.float64]) -> _Linearization:
         """Return model minus measurement and its derivatives with respect to x."""
-        model, gradient = self.grid.model.evaluate_with_gradient(
+        model_response, gradient = self.grid.model.evaluate_with_gradient(
             self.unknowns.damping(x), self.unknowns.structure.free
         )
         jacobian = self.unknowns.derivative_of_parameters(x).T @ gradient
-        return model - self.grid.measured, jacobian
+        return model_response - self.grid.measured, jacobian
 
     def normal_equations(self, x: NDArray[np.float64]) -> NormalEquations:
         """Return cost, gradient and Gauss-Newton Hessian at the unknowns x."""
         deviation, jacobian = self.deviation_and_jacobian(x)
-        weighted = jacobian.conj() * self.grid.weights
+        weighted_jacobian = jacobian.conj() * self.grid.weights
         return NormalEquations(
             cost=float(self.grid.weights @ (deviation.real**2 + deviation.imag**2)),
-            gradient=(weighted @ deviation).real,
-            hessian=(weighted @ jacobian.T).real,
+            gradient=(weighted_jacobian @ deviation).real,
+            hessian=(weighted_jacobian @ jacobian.T).real,
         )
 
 
@@ -264,69 +264,81 @@ def _fit(
     """Fit a damping structure: descents on few points, then refinement on all points."""
     unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
     bounds = Box(*unknowns.bounds)
-    few_problem, whole_problem = (
+    thinned_problem, whole_problem = (
         _FrfProblem(unknowns, few_points_grid),
         _FrfProblem(unknowns, whole_grid),
     )
     rough_minima = [
-        descend(few_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
-        for x in starting_points(structure, few_problem.cost)
+        descend(thinned_problem.normal_equations, x, bounds, relative_tolerance=_ROUGH_TOLERANCE)
+        for x in starting_points(structure, thinned_problem.cost)
     ]
     # The descents first converge on the few points. With the Hessian estimated there, one or two
     # steps on all points remain.
-    refined = _distinct_minima(
+    refined_minima = _distinct_minima(
         [
-            _refine(few_problem, rough, bounds)
-            for rough in _distinct_minima(rough_minima)[:_REFINED_MINIMA]
+            _refine(thinned_problem, rough_minimum, bounds)
+            for rough_minimum in _distinct_minima(rough_minima)[:_REFINED_MINIMA]
         ]
     )
-    refined = [_refine(whole_problem, rough, bounds) for rough in refined]
-    best = min(refined, key=lambda minimum: minimum.cost)
-    parameters = unknowns.parameters(best.x)
-    at_bound = (best.x <= bounds.lower) | (best.x >= bounds.upper)
+    refined_minima = [
+        _refine(whole_problem, rough_minimum, bounds) for rough_minimum in refined_minima
+    ]
+    best_minimum = min(refined_minima, key=lambda minimum: minimum.cost)
+    parameters = unknowns.parameters(best_minimum.x)
+    are_at_bound = (best_minimum.x <= bounds.lower) | (best_minimum.x >= bounds.upper)
     return FrfFit(
         structure=structure,
         weighting=weighting,
-        damping=unknowns.damping(best.x),
-        parameters={name: parameters[name] for name in PARAMETERS},
-        std=None if at_bound.any() else _standard_deviations(whole_problem, best.x),
-        cost=best.cost,
+        damping=unknowns.damping(best_minimum.x),
+        parameters={parameter_name: parameters[parameter_name] for parameter_name in PARAMETERS},
+        std=None if are_at_bound.any() else _standard_deviations(whole_problem, best_minimum.x),
+        cost=best_minimum.cost,
         at_bounds=tuple(
-            name for name, is_at_bound in zip(structure.free, at_bound, strict=True) if is_at_bound
+            parameter_name
+            for parameter_name, is_at_bound in zip(structure.free, are_at_bound, strict=True)
+            if is_at_bound
         ),
     )
 
 
-def _refine(problem: _FrfProblem, rough: Minimum, bounds: Box) -> Minimum:
+def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: Box) -> Minimum:
     """Continue a less accurate descent to the minimum."""
     return descend(
-        problem.normal_equations,
-        rough.x,
+        frf_problem.normal_equations,
+        rough_minimum.x,
         bounds,
         relative_tolerance=_REFINED_TOLERANCE,
-        second_part=rough.second_part,
+        second_part=rough_minimum.second_part,
     )
 
 
 def _distinct_minima(minima: list[Minimum]) -> list[Minimum]:
     """Return the distinct minima, the one of the lowest cost first."""
-    distinct: list[Minimum] = []
+    distinct_minima: list[Minimum] = []
     for minimum in sorted(minima, key=lambda m: m.cost):
-        if all(np.abs(minimum.x - other.x).max() > _SAME_MINIMUM_DISTANCE for other in distinct):
-            distinct.append(minimum)
-    return distinct
+        if all(
+            np.abs(minimum.x - other_minimum.x).max() > _SAME_MINIMUM_DISTANCE
+            for other_minimum in distinct_minima
+        ):
+            distinct_minima.append(minimum)
+    return distinct_minima
 
 
-def _standard_deviations(problem: _FrfProblem, x: NDArray[np.float64]) -> dict[str, float] | None:
+def _standard_deviations(
+    frf_problem: _FrfProblem, x: NDArray[np.float64]
+) -> dict[str, float] | None:
     """Return the standard deviations of all parameters, or None if not determined."""
-    deviation, jacobian = problem.deviation_and_jacobian(x)
-    covariance = sandwich_covariance(deviation, jacobian, problem.grid.weights)
+    deviation, jacobian = frf_problem.deviation_and_jacobian(x)
+    covariance = sandwich_covariance(deviation, jacobian, frf_problem.grid.weights)
     if covariance is None:
         return None
-    derivative = problem.unknowns.derivative_of_parameters(x)
-    variance = np.diag(derivative @ covariance @ derivative.T)
-    free = dict(zip(problem.unknowns.structure.free, variance, strict=True))
-    return {name: math.sqrt(max(float(free.get(name, 0.0)), 0.0)) for name in PARAMETERS}
+    derivative = frf_problem.unknowns.derivative_of_parameters(x)
+    variances = np.diag(derivative @ covariance @ derivative.T)
+    variance_by_name = dict(zip(frf_problem.unknowns.structure.free, variances, strict=True))
+    return {
+        parameter_name: math.sqrt(max(float(variance_by_name.get(parameter_name, 0.0)), 0.0))
+        for parameter_name in PARAMETERS
+    }
 
 
 def _check_response(
@@ -335,11 +347,11 @@ def _check_response(
     structures: tuple[Structure, ...],
 ) -> None:
     """Raise if a response has too few points, values that are not finite, or a frequency of 0."""
-    needed = max((len(structure.free) for structure in structures), default=0)
-    if frequency_hz.size < max(needed, 3):
+    needed_points = max((len(structure.free) for structure in structures), default=0)
+    if frequency_hz.size < max(needed_points, 3):
         raise FitError(
             f"The band holds {frequency_hz.size} points of the frequency response, too few for "
-            f"{needed} unknowns; widen the band."
+            f"{needed_points} unknowns; widen the band."
         )
     if not (np.isfinite(response).all() and frequency_hz[0] > 0):
         raise FitError(
@@ -352,46 +364,46 @@ def _check_response(
 
 
 def thinned(
-    measured: NDArray[np.complex128], weights: NDArray[np.float64], count: int
+    measured_response: NDArray[np.complex128], weights: NDArray[np.float64], point_count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Choose representative points of a response, densest near peaks and at large weights.
 
     Parameters
     ----------
-    measured : ndarray of complex, shape (n,)
+    measured_response : ndarray of complex, shape (n,)
         Measured response.
     weights : ndarray, shape (n,)
         Weights of the points, with a sum of 1.
-    count : int
+    point_count : int
         Largest number of points to be chosen.
 
     Returns
     -------
-    index : ndarray of int, shape (m,), m <= count
+    point_indices : ndarray of int, shape (m,), m <= count
         Indices of the chosen points, increasing.
     weights : ndarray, shape (m,)
         Weight of each chosen point, including the weights of omitted points around it. The sum
         is 1.
     """
-    n = measured.size
-    if n <= count:
+    n = measured_response.size
+    if n <= point_count:
         return np.arange(n), weights
     # The density of the points has three equal parts: uniform, by the size of the response, and by
     # its change from bin to bin. With 800 of 7907 points, the cost at a minimum then differs by
     # less than 1 % from the cost with all points.
     root_weights = np.sqrt(weights)
-    magnitude, variation = (
-        root_weights * np.abs(measured),
-        root_weights * np.abs(np.gradient(measured)),
+    weighted_magnitude, weighted_variation = (
+        root_weights * np.abs(measured_response),
+        root_weights * np.abs(np.gradient(measured_response)),
     )
-    density = np.full(n, 1 / n)
-    for contribution in (magnitude, variation):
-        density += contribution / max(float(contribution.sum()), np.finfo(float).tiny)
-    cumulative = np.cumsum(density)
-    levels = (np.arange(count) + 0.5) * (cumulative[-1] / count)
-    index = np.unique(np.searchsorted(cumulative, levels))
-    borders = (index[:-1] + index[1:] + 1) // 2
-    return index, np.add.reduceat(weights, np.concatenate(([0], borders)))
+    point_density = np.full(n, 1 / n)
+    for weight_density in (weighted_magnitude, weighted_variation):
+        point_density += weight_density / max(float(weight_density.sum()), np.finfo(float).tiny)
+    cumulative_density = np.cumsum(point_density)
+    density_levels = (np.arange(point_count) + 0.5) * (cumulative_density[-1] / point_count)
+    point_indices = np.unique(np.searchsorted(cumulative_density, density_levels))
+    cell_borders = (point_indices[:-1] + point_indices[1:] + 1) // 2
+    return point_indices, np.add.reduceat(weights, np.concatenate(([0], cell_borders)))
 
 
 # Starts
@@ -416,20 +428,22 @@ def starting_points(
     `cost` is a function of the vector of unknowns, shape (k,). Return at most eight points of the
     coarse grid, shape (k,), that have no neighbour of lower cost along any axis.
     """
-    axes = [_START_GRID[name] for name in structure.free]
-    points = np.array(list(itertools.product(*axes)))
-    costs = np.array([cost(x) for x in points]).reshape([len(axis) for axis in axes])
-    is_minimum = np.ones(costs.shape, dtype=bool)
-    for axis in range(costs.ndim):
-        cost_differences = np.diff(costs, axis=axis)
+    parameter_axes = [_START_GRID[parameter_name] for parameter_name in structure.free]
+    grid_points = np.array(list(itertools.product(*parameter_axes)))
+    grid_costs = np.array([cost(x) for x in grid_points]).reshape(
+        [len(axis) for axis in parameter_axes]
+    )
+    is_minimum = np.ones(grid_costs.shape, dtype=bool)
+    for axis in range(grid_costs.ndim):
+        cost_differences = np.diff(grid_costs, axis=axis)
         # A point is no minimum if the next or the previous point along the axis has a lower cost.
-        pad_end = [(0, 1) if k == axis else (0, 0) for k in range(costs.ndim)]
-        pad_start = [(1, 0) if k == axis else (0, 0) for k in range(costs.ndim)]
+        pad_end = [(0, 1) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
+        pad_start = [(1, 0) if k == axis else (0, 0) for k in range(grid_costs.ndim)]
         is_minimum &= np.pad(cost_differences, pad_end) >= 0
         is_minimum &= np.pad(cost_differences, pad_start) <= 0
-    minima = np.flatnonzero(is_minimum)
-    best_first = minima[np.argsort(costs.ravel()[minima])]
-    return [points[i] for i in best_first[:_MOST_STARTS]]
+    minimum_indices = np.flatnonzero(is_minimum)
+    sorted_minima = minimum_indices[np.argsort(grid_costs.ravel()[minimum_indices])]
+    return [grid_points[i] for i in sorted_minima[:_MOST_STARTS]]
 
 
 # Covariance
@@ -451,21 +465,23 @@ def sandwich_covariance(
     shape (k, n) and `weights` (n,). Return None if the data do not determine the unknowns.
     """
     hessian = ((jacobian.conj() * weights) @ jacobian.T).real
-    scale = np.sqrt(np.diag(hessian))
-    if not (np.isfinite(hessian).all() and (scale > 0).all()):
+    hessian_scales = np.sqrt(np.diag(hessian))
+    if not (np.isfinite(hessian).all() and (hessian_scales > 0).all()):
         return None
-    scaled = hessian / np.outer(scale, scale)
-    if np.linalg.cond(scaled) > 1e12:
+    scaled_hessian = hessian / np.outer(hessian_scales, hessian_scales)
+    if np.linalg.cond(scaled_hessian) > 1e12:
         return None
     gradient_terms = (jacobian.conj() * (weights * deviation)).real
-    correlated = _correlated_bins(np.sqrt(weights) * deviation)
+    correlated_bins = _correlated_bins(np.sqrt(weights) * deviation)
     # Bartlett's kernel over a number of bins equals the mean square of sums over as many
     # neighbours.
-    cumulative = np.cumsum(np.pad(gradient_terms, ((0, 0), (correlated, correlated - 1))), axis=1)
-    neighbour_sums = cumulative[:, correlated:] - cumulative[:, :-correlated]
-    gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated
-    inverse = np.linalg.inv(scaled) / np.outer(scale, scale)
-    covariance: NDArray[np.float64] = inverse @ gradient_covariance @ inverse
+    cumulative_terms = np.cumsum(
+        np.pad(gradient_terms, ((0, 0), (correlated_bins, correlated_bins - 1))), axis=1
+    )
+    neighbour_sums = cumulative_terms[:, correlated_bins:] - cumulative_terms[:, :-correlated_bins]
+    gradient_covariance = neighbour_sums @ neighbour_sums.T / correlated_bins
+    inverse_hessian = np.linalg.inv(scaled_hessian) / np.outer(hessian_scales, hessian_scales)
+    covariance: NDArray[np.float64] = inverse_hessian @ gradient_covariance @ inverse_hessian
     return covariance
 
 

@@ -56,8 +56,8 @@ class Indices:
 
 def fit_indices(
     omega_rad_s: NDArray[np.float64],
-    measured: NDArray[np.complex128],
-    model: NDArray[np.complex128],
+    measured_response: NDArray[np.complex128],
+    model_response: NDArray[np.complex128],
 ) -> Indices:
     """Return the fit indices of a model (Eqs. 28 to 30), from the deviations ``|G - Ĝ|``.
 
@@ -65,7 +65,7 @@ def fit_indices(
     ----------
     omega_rad_s : ndarray, shape (n,)
         Angular frequencies, positive.
-    measured, model : ndarray of complex, shape (n,)
+    measured_response, model_response : ndarray of complex, shape (n,)
         Measured and modelled response in N·m/rad.
 
     References
@@ -73,12 +73,12 @@ def fit_indices(
     Fractional-Order Models of Damping Phenomena in a Flexible Sensing Antenna Used for Haptic Robot
     Navigation, Eqs. 28 to 30.
     """
-    deviation = np.abs(measured - model)
-    square = deviation**2
+    absolute_deviation = np.abs(measured_response - model_response)
+    squared_deviation = absolute_deviation**2
     return Indices(
-        mse=float(square.mean()),
-        wmse=float(weights(omega_rad_s, "omega") @ square),
-        md=float(deviation.max()),
+        mse=float(squared_deviation.mean()),
+        wmse=float(weights(omega_rad_s, "omega") @ squared_deviation),
+        md=float(absolute_deviation.max()),
     )
 
 
@@ -137,27 +137,35 @@ def resonant_peaks(
     2.50 Hz, 18.1 dB
     """
     magnitude = np.abs(response)
-    ratio = np.sqrt(mode_hz[1:] / mode_hz[:-1])
+    border_ratios = np.sqrt(mode_hz[1:] / mode_hz[:-1])
     # The peak of a single mode is searched within half an octave on either side.
-    first, last = (ratio[0], ratio[-1]) if ratio.size else (np.sqrt(2.0), np.sqrt(2.0))
-    lower = mode_hz / np.concatenate(([first], ratio))
-    upper = mode_hz * np.concatenate((ratio, [last]))
+    first_ratio, last_ratio = (
+        (border_ratios[0], border_ratios[-1])
+        if border_ratios.size
+        else (np.sqrt(2.0), np.sqrt(2.0))
+    )
+    lower_borders_hz = mode_hz / np.concatenate(([first_ratio], border_ratios))
+    upper_borders_hz = mode_hz * np.concatenate((border_ratios, [last_ratio]))
     inner_magnitude = magnitude[1:-1]
-    maxima = 1 + np.flatnonzero(
+    maximum_bins = 1 + np.flatnonzero(
         (inner_magnitude > magnitude[:-2]) & (inner_magnitude >= magnitude[2:])
     )
-    peaks: list[Peak | None] = []
-    for low, high in zip(lower, upper, strict=True):
-        candidates = maxima[(frequency_hz[maxima] >= low) & (frequency_hz[maxima] <= high)]
-        if candidates.size == 0:
-            peaks.append(None)
+    resonant_peak_list: list[Peak | None] = []
+    for low, end_bin in zip(lower_borders_hz, upper_borders_hz, strict=True):
+        candidate_bins = maximum_bins[
+            (frequency_hz[maximum_bins] >= low) & (frequency_hz[maximum_bins] <= end_bin)
+        ]
+        if candidate_bins.size == 0:
+            resonant_peak_list.append(None)
             continue
-        largest = candidates[np.argmax(magnitude[candidates])]
-        peaks.append(Peak(float(frequency_hz[largest]), 20 * float(np.log10(magnitude[largest]))))
-    return tuple(peaks)
+        largest_bin = candidate_bins[np.argmax(magnitude[candidate_bins])]
+        resonant_peak_list.append(
+            Peak(float(frequency_hz[largest_bin]), 20 * float(np.log10(magnitude[largest_bin])))
+        )
+    return tuple(resonant_peak_list)
 
 
-def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
+def peak_deviation(measured_peak: Peak, model_peak: Peak) -> PeakDeviation:
     """Return the absolute deviations of a resonant peak in frequency and in magnitude (dB).
 
     These are the terms ``|omega_q - omega^_q|`` and ``||G| - |Ĝ||`` of one session, which the
@@ -165,7 +173,7 @@ def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
 
     Parameters
     ----------
-    measured, model : Peak
+    measured_peak, model_peak : Peak
         Resonant peak of the same mode in the measured and in the modelled response.
 
     Examples
@@ -176,8 +184,8 @@ def peak_deviation(measured: Peak, model: Peak) -> PeakDeviation:
     0.0628 rad/s, 0.4 dB
     """
     return PeakDeviation(
-        frequency_rad_s=2 * np.pi * abs(measured.frequency_hz - model.frequency_hz),
-        magnitude_db=abs(measured.magnitude_db - model.magnitude_db),
+        frequency_rad_s=2 * np.pi * abs(measured_peak.frequency_hz - model_peak.frequency_hz),
+        magnitude_db=abs(measured_peak.magnitude_db - model_peak.magnitude_db),
     )
 
 
@@ -209,27 +217,30 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
     ndarray, shape (n,)
         Torque in N·m as the sensor would report it at the record's time stamps.
     """
-    samples = len(record.angle_rad)
-    padded = 1 << (2 * samples - 1).bit_length()
-    duration_s = samples / record.rate_hz
-    sigma = _DECAY_OVER_RECORD / duration_s
-    decay = np.exp(-sigma * np.arange(samples) / record.rate_hz)
-    s = sigma + 2j * np.pi * np.fft.rfftfreq(padded, 1.0 / record.rate_hz)
+    sample_count = len(record.angle_rad)
+    padded_samples = 1 << (2 * sample_count - 1).bit_length()
+    duration_s = sample_count / record.rate_hz
+    sigma_per_s = _DECAY_OVER_RECORD / duration_s
+    decay_factors = np.exp(-sigma_per_s * np.arange(sample_count) / record.rate_hz)
+    s = sigma_per_s + 2j * np.pi * np.fft.rfftfreq(padded_samples, 1.0 / record.rate_hz)
     origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
-    angle = np.fft.rfft((record.angle_rad - origin_rad) * decay, padded)
-    response = transfer(s, record.beam, damping) + record.tool_inertia_kg_m2 * s**2
-    response *= np.exp(-s * (record.torque_delay_s - record.angle_delay_s))
-    return np.asarray(np.fft.irfft(angle * response, padded)[:samples] / decay)
+    angle_transform = np.fft.rfft((record.angle_rad - origin_rad) * decay_factors, padded_samples)
+    torque_response = transfer(s, record.beam, damping) + record.tool_inertia_kg_m2 * s**2
+    torque_response *= np.exp(-s * (record.torque_delay_s - record.angle_delay_s))
+    return np.asarray(
+        np.fft.irfft(angle_transform * torque_response, padded_samples)[:sample_count]
+        / decay_factors
+    )
 
 
 def band_limited(
-    values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
+    signal_values: NDArray[np.float64], rate_hz: float, band_hz: tuple[float, float]
 ) -> NDArray[np.float64]:
     """Return a signal limited to a frequency band, by a mask on its Fourier transform (no delay).
 
     Parameters
     ----------
-    values : ndarray, shape (n,)
+    signal_values : ndarray, shape (n,)
         Signal.
     rate_hz
         Sampling rate.
@@ -241,11 +252,11 @@ def band_limited(
     ndarray, shape (n,)
         Filtered signal.
     """
-    padded = 1 << (2 * len(values) - 1).bit_length()
-    frequency_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
-    spectrum = np.fft.rfft(values, padded)
+    padded_samples = 1 << (2 * len(signal_values) - 1).bit_length()
+    frequency_hz = np.fft.rfftfreq(padded_samples, 1.0 / rate_hz)
+    spectrum = np.fft.rfft(signal_values, padded_samples)
     spectrum[(frequency_hz < band_hz[0]) | (frequency_hz > band_hz[1])] = 0.0
-    return np.asarray(np.fft.irfft(spectrum, padded)[: len(values)])
+    return np.asarray(np.fft.irfft(spectrum, padded_samples)[: len(signal_values)])
 
 
 _ENVELOPE_HALF_WIDTH: Final = 0.1
@@ -253,13 +264,13 @@ _ENVELOPE_HALF_WIDTH: Final = 0.1
 
 
 def largest_oscillation_time_s(
-    values: NDArray[np.float64], rate_hz: float, frequency_hz: float
+    signal_values: NDArray[np.float64], rate_hz: float, frequency_hz: float
 ) -> float:
     """Return the time at which a signal's oscillation near a frequency is largest.
 
     Parameters
     ----------
-    values : ndarray, shape (n,)
+    signal_values : ndarray, shape (n,)
         Signal.
     rate_hz : float
         Sampling rate.
@@ -280,12 +291,14 @@ def largest_oscillation_time_s(
     >>> print(f"{largest_oscillation_time_s(values, 1000, 5.0):.2f} s")
     4.00 s
     """
-    padded = 1 << (len(values) - 1).bit_length()
-    frequencies_hz = np.fft.rfftfreq(padded, 1.0 / rate_hz)
+    padded_samples = 1 << (len(signal_values) - 1).bit_length()
+    frequencies_hz = np.fft.rfftfreq(padded_samples, 1.0 / rate_hz)
     in_band = np.abs(frequencies_hz / frequency_hz - 1.0) <= _ENVELOPE_HALF_WIDTH
-    analytic = np.zeros(padded, dtype=np.complex128)
-    analytic[: len(frequencies_hz)][in_band] = np.fft.rfft(values, padded)[in_band]
-    envelope = np.abs(np.fft.ifft(analytic)[: len(values)])
+    analytic_signal = np.zeros(padded_samples, dtype=np.complex128)
+    analytic_signal[: len(frequencies_hz)][in_band] = np.fft.rfft(signal_values, padded_samples)[
+        in_band
+    ]
+    envelope = np.abs(np.fft.ifft(analytic_signal)[: len(signal_values)])
     return float(np.argmax(envelope)) / rate_hz
 
 
@@ -391,51 +404,52 @@ def analyse(
         The motor did not move, or the record is too short for the segments.
     """
     _check_excited(record)
-    response, whole_record = estimate(record, settings)
+    main_response, whole_record = estimate(record, settings)
     on_step("frequency response")
-    peaks = _mode_peaks(record.beam, response.frequency_hz, response.response)
+    measured_peaks = _mode_peaks(record.beam, main_response.frequency_hz, main_response.response)
     beam_on_tool = FrequencyResponseModel(
-        response.frequency_hz, record.beam, record.tool_inertia_kg_m2
+        main_response.frequency_hz, record.beam, record.tool_inertia_kg_m2
     )
-    models: list[FittedModel] = []
-    for name in settings.types:
+    fitted_models: list[FittedModel] = []
+    for fit_name in settings.types:
         # One type at a time, so that progress can be shown. Common grids would save little time.
         try:
-            fits = fit_many(
-                response.frequency_hz,
-                response.response,
+            frf_fits = fit_many(
+                main_response.frequency_hz,
+                main_response.response,
                 record.beam,
-                [STRUCTURES[name]],
+                [STRUCTURES[fit_name]],
                 settings.weightings,
                 tool_inertia_kg_m2=record.tool_inertia_kg_m2,
             )
         except (FitError, WeightingError) as error:
             raise SettingsError(f"{record.path}: {error}") from error
-        models.extend(
-            _evaluate_fit(fit, record.beam, response, beam_on_tool, peaks) for fit in fits
+        fitted_models.extend(
+            _evaluate_fit(fit, record.beam, main_response, beam_on_tool, measured_peaks)
+            for fit in frf_fits
         )
-        on_step(f"type {name}")
+        on_step(f"type {fit_name}")
     return WelchAnalysis(
         record=record,
         settings=settings,
         segmentation=settings.segmentation(record.rate_hz),
-        response=response,
+        response=main_response,
         whole_record=whole_record,
-        peaks=peaks,
-        models=tuple(models),
-        warnings=record.warnings + estimate_warnings(record, settings, response),
+        peaks=measured_peaks,
+        models=tuple(fitted_models),
+        warnings=record.warnings + estimate_warnings(record, settings, main_response),
     )
 
 
 def _check_excited(record: Record) -> None:
     """Raise if the motor did not move during a record."""
-    angles = record.angle_rad[record.angle_known]
+    known_angles_rad = record.angle_rad[record.angle_known]
     if record.metadata.get("excitation") == "hold":
         raise FrequencyResponseError(
             f"{record.path}: nothing was excited: the motor was held; record an excitation, such "
             "as rigd run chirp."
         )
-    if angles.size == 0 or np.ptp(angles) == 0:
+    if known_angles_rad.size == 0 or np.ptp(known_angles_rad) == 0:
         raise FrequencyResponseError(
             f"{record.path}: nothing was excited: the angle never changes; check the encoder and "
             "that the motor moved."
@@ -450,24 +464,24 @@ def _evaluate_fit(
     measured_peaks: tuple[Peak | None, ...],
 ) -> FittedModel:
     """Return a fitted model with its indices, modes and peaks."""
-    response = beam_on_tool.evaluate(fit.damping)
-    peaks = _mode_peaks(beam, measured.frequency_hz, response)
+    model_response = beam_on_tool.evaluate(fit.damping)
+    model_peaks = _mode_peaks(beam, measured.frequency_hz, model_response)
     try:
         beam_modes = modes(beam, fit.damping, MODES)
     except ArithmeticError:
         beam_modes = ()
     return FittedModel(
         fit=fit,
-        response=response,
-        indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, response),
+        response=model_response,
+        indices=fit_indices(2 * np.pi * measured.frequency_hz, measured.response, model_response),
         modes=beam_modes,
         followed=_vibrate_near_undamped(beam_modes, beam),
-        peaks=peaks,
+        peaks=model_peaks,
         deviations=tuple(
             None
             if measured_peak is None or model_peak is None
             else peak_deviation(measured_peak, model_peak)
-            for measured_peak, model_peak in zip(measured_peaks, peaks, strict=True)
+            for measured_peak, model_peak in zip(measured_peaks, model_peaks, strict=True)
         ),
     )
 
@@ -476,8 +490,9 @@ def _vibrate_near_undamped(fitted_modes: tuple[Mode, ...], beam: Beam) -> tuple[
     """Return whether each mode vibrates near the frequency of the undamped beam's mode."""
     undamped_hz = undamped_frequencies_rad_s(beam, MODES) / (2 * np.pi)
     return tuple(
-        mode.damping_ratio < 1 and abs(mode.frequency_hz / own_hz - 1) < LARGEST_FREQUENCY_SHIFT
-        for mode, own_hz in zip(fitted_modes, undamped_hz[: len(fitted_modes)], strict=True)
+        fitted_mode.damping_ratio < 1
+        and abs(fitted_mode.frequency_hz / mode_hz - 1) < LARGEST_FREQUENCY_SHIFT
+        for fitted_mode, mode_hz in zip(fitted_modes, undamped_hz[: len(fitted_modes)], strict=True)
     )
 
 

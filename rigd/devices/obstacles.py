@@ -239,7 +239,7 @@ def with_obstacles(rig: RigParameters, added_texts: Iterable[str]) -> RigParamet
     ----------
     rig
         Parameters of the rig, with a section ``simulation``.
-    texts
+    added_texts
         Obstacles and impacts in the syntax of `parse_obstacle`.
 
     Raises

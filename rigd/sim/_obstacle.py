@@ -199,7 +199,7 @@ class AttachedObstacles:
             As `extended_model` returns them.
         holding_torque, switch_s, angle_instant_s, torque_instant_s
             As for a step of the plant.
-        friction
+        friction_effect
             Effect of the previous period's friction (1 N·m) on the state, shape (n,).
         """
         substep_count, step_s, body_count = self.substeps, self._step_s, self._positions_m.size
@@ -449,9 +449,9 @@ class AttachedObstacles:
 
         Parameters
         ----------
-        state
+        old_state
             State of the plant with the other obstacles.
-        other
+        old_obstacles
             Obstacles that have acted so far; None if there were none.
 
         Returns

@@ -313,7 +313,7 @@ class SimulatedPlant:
 
         Parameters
         ----------
-        other
+        other_plant
             Plant with the same rates and delays, which must not be used any more.
         """
         angle_rad = self.angle_rad

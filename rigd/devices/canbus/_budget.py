@@ -168,7 +168,7 @@ def frame_bits(data_length: int) -> int:
 
     Parameters
     ----------
-    length
+    data_length
         Number of data bytes, 0 to 8.
     """
     return FRAME_BITS + 8 * data_length

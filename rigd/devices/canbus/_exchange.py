@@ -301,7 +301,7 @@ class CanExchange:
 
         Parameters
         ----------
-        ready
+        is_ready
             Condition, which is checked after every delivery.
         deadline_ns
             Deadline in nanoseconds on the clock ``time.monotonic_ns``.

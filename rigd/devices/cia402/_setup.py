@@ -115,7 +115,7 @@ def set_up_drive(port: CanPort, rig: RigParameters, drive_name: str) -> DriveCap
         Open port; no other code receives from it meanwhile.
     rig
         Parameters with a section ``cia402``.
-    name
+    drive_name
         Name of the drive, for messages.
 
     Returns

@@ -53,7 +53,7 @@ def reset_fault(port: CanPort, rig: RigParameters, drive_name: str) -> str | Non
         Open port; no other code receives from it meanwhile.
     rig
         Parameters with a section ``cia402``.
-    name
+    drive_name
         Name of the drive, for messages.
 
     Returns

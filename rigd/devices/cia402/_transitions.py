@@ -38,7 +38,7 @@ def operation_left_error(drive_name: str, statusword: int) -> DeviceError:
 
     Parameters
     ----------
-    name
+    drive_name
         Name of the drive, for messages.
     statusword
         Last statusword, which shows no fault; no emergency message explains it either.

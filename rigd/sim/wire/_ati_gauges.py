@@ -99,7 +99,7 @@ class AtiGauges:
         ----------
         wrenches
             Wrenches: fx, fy, fz in N, tx, ty, tz in N·m.
-        saturated
+        saturated_gauge
             Number of a gauge that reads ±32767, with the sign of its reading; or None.
 
         Returns

@@ -66,11 +66,11 @@ class Emergencies:
 
         Parameters
         ----------
-        code
+        error_code
             Error code.
-        register
+        register_bits
             Bits of the error in the error register; the generic bit is added.
-        vendor
+        vendor_bytes
             Up to five vendor-specific bytes of the message.
 
         Returns
@@ -210,7 +210,7 @@ def add_heartbeat_monitors(
     ----------
     objects
         Dictionary to which the object is added.
-    count
+    monitor_count
         Number of nodes that can be monitored; with 0 the object is not added.
     on_restart
         Function that is called after an entry was set, which restarts its monitoring.
