@@ -602,8 +602,8 @@ class _TimeForecast:
         ) ** -0.5
         return (
             f"it would take about {required_s:.0f} s more, and the {available_s:.0f} s that are "
-            f"left will do for {reachable_ratio:.2g} times the deviation asked for. Ask for that, or give "
-            f"--at-most {1.2 * (now_s + required_s):.0f}."
+            f"left will do for {reachable_ratio:.2g} times the deviation asked for. Ask for "
+            f"that, or give --at-most {1.2 * (now_s + required_s):.0f}."
         )
 
 
@@ -643,4 +643,7 @@ def _estimate_text(estimate: TargetEstimate) -> str:
     """Return text with one estimate and its standard deviation, or with its doubt."""
     if estimate.value is None or estimate.doubt:
         return f"{estimate.name}: {estimate.doubt}"
-    return f"{estimate.name} {estimate.value:.5g}, standard deviation {with_percentage(estimate.std, estimate.value)}"
+    return (
+        f"{estimate.name} {estimate.value:.5g}, standard deviation "
+        f"{with_percentage(estimate.std, estimate.value)}"
+    )

@@ -124,8 +124,8 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
     else:
         peak_fraction = tip.deflection_m / beam.length_m
         motion_text = (
-            f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * peak_fraction:.2g} % of the "
-            f"length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
+            f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * peak_fraction:.2g} % of "
+            f"the length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
         )
         if not tip.slope_rad > SMALL_SLOPE_RAD:
             return motion_text

@@ -509,8 +509,10 @@ def _move_text(parameters: Mapping[str, float | int | str]) -> str:
             "uncertainty"
         )
     return (
-        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
-        f"within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); vibration left "
+        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} "
+        "ms, the angle "
+        f"within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); "
+        "vibration left "
         f"{residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
         f"{parameters['file'] or 'profile'})"
     )
@@ -538,7 +540,8 @@ def _precision_search_text(excitation: Excitation) -> str:
         str(precision_target) for precision_target in excitation.search.targets
     )
     return (
-        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_duration_s:g} s at up to {amplitude_rad:.3g} rad, "
+        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_duration_s:g} s at up to "
+        f"{amplitude_rad:.3g} rad, "
         f"then chooses the most informative excitation until {targets_text} (standard deviation)"
     )
 

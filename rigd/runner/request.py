@@ -173,10 +173,14 @@ def _refuse_unreachable_simulators(profile: Profile) -> None:
             owner_name = f"by user {uid}"
             if uid == os.getuid():
                 owner_name = "in another environment"
-                remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(simulator_path.parent.parent))} to use it"
+                remedy = (
+                    f"set XDG_RUNTIME_DIR={shlex.quote(str(simulator_path.parent.parent))} "
+                    "to use it"
+                )
         shown_path = printable(str(simulator_path))  # another user may have chosen any name
         raise RefusedError(
-            f"A simulated rig of {profile.name} is run {owner_name} ({shown_path}), which this command "
+            f"A simulated rig of {profile.name} is run {owner_name} ({shown_path}), which this "
+            "command "
             f"does not reach, and the hardware would move instead. Either {remedy}, or end it, or "
             "give --hardware if the hardware is meant."
         )
@@ -210,8 +214,8 @@ def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
             for metadata_name in missing_names
         )
         raise RefusedError(
-            f"{profile.path}: metadata.required asks each session for {', '.join(missing_names)}; add "
-            f"{' '.join(option_texts)}."
+            f"{profile.path}: metadata.required asks each session for "
+            f"{', '.join(missing_names)}; add {' '.join(option_texts)}."
         )
 
 
@@ -269,8 +273,8 @@ def require_disk_space(folder: Path, excitation: Excitation, limits: Limits) -> 
     if free_bytes - needed_bytes < limits.disk_free_mb * 1e6:
         raise NoRoomError(
             f"{folder}: {free_bytes / 1e6:.1f} MB free, of which the session may need "
-            f"{needed_bytes / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB must "
-            "remain free; free up space or choose another folder (--output)."
+            f"{needed_bytes / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB "
+            "must remain free; free up space or choose another folder (--output)."
         )
 
 
@@ -347,9 +351,13 @@ def remaining_file_text(session_path: Path | None) -> str:
         for file_path in (session_path, _unused_path(session_path))
     )
     if not file_exists:
-        return f"What was recorded is in {part_file_path}; rigd recover {old_path_text} makes a clean file of it."
+        return (
+            f"What was recorded is in {part_file_path}; rigd recover {old_path_text} makes a "
+            "clean file of it."
+        )
     return (
-        f"What was recorded is in {part_file_path}, whose name without {PART_SUFFIX} is taken: after "
+        f"What was recorded is in {part_file_path}, whose name without {PART_SUFFIX} is taken: "
+        "after "
         f"mv {old_path_text} {new_path_text} rigd recover {new_path_text} makes a clean file of it."
     )
 

@@ -460,8 +460,8 @@ class SessionRun:
         """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {failure_predicate} and was killed: without its heartbeat the drive "
-            "switches itself off. Check that it is off."
+            f"The control process {failure_predicate} and was killed: without its heartbeat the "
+            "drive switches itself off. Check that it is off."
         )
 
     def _control_died(self, reason: str) -> Finished:
