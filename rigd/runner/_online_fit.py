@@ -174,10 +174,10 @@ class FitSupervisor:
         return "Reached by the fit of the whole record."
 
     def _assess_precision(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
-        """Return whether the whole record has the requested precision, and text if it has not.
+        """Return whether the whole record has the requested precision, and the reason if not.
 
         The first value is None if the whole record was not fitted, whatever earlier estimates
-        stated. The text is empty if the precision was reached.
+        stated. The reason is empty if the precision was reached.
         """
         report, search_end = self._last_report, self._search_end
         was_reached_before = search_end is not None and search_end.reached

@@ -293,8 +293,8 @@ class ExcitationPlanner:
     def has_last_segment_begun(self, begun_until_tick: int) -> bool:
         """Return whether the last planned segment has begun, so that its record tick is known.
 
-        `begun_until_tick` is the tick of the reference at which the segment that began last ends, or 0 if none
-        has begun.
+        `begun_until_tick` is the tick of the reference at which the segment that began last
+        ends, or 0 if none has begun.
         """
         return len(self._intervals) == 1 or begun_until_tick > self._intervals[-1].reference_tick
 
@@ -380,7 +380,7 @@ class ExcitationPlanner:
     def _corrected_targets(
         self, estimate: BeamEstimate, angle_rad: Real, estimates: Sequence[TargetEstimate]
     ) -> list[Target]:
-        """Return the requested deviations with which the next segment is designed.
+        """Return the requested standard deviations with which the next segment is designed.
 
         The design predicts standard deviations of the beam model, but a fit reports those of the
         modal model. Each requested deviation is therefore divided by the ratio of reported to
@@ -426,7 +426,7 @@ class ExcitationPlanner:
         return unseen_modes if self._excites_unseen_modes else []
 
     def _repeat_scan(self, reason: str, held_ticks: int) -> Iterator[object]:
-        """Append the scan again after an unusable estimate, or end the search.
+        """Append the first chirp, the scan, again after an unusable estimate, or end the search.
 
         Yields the message for the supervisor. `reason` states why the estimate is unusable.
         """
@@ -440,7 +440,7 @@ class ExcitationPlanner:
         yield PlannedSegment("the scan once more", {"why": reason})
 
     def _append_scan(self, name: str, held_ticks: int) -> bool:
-        """Append the first scan under another name; return whether enough time was left."""
+        """Append the first chirp again as segment `name`; return whether enough time was left."""
         scan_rad = self._intervals[0].reference_rad
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
@@ -553,7 +553,7 @@ class ExcitationPlanner:
 class _TimeForecast:
     """Forecast of the time until the requested precision is reached.
 
-    It extrapolates the largest ratio of reported to requested deviation. The inverse square of this
+    It extrapolates the largest ratio of reported to requested standard deviation. The inverse square of this
     ratio is proportional to the information, which grows linearly with time under the most
     informative excitation.
     """
@@ -562,7 +562,7 @@ class _TimeForecast:
         self._information_at_times: list[tuple[float, float]] = []
 
     def add(self, time_s: float, ratio: float) -> None:
-        """Add the ratio of reported to requested deviation at a time of the record."""
+        """Add the ratio of reported to requested standard deviation at a time of the record."""
         if isfinite(ratio):
             self._information_at_times.append((time_s, ratio**-2))
 
@@ -640,7 +640,7 @@ def estimates_text(estimates: Sequence[TargetEstimate]) -> str:
 
 
 def _estimate_text(estimate: TargetEstimate) -> str:
-    """Return text with one estimate and its standard deviation, or with its doubt."""
+    """Return text with one estimate and its standard deviation, or why it is doubtful."""
     if estimate.value is None or estimate.doubt:
         return f"{estimate.name}: {estimate.doubt}"
     return (

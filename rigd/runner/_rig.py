@@ -448,7 +448,7 @@ class Rig:
         return self._group
 
     def _measure(self, measurement_order: Tare | Zero, duration_s: float) -> dict[str, Any]:
-        """Make the control process measure a tare or zero between sessions; return the result.
+        """Make the control process tare the sensor or set the zero; return the result.
 
         `duration_s` is the measuring time.
         """

@@ -90,7 +90,7 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
 
 
 def _reading_noise(profile: Profile) -> "ChannelNoise":
-    """Return the noise of torque, shear force and angle readings.
+    """Return the standard deviations of torque, shear force and angle readings.
 
     Only the ratios are used, since the size of the noise is measured at rest.
     """

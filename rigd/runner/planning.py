@@ -530,7 +530,7 @@ def _obstacle_search_text(parameters: Mapping[str, float | int | str]) -> str:
 
 
 def _precision_search_text(excitation: Excitation) -> str:
-    """Return text with the first scan and the precision targets of an excitation ``until``."""
+    """Return text with the first chirp and the requested precision of an excitation ``until``."""
     assert excitation.search is not None
     start_hz, stop_hz, scan_duration_s, amplitude_rad = (
         float(excitation.parameters[parameter_name])

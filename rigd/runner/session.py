@@ -353,7 +353,7 @@ class SessionRun:
         return self._shared_state[StateField.STOP] == Stop.NO
 
     def _open_file(self) -> None:
-        """Start the recorder, which creates the file; use another name if the name is taken."""
+        """Start the recorder, which creates the session file; use another name if one exists."""
         process_group = self._group
         realtime_settings = None if self._is_virtual_clock else self._order.profile.realtime
         for _ in range(_MAX_FILE_NAMES):

@@ -104,7 +104,7 @@ class SignalStatisticsReader:
 def _signal_statistics(
     rate_hz: float, sample_blocks: tuple[npt.NDArray[Any], ...], peaks: npt.NDArray[np.float64]
 ) -> SignalStatus:
-    """Return the statistics of the samples in the window, with the peaks of the record."""
+    """Return the statistics of the samples of the last second, with the peaks of the record."""
     window_samples = np.concatenate(sample_blocks)
     last_sample = window_samples[-1]
     tick_span = int(last_sample["tick"]) - int(window_samples["tick"][0]) + 1

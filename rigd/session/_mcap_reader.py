@@ -696,8 +696,8 @@ def parse_record(
 def _run_length(records: Buffer, start: int, message_size: int, limit_position: int) -> int:
     """Return the number of consecutive records from `start` with the same opcode, length, channel.
 
-    Records end before `limit_position`. Ever more records are compared at once, so that short runs in long
-    chunks take little time.
+    All records end before the byte offset `limit_position`. The number of records that are
+    compared at once grows, so that short runs in long chunks take little time.
     """
     (first_head, second_head) = np.frombuffer(
         records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE

@@ -349,8 +349,10 @@ class MessageDecoder:
         indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode the rows `indices` of `message_bytes` (n, bytes) into `out`, grouped by field "
-        "layout."""
+        """Decode the rows `indices` of `message_bytes` (n, bytes) into the same rows of `out`.
+
+        Messages whose fields have the same byte offsets are decoded together.
+        """
         known_layouts = self._offsets.setdefault((channel, message_bytes.shape[1]), [])
         layout_index = 0
         while (
@@ -629,8 +631,7 @@ def _decode_at_offsets(
     indices: npt.NDArray[np.int64],
     out: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages `message_rows` (n, bytes) of one field layout into elements `indices` of "
-    "`out`."""
+    """Decode messages (n, bytes) of one field layout into the elements `indices` of `out`."""
     message_rows = np.ascontiguousarray(message_rows)
     message_count, message_size = message_rows.shape
     for field_name, first_byte, field_length, array_conversion in layout.fields:

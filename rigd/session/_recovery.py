@@ -477,7 +477,7 @@ def _planned_recovery(
 
 
 def _loss_text(lost_bytes: int) -> str:
-    """Return the words that report the number of lost bytes, or "" for 0."""
+    """Return words for an error message with the number of lost bytes, or "" for 0."""
     return f"; {lost_bytes} bytes from there on were lost" if lost_bytes else ""
 
 

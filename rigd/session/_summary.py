@@ -115,9 +115,10 @@ def _has_final_magic(file: BinaryIO) -> bool:
 
 
 def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
-    """Return channels, message counts and metadata that the summary section leads to.
+    """Return channels, message counts and metadata of a file, located by its summary section.
 
-    Returns None if the file of `file_size` bytes has no usable summary section with a correct checksum.
+    Returns None if the file of `file_size` bytes has no usable summary section with a correct
+    checksum.
     """
     footer_start = file_size - len(MAGIC) - FOOTER_FORMAT.size
     if footer_start < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:

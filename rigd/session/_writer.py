@@ -414,8 +414,7 @@ class SessionWriter:
         return self._mcap
 
     def _checked_view(self, block: Buffer, message_size: int) -> memoryview:
-        """Return a view of the block; raise if its length is no multiple of `message_size` "
-        "bytes."""
+        """Return a view of encoded messages; raise if their length is no whole number of messages."""
         self._require_writer()
         block_view = memoryview(block).cast("B")
         if len(block_view) % message_size:
@@ -473,7 +472,7 @@ class SessionWriter:
         self._events = []
 
     def _sync_when_due(self) -> None:
-        """Sync the file to the disk if it has changed and the last sync is a second ago."""
+        """Sync the file to the disk if it has changed since the last sync, a second or more ago."""
         if self._is_sync_needed and time.monotonic() - self._last_sync_s >= SYNC_INTERVAL_S:
             self._sync()
             self._check_part_file()

@@ -265,8 +265,8 @@ def estimate_lines(
             )
             doubt_text = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
             report_lines.append(
-                "  "
-                f"{mode_line(mode)}{change_text}{f' (doubtful: {doubt_text})' if doubt_text else ''}"
+                f"  {mode_line(mode)}{change_text}"
+                f"{f' (doubtful: {doubt_text})' if doubt_text else ''}"
             )
     unseen_text = unseen_modes(fit_document["modes"])
     if unseen_text:

@@ -184,7 +184,7 @@ def modes_of(documents: object) -> list[Document]:
 
 
 def _valid_modes(mode_documents: list[object]) -> Iterator[Document]:
-    """Yield the valid modes of a list of any JSON values."""
+    """Yield the entries of a list of JSON values that validly describe a mode of the beam."""
     for mode_index, mode in enumerate(mode_documents[:_MAX_MODES], start=1):
         if isinstance(mode, dict):
             mode_number, is_shown = mode.get("mode", mode_index), mode.get("shown") is not False
@@ -258,7 +258,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
 
 
 def _valid_targets(documents: object) -> Iterator[Document]:
-    """Yield the valid precision targets of any JSON value."""
+    """Yield the entries of a JSON value that validly state a requested precision."""
     for target_document in documents if isinstance(documents, list) else ():
         if isinstance(target_document, dict):
             target_numbers = {
@@ -342,7 +342,7 @@ def _finite_or_none(number_text: str) -> float | None:
 
 
 def _checked_text(json_value: object) -> str:
-    """Return a text without control characters, cut to 1000; raise TypeError if it is no text."""
+    """Return a text without control characters, cut to 1000 characters; raise TypeError if none."""
     if not isinstance(json_value, str):
         raise TypeError
     return printable(json_value, _MAX_TEXT_CHARACTERS)

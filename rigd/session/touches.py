@@ -51,7 +51,7 @@ def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
 
 
 def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a touch with checked values from a JSON object."""
+    """Return a touch of the beam with its valid values from a JSON object."""
     touch_number, touch_kind = touch_document.get("number"), touch_document.get("kind")
     touch: dict[str, Any] = {
         "number": touch_number if isinstance(touch_number, int) and 0 < touch_number < 10**9 else 0,
