@@ -82,7 +82,7 @@ class StopReport:
 
     @property
     def sure(self) -> bool:
-        """Whether it is certain that no session of this user is running any more."""
+        """Whether certainly no session of this user is running any more."""
         return not (self.running or self.doubts)
 
 

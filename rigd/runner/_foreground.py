@@ -252,7 +252,7 @@ class _TerminalProgress:
 
 
 def _print(text: str, *, to_stderr: bool) -> None:
-    """Print a line to standard output or, if `to_stderr` is True, to standard error."""
+    """Print a line to standard error if `to_stderr` is True, else to standard output."""
     with contextlib.suppress(OSError):  # the session continues without a terminal
         typer.echo(text, err=to_stderr)
 

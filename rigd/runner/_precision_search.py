@@ -514,7 +514,7 @@ class ExcitationPlanner:
     def _expectation_document(
         self, segment: Segment, estimates: Sequence[TargetEstimate]
     ) -> dict[str, Any]:
-        """Return the expected precision after a segment, and the present one, for JSON."""
+        """Return the expected standard deviations after a segment, and the present ones, for JSON."""
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
             "stated": {
@@ -553,9 +553,9 @@ class ExcitationPlanner:
 class _TimeForecast:
     """Forecast of the time until the requested precision is reached.
 
-    It extrapolates the largest ratio of reported to requested standard deviation. The inverse square of this
-    ratio is proportional to the information, which grows linearly with time under the most
-    informative excitation.
+    It extrapolates the largest ratio of reported to requested standard deviation. The inverse
+    square of this ratio is proportional to the information, which grows linearly with time under
+    the most informative excitation.
     """
 
     def __init__(self) -> None:

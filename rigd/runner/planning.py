@@ -274,7 +274,7 @@ def plan_session(
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
-    """Return the plan of a session, which states whether checks and limits allow the session.
+    """Return the plan of a session; its field `refused` states why it is not allowed, if so.
 
     Parameters
     ----------

@@ -62,11 +62,11 @@ class QuickLook:
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return the quick look that an event of the daemon reports."""
-        session_path, look_content = Path(event["path"]), event["look"]
+        session_path, report_content = Path(event["path"]), event["look"]
         return cls(
             session_path,
-            None if look_content is None else quick_look_path(session_path),
-            look_content,
+            None if report_content is None else quick_look_path(session_path),
+            report_content,
             event["error"],
         )
 
@@ -129,8 +129,8 @@ class QuickLooks:
     def poll(self) -> None:
         """Report ended quick looks and start the next one; call this often between sessions."""
         with self._lock:
-            ended_looks = [*self._ended_quick_look(), *self._start_next()]
-        for quick_look in ended_looks:
+            ended_reports = [*self._ended_quick_look(), *self._start_next()]
+        for quick_look in ended_reports:
             self._on_result(quick_look)
 
     @contextlib.contextmanager
@@ -227,11 +227,11 @@ class QuickLooks:
 
     def _read_result(self) -> QuickLook:
         """Return the quick look that the program has written successfully."""
-        look_path = quick_look_path(self._session)
-        look_content = read_quick_look(look_path)
-        if look_content is None:
-            return QuickLook.failed(self._session, f"{look_path} cannot be read.")
-        return QuickLook(self._session, look_path, look_content, "")
+        report_path = quick_look_path(self._session)
+        report_content = read_quick_look(report_path)
+        if report_content is None:
+            return QuickLook.failed(self._session, f"{report_path} cannot be read.")
+        return QuickLook(self._session, report_path, report_content, "")
 
     def _send_signal(self, signal_number: signal.Signals) -> None:
         """Send a signal to the running quick look, if there is one."""

@@ -86,7 +86,7 @@ def load_rig(
     hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, ActuationTarget]:
-    """Return a profile, and whether a session with it moves the hardware or a simulated rig.
+    """Return a profile, and which rig its sessions move: the hardware or a simulated one.
 
     Parameters
     ----------

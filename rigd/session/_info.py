@@ -435,7 +435,7 @@ def _time_text(time_utc: datetime) -> str:
 
 
 def _recovery_items(outcome: dict[str, str]) -> dict[str, str]:
-    """Return the items of the record ``outcome`` on a recovery, without their keys' prefix."""
+    """Return the items of the record ``outcome`` that a recovery added, without the key prefix."""
     return {
         key.removeprefix(_RECOVERY_KEY_PREFIX): outcome_value
         for key, outcome_value in outcome.items()

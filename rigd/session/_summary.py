@@ -146,7 +146,7 @@ def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
 
 
 def _contents_from_summary(file: BinaryIO, summary_bytes: bytes) -> McapContents | None:
-    """Return the contents that a summary section leads to.
+    """Return channels, message counts and metadata of a file from its summary section.
 
     Returns None if the section is incomplete, or the metadata are too long.
     """

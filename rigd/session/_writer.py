@@ -414,7 +414,7 @@ class SessionWriter:
         return self._mcap
 
     def _checked_view(self, block: Buffer, message_size: int) -> memoryview:
-        """Return a view of encoded messages; raise if their length is no whole number of messages."""
+        """Return a view of encoded messages; raise unless it contains a whole number of them."""
         self._require_writer()
         block_view = memoryview(block).cast("B")
         if len(block_view) % message_size:

@@ -122,17 +122,17 @@ def last_quick_look(
         Path of the session file, and the quick look's document from `read_quick_look`; None if
         there is no such session.
     """
-    for look_path in sorted(_newest_quick_looks(folder), key=_start_utc_ns, reverse=True):
+    for report_path in sorted(_newest_quick_looks(folder), key=_start_utc_ns, reverse=True):
         if (
-            look_path.name != excluded_session + QUICK_LOOK_SUFFIX
-            and (look_document := read_quick_look(look_path)) is not None
-            and look_document["specimen"] == specimen
-            and (before_utc_ns is None or look_document["start_utc_ns"] < before_utc_ns)
-            and is_usable(look_document)
+            report_path.name != excluded_session + QUICK_LOOK_SUFFIX
+            and (report_document := read_quick_look(report_path)) is not None
+            and report_document["specimen"] == specimen
+            and (before_utc_ns is None or report_document["start_utc_ns"] < before_utc_ns)
+            and is_usable(report_document)
         ):
-            return look_path.with_name(
-                look_path.name.removesuffix(QUICK_LOOK_SUFFIX) + ".mcap"
-            ), look_document
+            return report_path.with_name(
+                report_path.name.removesuffix(QUICK_LOOK_SUFFIX) + ".mcap"
+            ), report_document
     return None
 
 
@@ -140,10 +140,12 @@ def _newest_quick_looks(folder: Path) -> list[Path]:
     """Return the paths of the 200 newest quick looks in a folder."""
     times_and_paths: list[tuple[float, Path]] = []
     with suppress(OSError):
-        for look_path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
+        for report_path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
             with suppress(OSError):
-                times_and_paths.append((look_path.stat().st_mtime, look_path))
-    return [look_path for _, look_path in sorted(times_and_paths, reverse=True)[:_MAX_FILES_READ]]
+                times_and_paths.append((report_path.stat().st_mtime, report_path))
+    return [
+        report_path for _, report_path in sorted(times_and_paths, reverse=True)[:_MAX_FILES_READ]
+    ]
 
 
 def _start_utc_ns(path: Path) -> int:
@@ -165,7 +167,7 @@ def _file_beginning(path: Path) -> bytes:
 
 
 def modes_of(documents: object) -> list[Document]:
-    """Return the valid modes of a quick look or a report.
+    """Return the valid modes of the beam from the JSON list of a quick look or a report.
 
     Parameters
     ----------

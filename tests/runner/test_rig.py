@@ -130,7 +130,7 @@ def test_a_stop_ends_one_session_and_not_the_next(rig, run, tmp_path):
         if progress.phase is Phase.RUNNING:
             stop.request()
 
-    stopped = run(rig, stop=stop, on_progress=watcher, duration_s=100.0)
+    stopped = run(rig, stop=stop, watcher=watcher, duration_s=100.0)
     assert stopped.outcome == "stopped"
     assert stopped.scheduled == stopped.recorded + stopped.missed + stopped.lost < 100_200
     after = run(rig)
@@ -148,7 +148,7 @@ def test_a_recorder_that_dies_ends_its_session_and_not_the_next(rig, run, tmp_pa
     from rigd.runner.session import SessionFailedError
 
     with pytest.raises(SessionFailedError, match="killed by signal 9") as caught:
-        run(rig, on_progress=watcher, duration_s=100.0)
+        run(rig, watcher=watcher, duration_s=100.0)
     told = caught.value.result()
     assert (told.outcome, told.fault, told.path) == ("fault", True, None)
     assert told.part == tmp_path / "0.mcap.part"
