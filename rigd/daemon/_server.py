@@ -532,7 +532,7 @@ _TOO_MANY_CLIENTS_LINE = _json_line(
 
 
 def _send_last_line(client_socket: socket.socket, last_line: bytes) -> None:
-    """Send a last line without waiting, and close the connection."""
+    """Send a last reply to a client without waiting, and close the connection."""
     with client_socket, suppress(OSError):
         client_socket.send(last_line)
 

@@ -150,7 +150,7 @@ def run_in_foreground(
             is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
             is_hardware = target is ActuationTarget.HARDWARE
             locks.enter_context(
-                RigLock(profile.name, "rigd run", hardware=is_hardware, alone=is_exclusive)
+                RigLock(profile.name, "rigd run", hardware=is_hardware, exclusive=is_exclusive)
             )
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:

@@ -90,9 +90,9 @@ def move_plant_of(
     frequency_uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
     if identified_beam is not None:
         frequency_uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
-    motor, rig = profile.control_motor, profile.rig
+    control_motor, rig = profile.control_motor, profile.rig
     disturbances = Disturbances(
-        motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
+        control_motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
     )
     compensated_loop = replace(uncompensated_loop, model=model)
 
@@ -112,11 +112,11 @@ def move_plant_of(
         frequency_uncertainty=np.array(frequency_uncertainty),
         torque_noise_nm=disturbances.torque_noise_nm,
         settling_s=_SETTLING_TIME_CONSTANTS / settings.pole_rad_s,
-        peak_torque_nm=motor.peak_torque_nm,
+        peak_torque_nm=control_motor.peak_torque_nm,
         friction_nm=profile.control.friction_compensation_nm,
         largest_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
-        * motor.peak_torque_nm
-        / motor.inertia_kg_m2,
+        * control_motor.peak_torque_nm
+        / control_motor.inertia_kg_m2,
         velocity_rad_s=profile.limits.velocity_rad_s,
         tracking_error_rad=profile.limits.tracking_error_rad,
         coupling_torque_nm=coupling_limit_nm,

@@ -80,7 +80,7 @@ class TargetEstimate:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the standard deviation to the requested standard deviation."""
+        """Ratio of the estimate's standard deviation to the requested one; at most 1 suffices."""
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
 
@@ -514,7 +514,7 @@ class ExcitationPlanner:
     def _expectation_document(
         self, segment: Segment, estimates: Sequence[TargetEstimate]
     ) -> dict[str, Any]:
-        """Return the expected standard deviations after a segment, and the present ones, for JSON."""
+        """Return the present standard deviations, and those expected after a segment, for JSON."""
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
             "stated": {

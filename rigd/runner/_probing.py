@@ -205,7 +205,7 @@ def probe_in_foreground(
         is_exclusive = not (fast and actuation_target is ActuationTarget.SIMULATED)
         is_hardware = actuation_target is ActuationTarget.HARDWARE
         locks.enter_context(
-            RigLock(profile.name, "rigd probe", hardware=is_hardware, alone=is_exclusive)
+            RigLock(profile.name, "rigd probe", hardware=is_hardware, exclusive=is_exclusive)
         )
         rig = Rig(profile, fast=fast, group=group)
         rig.connect(actuation_target)

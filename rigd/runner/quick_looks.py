@@ -135,7 +135,7 @@ class QuickLooks:
 
     @contextlib.contextmanager
     def suspended(self) -> Iterator[None]:
-        """Suspend the running quick look while the context, a session, lasts."""
+        """Suspend the process of the running quick look within the context, during a session."""
         with self._lock:
             self._is_suspended = True
             self._send_signal(signal.SIGSTOP)

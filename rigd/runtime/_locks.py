@@ -157,10 +157,10 @@ class RigLock:
         because each simulates a rig of its own.
     """
 
-    def __init__(self, rig: str, holder: str, *, hardware: bool, alone: bool = True) -> None:
+    def __init__(self, rig: str, holder: str, *, hardware: bool, exclusive: bool = True) -> None:
         self._rig = rig
         self._holder = holder
-        self._is_exclusive = alone
+        self._is_exclusive = exclusive
         self._file = LockFile(f"rig-{rig}", for_all_users=hardware)
 
     def acquire(self) -> None:

@@ -296,12 +296,12 @@ def readable_texts(
 class _EntryLimiter:
     """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
-    `what` is a plural noun for the entries. `max_characters` is the maximum number of characters in
+    `entries_noun` is a plural noun for the entries. `max_characters` is the maximum number of characters in
     text or JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
-    def __init__(self, what: str, max_characters: int, omission_texts: list[str]) -> None:
-        self._entries_noun = what
+    def __init__(self, entries_noun: str, max_characters: int, omission_texts: list[str]) -> None:
+        self._entries_noun = entries_noun
         self._omission_texts = omission_texts
         self._remaining_characters = max_characters
 

@@ -387,9 +387,9 @@ class MessageDecoder:
         Returns None if such messages must be decoded one by one with the protobuf package.
         """
         cls = self._message_class(channel)
-        empty_message, descriptor = cls(), cls.DESCRIPTOR
+        empty_message, message_descriptor = cls(), cls.DESCRIPTOR
         if not empty_message.IsInitialized() or any(
-            len(end_group.fields) > 1 for end_group in descriptor.oneofs
+            len(end_group.fields) > 1 for end_group in message_descriptor.oneofs
         ):
             return None
         tag_mask, found_fields = np.zeros(len(message), np.uint8), {}
@@ -418,7 +418,7 @@ class MessageDecoder:
             ):
                 return None
             tag_mask[start:value_start] = 0xFF
-            field_descriptor = descriptor.fields_by_number.get(field_number)
+            field_descriptor = message_descriptor.fields_by_number.get(field_number)
             if field_descriptor is not None:
                 array_conversion = self._array_conversion(field_descriptor, wire_type)
                 if array_conversion is None:

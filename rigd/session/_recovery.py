@@ -534,7 +534,9 @@ def _metadata_records(contents: McapContents) -> dict[str, dict[str, str]]:
     if protected_records and not contents.verified:
         return protected_records
     record_names = dict.fromkeys(
-        record.name for record in contents.metadata if record.name != "outcome"
+        metadata_record.name
+        for metadata_record in contents.metadata
+        if metadata_record.name != "outcome"
     )
     return {
         record_name: merged_metadata(contents, record_name) or {} for record_name in record_names

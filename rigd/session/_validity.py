@@ -138,7 +138,7 @@ class Validity:
 
     @property
     def sentence(self) -> str:
-        """Sentence that states the peak tip slope and the error of the linear model."""
+        """Sentence that states the beam's peak tip slope and the error of the linear beam model."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "The slope of the tip, and with it the error of the linear model, is unknown."
         slope_text = f"Tip slopes up to {self.predicted_peak_tip_slope_rad:.2g} rad"

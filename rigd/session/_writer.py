@@ -488,7 +488,7 @@ class SessionWriter:
 def _message_records(
     wire_messages: npt.NDArray[np.void], channel: int, start_utc_ns: int
 ) -> npt.NDArray[np.void]:
-    """Return MCAP message records (n,) for messages (n,) of a wire dtype."""
+    """Return the MCAP message records (n,) that contain the encoded messages (n,)."""
     message_records = np.empty(
         wire_messages.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire_messages.dtype)]
     )

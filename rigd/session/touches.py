@@ -69,7 +69,7 @@ def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _checked_estimate(estimate_document: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
-    """Return an estimate with its uncertainty from any JSON value, or None if it is invalid."""
+    """Return a touch's estimate with its uncertainty from a JSON value, or None if invalid."""
     if not isinstance(estimate_document, dict):
         return None
     interval_bounds = estimate_document.get("interval_95")
