@@ -296,7 +296,8 @@ def readable_texts(
 class _EntryLimiter:
     """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
-    `entries_noun` is a plural noun for the entries. `max_characters` is the maximum number of characters in
+    `entries_noun` is a plural noun for the entries. `max_characters` is the maximum number of
+    characters in
     text or JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
