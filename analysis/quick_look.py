@@ -387,8 +387,8 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
         path.parent,
         specimen,
         before_utc_ns=before_utc_ns,
-        but=path.stem,
-        usable=lambda document: any(mode["shown"] for mode in document["modes"]),
+        excluded_session=path.stem,
+        is_usable=lambda document: any(mode["shown"] for mode in document["modes"]),
     )
     return None if path_and_document is None else path_and_document[1]
 

@@ -35,7 +35,7 @@ def probe(
             profile_name=profile,
             fast=fast,
             hardware=hardware,
-            says=partial(typer.echo, err=True),
+            report_line=partial(typer.echo, err=True),
         )
     finally:
         ignore()

@@ -80,7 +80,7 @@ def start_processes(
         extra_processes = [
             process for process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
         ]
-        return stop, ProcessGroup(live=live, also=extra_processes)
+        return stop, ProcessGroup(live=live, extra_processes=extra_processes)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "
@@ -232,7 +232,7 @@ def _follow_series(
                         event["total"],
                         missed=event["missed"],
                         late=event["late"],
-                        number=f"{event['session']}/{event['repeat']}"
+                        session_number_text=f"{event['session']}/{event['repeat']}"
                         if event["repeat"] > 1
                         else "",
                     )

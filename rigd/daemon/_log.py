@@ -25,17 +25,17 @@ _FLUSH_TIMEOUT_S: Final = 1.0
 class _DroppingQueueHandler(logging.handlers.QueueHandler):
     """Log handler that queues records, and drops and counts records if the queue is full."""
 
-    def __init__(self, waiting: "queue.Queue[logging.LogRecord]") -> None:
-        super().__init__(waiting)
-        self._queue = waiting
+    def __init__(self, record_queue: "queue.Queue[logging.LogRecord]") -> None:
+        super().__init__(record_queue)
+        self._queue = record_queue
         self._dropped = 0
 
     def enqueue(self, record: logging.LogRecord) -> None:
         """Add a record to the queue without waiting; drop it if the queue is full."""
         if self._dropped and not self._queue.full():
-            text = f"{self._dropped} lines before this one were dropped (log not read)"
+            dropped_text = f"{self._dropped} lines before this one were dropped (log not read)"
             self._queue.put_nowait(
-                logging.LogRecord(LOGGER_NAME, logging.WARNING, "", 0, text, None, None)
+                logging.LogRecord(LOGGER_NAME, logging.WARNING, "", 0, dropped_text, None, None)
             )
             self._dropped = 0
         try:
@@ -73,9 +73,9 @@ class DaemonLog:
         """
         formatter = logging.Formatter("%(asctime)s %(levelname)s %(message)s")
         while True:
-            line = formatter.format(self._queue.get()) + "\n"
-            data = line.encode(errors="backslashreplace")
+            log_line = formatter.format(self._queue.get()) + "\n"
+            line_bytes = log_line.encode(errors="backslashreplace")
             with contextlib.suppress(OSError):
-                while data:
-                    data = data[os.write(_STANDARD_ERROR_FD, data) :]
+                while line_bytes:
+                    line_bytes = line_bytes[os.write(_STANDARD_ERROR_FD, line_bytes) :]
             self._queue.task_done()

@@ -78,48 +78,52 @@ def run_daemon(
         resources.enter_context(
             RigLock(profile.name, "rigd serve", hardware=target is ActuationTarget.HARDWARE)
         )
-        path = socket_path(profile.name, None if group is None else GROUP_FOLDER)
-        listener = resources.enter_context(bind(path, group))
-        resources.callback(path.unlink, missing_ok=True)
-        worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
+        daemon_socket = socket_path(profile.name, None if group is None else GROUP_FOLDER)
+        listener = resources.enter_context(bind(daemon_socket, group))
+        resources.callback(daemon_socket.unlink, missing_ok=True)
+        rig_worker = resources.enter_context(ThreadPoolExecutor(1, "rig"))
         server = Server(listener)
         service = Service(
             Rig(profile, fast=fast, live=live),
             profile,
             folder,
-            worker,
+            rig_worker,
             server.publish,
             partial(actuation_target, profile.rig),
             fast=fast,
             live=live,
             quick_looks=quick_looks,
         )
-        _log.info("%s Listening on %s", describe_actuation_target(profile.rig, target), path)
-        for difference in simulated_differently(profile.rig):
-            _log.warning("the simulated rig has %s", difference)
+        _log.info(
+            "%s Listening on %s", describe_actuation_target(profile.rig, target), daemon_socket
+        )
+        for simulation_difference in simulated_differently(profile.rig):
+            _log.warning("the simulated rig has %s", simulation_difference)
         if page:
             from rigd.daemon._page import PageProcess
 
-            page_process = PageProcess(profile, folder, path, page_port, service.set_page_address)
+            page_process = PageProcess(
+                profile, folder, daemon_socket, page_port, service.set_page_address
+            )
             resources.callback(page_process.close)
         return asyncio.run(_run_until_signal(server, service))
 
 
 async def _run_until_signal(server: Server, service: Service) -> signal.Signals:
     """Run server and service until a signal ends the daemon, and return that signal."""
-    loop = asyncio.get_running_loop()
-    ending_signal: asyncio.Future[signal.Signals] = loop.create_future()
+    event_loop = asyncio.get_running_loop()
+    ending_signal: asyncio.Future[signal.Signals] = event_loop.create_future()
 
-    def end_by_signal(number: signal.Signals) -> None:
+    def end_by_signal(signal_number: signal.Signals) -> None:
         if not ending_signal.done():
-            ending_signal.set_result(number)
+            ending_signal.set_result(signal_number)
 
-    for number in _END_SIGNALS:
-        if signal.getsignal(number) != signal.SIG_IGN:  # nohup
-            loop.add_signal_handler(number, end_by_signal, number)
+    for signal_number in _END_SIGNALS:
+        if signal.getsignal(signal_number) != signal.SIG_IGN:  # nohup
+            event_loop.add_signal_handler(signal_number, end_by_signal, signal_number)
     # A stop by signal works even if other clients block the socket. The handler is installed before
     # the socket accepts clients.
-    loop.add_signal_handler(STOP_SIGNAL, _stop_session, service)
+    event_loop.add_signal_handler(STOP_SIGNAL, _stop_session, service)
     server.serve(service)
     connecting_task = asyncio.create_task(service.open())
     polling_task = asyncio.create_task(service.run())
@@ -128,9 +132,9 @@ async def _run_until_signal(server: Server, service: Service) -> signal.Signals:
     # Polling ends only because of a bug, which must not leave the rig unsupervised.
     polling_task.add_done_callback(lambda _: end_by_signal(signal.SIGABRT))
     await ending_signal
-    reason = f"the daemon got {ending_signal.result().name}"
-    _log.info("%s and ends", reason)
-    await service.close(reason)
+    end_reason = f"the daemon got {ending_signal.result().name}"
+    _log.info("%s and ends", end_reason)
+    await service.close(end_reason)
     polling_task.cancel()
     streaming_task.cancel()
     await asyncio.gather(connecting_task, polling_task, streaming_task, return_exceptions=True)
@@ -138,10 +142,10 @@ async def _run_until_signal(server: Server, service: Service) -> signal.Signals:
     return ending_signal.result()
 
 
-def _log_stream_failure(streaming: "asyncio.Task[None]") -> None:
+def _log_stream_failure(streaming_task: "asyncio.Task[None]") -> None:
     """Log that the publishing of signals has failed, on which the rig does not depend."""
-    if not streaming.cancelled():
-        _log.error("the signals are no longer published", exc_info=streaming.exception())
+    if not streaming_task.cancelled():
+        _log.error("the signals are no longer published", exc_info=streaming_task.exception())
 
 
 def _stop_session(service: Service) -> None:

@@ -116,29 +116,31 @@ class PageProcess:
     def _run_process(self) -> None:
         """Start the process of the page, announce its address, and wait for its end."""
         with signals_blocked():
-            process = subprocess.Popen(
+            page_process = subprocess.Popen(
                 [*OWN_PYTHON, *_PAGE_SERVER_ARGUMENTS],
                 stdin=subprocess.PIPE,
                 stdout=subprocess.PIPE,
                 env=os.environ | SINGLE_THREADED,
             )
-        self._process = process
+        self._process = page_process
         if self._is_closing.is_set():
-            process.kill()
-        assert process.stdin is not None
-        assert process.stdout is not None
-        report = {}
-        with process:
+            page_process.kill()
+        assert page_process.stdin is not None
+        assert page_process.stdout is not None
+        port_report = {}
+        with page_process:
             with suppress(OSError, ValueError):
-                process.stdin.write(json.dumps(self._job).encode() + b"\n")
-                process.stdin.flush()
-                for line in process.stdout:
-                    report = json.loads(line)
-                    if "port" in report:
-                        self._announce(report["port"])
-            code = process.wait()
+                page_process.stdin.write(json.dumps(self._job).encode() + b"\n")
+                page_process.stdin.flush()
+                for output_line in page_process.stdout:
+                    port_report = json.loads(output_line)
+                    if "port" in port_report:
+                        self._announce(port_report["port"])
+            exit_code = page_process.wait()
         if not self._is_closing.is_set():
-            _log.warning("page: its process ended with code %s: %s", code, report.get("error", ""))
+            _log.warning(
+                "page: its process ended with code %s: %s", exit_code, port_report.get("error", "")
+            )
 
     def _announce(self, port: int) -> None:
         """Announce the page's address; a restarted process uses the same port, for open pages."""
@@ -163,11 +165,13 @@ def page_address(rig: str) -> str | None:
     rig
         Name of the rig's profile.
     """
-    address = read_address(_address_path(rig))
-    pid, born, url, token = (address.get(name) for name in ("pid", "born", "url", "token"))
+    address_document = read_address(_address_path(rig))
+    pid, start_ticks, url, token = (
+        address_document.get(address_key) for address_key in ("pid", "born", "url", "token")
+    )
     if not isinstance(pid, int) or not isinstance(url, str) or not isinstance(token, str):
         return None
-    return f"{url}#token={token}" if started_at(pid) == born else None
+    return f"{url}#token={token}" if started_at(pid) == start_ticks else None
 
 
 def _address_path(rig: str) -> Path:

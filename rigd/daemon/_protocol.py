@@ -123,8 +123,12 @@ class Notes(BaseModel):
         MetadataError
             If a name or value of `meta` breaks a rule.
         """
-        texts = {name: getattr(self, name) for name in NOTES}
-        return {name: text for name, text in texts.items() if text} | metadata_keys(self.meta)
+        note_texts = {metadata_name: getattr(self, metadata_name) for metadata_name in NOTES}
+        return {
+            metadata_name: metadata_text
+            for metadata_name, metadata_text in note_texts.items()
+            if metadata_text
+        } | metadata_keys(self.meta)
 
 
 class CheckRequest(Request):
@@ -177,7 +181,7 @@ _REQUESTS: TypeAdapter[AnyRequest] = TypeAdapter(
 _COMMAND_NAMES = "status", "watch", "stop", "tare", "zero", "reset", "check", "start", "predict"
 
 
-def parse_request(line: bytes) -> AnyRequest:
+def parse_request(request_line: bytes) -> AnyRequest:
     """Return the request that a line of bytes contains.
 
     Raises
@@ -185,44 +189,49 @@ def parse_request(line: bytes) -> AnyRequest:
     RequestError
         If the line is not a valid request; the message states the reason.
     """
-    document = _parse_object(line)
-    request_id = document.get("id")
+    request_document = _parse_object(request_line)
+    request_id = request_document.get("id")
     if not isinstance(request_id, int | str) or isinstance(request_id, bool):
         request_id = None
-    command = document.get("command")
-    if command not in _COMMAND_NAMES:
+    command_name = request_document.get("command")
+    if command_name not in _COMMAND_NAMES:
         raise RequestError(
-            f"command = {_shown_value(command)} is unknown; choose {', '.join(_COMMAND_NAMES)}.",
+            f"command = {_shown_value(command_name)} is unknown; choose "
+            f"{', '.join(_COMMAND_NAMES)}.",
             request_id,
         )
     try:
-        request = _REQUESTS.validate_python(document)
+        parsed_request = _REQUESTS.validate_python(request_document)
     except ValidationError as error:
         raise RequestError(_first_error_sentence(error), request_id) from None
     try:
-        return _checked_session_request(request) if isinstance(request, SessionRequest) else request
+        return (
+            _checked_session_request(parsed_request)
+            if isinstance(parsed_request, SessionRequest)
+            else parsed_request
+        )
     except RequestError as error:
         raise RequestError(str(error), request_id) from None
 
 
-def _parse_object(line: bytes) -> dict[str, Any]:
+def _parse_object(json_line: bytes) -> dict[str, Any]:
     """Return the JSON object in a line; raise RequestError if there is none."""
     try:
-        document = json.loads(line.decode(), parse_constant=_refuse_json_constant)
+        json_object = json.loads(json_line.decode(), parse_constant=_refuse_json_constant)
     except UnicodeDecodeError:
         raise RequestError("The line is not UTF-8.") from None
     except RecursionError:
         raise RequestError("The line is nested too deeply.") from None
     except ValueError as error:
         raise RequestError(f"The line is not JSON ({error}).") from None
-    if not isinstance(document, dict):
+    if not isinstance(json_object, dict):
         raise RequestError("A request is a JSON object.")
-    return document
+    return json_object
 
 
-def _refuse_json_constant(name: str) -> NoReturn:
+def _refuse_json_constant(constant_name: str) -> NoReturn:
     """Raise ValueError for ``NaN`` or ``Infinity`` in a line of JSON."""
-    raise ValueError(f"{name} is not a number")
+    raise ValueError(f"{constant_name} is not a number")
 
 
 def _first_error_sentence(error: ValidationError) -> str:
@@ -231,7 +240,9 @@ def _first_error_sentence(error: ValidationError) -> str:
     if first_error["loc"][1:2] == ("id",):  # pydantic reports each of its two types separately
         return f"id is a whole number or a text of at most {_MAX_ID_CHARACTERS} characters."
     field_name = (
-        ".".join(str(part)[:_MAX_SHOWN_CHARACTERS] for part in first_error["loc"][1:])
+        ".".join(
+            str(location_part)[:_MAX_SHOWN_CHARACTERS] for location_part in first_error["loc"][1:]
+        )
         or "The request"
     )
     return f"{field_name}: {first_error['msg']}."
@@ -250,81 +261,104 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
             f"excitation = {_shown_value(request.excitation)} is unknown; choose "
             f"{', '.join(KINDS)}."
         )
-    for note in NOTES:
-        if not getattr(request.notes, note).isprintable():
-            raise RequestError(f"notes.{note} is not plain text of one line.")
+    for note_text in NOTES:
+        if not getattr(request.notes, note_text).isprintable():
+            raise RequestError(f"notes.{note_text} is not plain text of one line.")
     try:
         request.notes.as_metadata()
     except MetadataError as error:
         raise RequestError(f"notes.meta: {error}") from None
-    update: dict[str, Any] = {}
+    checked_fields: dict[str, Any] = {}
     given_parameters = dict(request.parameters)
     # Older clients send it among the parameters of `until`.
     if request.tip_slope_rad is None and "tip_slope_rad" in given_parameters:
         slope_rad = _finite_number("tip_slope_rad", given_parameters.pop("tip_slope_rad"))
         if slope_rad <= 0.0:
             raise RequestError(f"tip_slope_rad = {slope_rad:g} rad must be more than 0 rad.")
-        update["tip_slope_rad"] = slope_rad
-    function = KINDS[request.excitation]
+        checked_fields["tip_slope_rad"] = slope_rad
+    excitation_function = KINDS[request.excitation]
     function_parameters = {
-        name: parameter
-        for name, parameter in inspect.signature(function).parameters.items()
-        if name not in RIG_ARGUMENTS
+        parameter_name: function_parameter
+        for parameter_name, function_parameter in inspect.signature(
+            excitation_function
+        ).parameters.items()
+        if parameter_name not in RIG_ARGUMENTS
     }
-    values: dict[str, Value] = {}
-    for name, given in given_parameters.items():
-        if name not in function_parameters:
+    checked_values: dict[str, Value] = {}
+    for parameter_name, given_value in given_parameters.items():
+        if parameter_name not in function_parameters:
             raise RequestError(
-                f"parameters: {_shown_value(name)} is not a parameter of {request.excitation}; "
-                f"there are {', '.join(function_parameters)}."
+                f"parameters: {_shown_value(parameter_name)} is not a parameter of "
+                f"{request.excitation}; there are {', '.join(function_parameters)}."
             )
-        values[name] = _converted_parameter(name, given, function_parameters[name].annotation)
-    for name, parameter in function_parameters.items():
-        if parameter.default is inspect.Parameter.empty and name not in values:
-            raise RequestError(f"parameters.{name} is missing.")
-    return request.model_copy(update={**update, "parameters": values})
+        checked_values[parameter_name] = _converted_parameter(
+            parameter_name, given_value, function_parameters[parameter_name].annotation
+        )
+    for parameter_name, function_parameter in function_parameters.items():
+        if (
+            function_parameter.default is inspect.Parameter.empty
+            and parameter_name not in checked_values
+        ):
+            raise RequestError(f"parameters.{parameter_name} is missing.")
+    return request.model_copy(update={**checked_fields, "parameters": checked_values})
 
 
-def _converted_parameter(name: str, given: object, wanted_type: object) -> Value:
+def _converted_parameter(parameter_name: str, given_value: object, wanted_type: object) -> Value:
     """Return a parameter converted to the type `wanted_type`; raise RequestError if impossible."""
     if wanted_type in (float, float | None):
-        return _finite_number(name, given)
+        return _finite_number(parameter_name, given_value)
     if wanted_type is int:
-        if isinstance(given, int) and not isinstance(given, bool) and abs(given) < 2**63:
-            return given
-        raise RequestError(f"parameters.{name} = {_shown_value(given)} is not a whole number.")
-    if wanted_type is str:
-        if isinstance(given, str) and given.isprintable() and len(given) <= _MAX_TEXT_CHARACTERS:
-            return given
+        if (
+            isinstance(given_value, int)
+            and not isinstance(given_value, bool)
+            and abs(given_value) < 2**63
+        ):
+            return given_value
         raise RequestError(
-            f"parameters.{name} = {_shown_value(given)} is not plain text of one line and at most "
-            f"{_MAX_TEXT_CHARACTERS} characters."
+            f"parameters.{parameter_name} = {_shown_value(given_value)} is not a whole number."
+        )
+    if wanted_type is str:
+        if (
+            isinstance(given_value, str)
+            and given_value.isprintable()
+            and len(given_value) <= _MAX_TEXT_CHARACTERS
+        ):
+            return given_value
+        raise RequestError(
+            f"parameters.{parameter_name} = {_shown_value(given_value)} is not plain text of one "
+            f"line and at most {_MAX_TEXT_CHARACTERS} characters."
         )
     if (
-        isinstance(given, str)
-        and given.isprintable()
-        and len(given) < _MAX_PATH_CHARACTERS
-        and Path(given).is_absolute()
+        isinstance(given_value, str)
+        and given_value.isprintable()
+        and len(given_value) < _MAX_PATH_CHARACTERS
+        and Path(given_value).is_absolute()
     ):
-        return Path(given)
+        return Path(given_value)
     raise RequestError(
-        f"parameters.{name} = {_shown_value(given)} is not the absolute path of a file; give one "
-        "that the daemon can read."
+        f"parameters.{parameter_name} = {_shown_value(given_value)} is not the absolute path of "
+        "a file; give one that the daemon can read."
     )
 
 
-def _finite_number(name: str, given: object) -> float:
+def _finite_number(parameter_name: str, given_value: object) -> float:
     """Return a parameter as a finite number; raise RequestError if it is not one."""
-    number = finite_number(given)
+    number = finite_number(given_value)
     if number is None:
-        raise RequestError(f"parameters.{name} = {_shown_value(given)} is not a finite number.")
+        raise RequestError(
+            f"parameters.{parameter_name} = {_shown_value(given_value)} is not a finite number."
+        )
     return number
 
 
-def _shown_value(value: object) -> str:
+def _shown_value(json_value: object) -> str:
     """Return a value as JSON for an error message, cut to 60 characters."""
     try:
-        text = json.dumps(value)
+        json_text = json.dumps(json_value)
     except (ValueError, RecursionError):
-        text = "..."
-    return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}..."
+        json_text = "..."
+    return (
+        json_text
+        if len(json_text) <= _MAX_SHOWN_CHARACTERS
+        else f"{json_text[:_MAX_SHOWN_CHARACTERS]}..."
+    )

@@ -79,7 +79,7 @@ class ServedSeries:
             "sessions": [replace(result, fit=None).as_dict() for result in self.results],
         }
 
-    def state_after(self, fault: str) -> tuple[DaemonState, str]:
+    def state_after(self, fault_reason: str) -> tuple[DaemonState, str]:
         """Return the state of the daemon after the end of this series, and the reason.
 
         Parameters
@@ -87,8 +87,8 @@ class ServedSeries:
         fault
             Sentence on the rig's fault, or empty if the rig is ready.
         """
-        if fault:
-            return DaemonState.FAULT, fault
+        if fault_reason:
+            return DaemonState.FAULT, fault_reason
         if self.stop.requested:
             return DaemonState.READY, f"{self.description} was stopped"
         if self.reason:
@@ -145,12 +145,12 @@ class SeriesReporter:
     def on_result(self, result: RunResult, *, look_follows: bool) -> None:
         series = self._series
         series.results.append(result)
-        fit = {}
+        fit_entry = {}
         if result.fit is not None:
             # The result's fit lacks temporary data, such as the text for the operator.
             series.fit = (series.fit or {}) | fit_document(result.fit)
-            fit = {"fit": series.fit}
-        line = result_line(result.as_dict())
+            fit_entry = {"fit": series.fit}
+        outcome_line = result_line(result.as_dict())
         _log.log(
             logging.INFO if result.went_well else logging.WARNING,
             "series %d: session %d of %d, %s: %s",
@@ -158,22 +158,22 @@ class SeriesReporter:
             series.session,
             series.request.repeat,
             result.path or result.part or "no file",
-            line,
+            outcome_line,
         )
         # This event has the text of the terminal, for clients that list events.
-        level = _OUTCOME_LEVELS.get(result.outcome, "error")
-        message = {"level": level, "text": line, "session": series.session}
-        self._publish({"event": "message", **message})
-        document = result.as_dict() | fit | {"look_follows": look_follows}
-        self._publish({"event": "session", "number": series.session, **document})
+        event_level = _OUTCOME_LEVELS.get(result.outcome, "error")
+        log_message = {"level": event_level, "text": outcome_line, "session": series.session}
+        self._publish({"event": "message", **log_message})
+        result_document = result.as_dict() | fit_entry | {"look_follows": look_follows}
+        self._publish({"event": "session", "number": series.session, **result_document})
 
     def _report(self, level: str, text: str, *, notable: bool = False) -> None:
         """Log a message on the series, and publish it as an event."""
         _log.log(_LOGGING_LEVELS[level], "series %d: %s", self._series.number, text)
-        message = {"level": level, "text": text, "notable": notable}
-        self._publish({"event": "message", **message})
+        log_message = {"level": level, "text": text, "notable": notable}
+        self._publish({"event": "message", **log_message})
 
     def _report_fit(self, fit: Mapping[str, Any]) -> None:
         """Store a fit of the present record, and publish it as an event."""
-        document = self._series.fit = fit_document(fit)
-        self._publish({"event": "fit", "session": self._series.session, **document})
+        published_fit = self._series.fit = fit_document(fit)
+        self._publish({"event": "fit", "session": self._series.session, **published_fit})

@@ -92,19 +92,19 @@ class Server:
 
     def publish(self, event: Document) -> None:
         """Send an event to all clients that have subscribed to it."""
-        is_subscribed = [client for client in self._clients if client.is_subscribed_to(event)]
-        data = _json_line(event) if is_subscribed else b""
-        for client in is_subscribed:
-            client.write(data)
+        subscribers = [client for client in self._clients if client.is_subscribed_to(event)]
+        event_line = _json_line(event) if subscribers else b""
+        for client in subscribers:
+            client.write(event_line)
 
     async def close(self) -> None:
         """Stop accepting clients, send the pending output, and close all connections."""
         self._closed = True
         asyncio.get_running_loop().remove_reader(self._listener)
         self._listener.close()
-        for pending in list(self._pending_connections.values()):
-            self._forget_pending(pending)
-            pending.link.close()
+        for pending_connection in list(self._pending_connections.values()):
+            self._forget_pending(pending_connection)
+            pending_connection.link.close()
         for client in list(self._clients):
             self._disconnect_when_sent(client)
         while self._is_leaving:  # takes at most `_CLOSE_TIMEOUT_S`
@@ -137,7 +137,7 @@ class Server:
         """Accept waiting connections up to a number, and pause after that."""
         for _ in range(_ACCEPTS_PER_ROUND):
             try:
-                link, _ = self._listener.accept()
+                new_socket, _ = self._listener.accept()
             except BlockingIOError:
                 return
             except OSError as error:
@@ -145,54 +145,60 @@ class Server:
                     return
                 self._refuse_without_fd()
                 break
-            self._read_new_connection(link)
-        loop = asyncio.get_running_loop()
-        loop.remove_reader(self._listener)
-        loop.call_later(_ACCEPT_PAUSE_S, self._await_connections)
+            self._read_new_connection(new_socket)
+        event_loop = asyncio.get_running_loop()
+        event_loop.remove_reader(self._listener)
+        event_loop.call_later(_ACCEPT_PAUSE_S, self._await_connections)
 
-    def _read_new_connection(self, link: socket.socket) -> None:
+    def _read_new_connection(self, new_socket: socket.socket) -> None:
         """Read from a new connection at once, because most have sent their line already."""
         try:
-            pending = self._identified_connection(link)
+            pending_connection = self._identified_connection(new_socket)
         except OSError:
-            link.close()
+            new_socket.close()
         else:
-            self._receive(pending)
+            self._receive(pending_connection)
 
-    def _identified_connection(self, link: socket.socket) -> "_PendingConnection":
+    def _identified_connection(self, new_socket: socket.socket) -> "_PendingConnection":
         """Return an accepted connection with its number, process id and user id."""
-        link.setblocking(False)
-        pid, uid = peer_of(link)
+        new_socket.setblocking(False)
+        pid, uid = peer_of(new_socket)
         self._connection_count += 1
-        return _PendingConnection(link, Peer(self._connection_count, pid, uid))
+        return _PendingConnection(new_socket, Peer(self._connection_count, pid, uid))
 
-    def _receive(self, pending: "_PendingConnection") -> None:
+    def _receive(self, pending_connection: "_PendingConnection") -> None:
         """Read from a connection, and make it a client when its first line is complete."""
         try:
-            data = pending.link.recv(MAX_LINE_BYTES)
+            received_bytes = pending_connection.link.recv(MAX_LINE_BYTES)
         except BlockingIOError:
-            self._await_line(pending)
+            self._await_line(pending_connection)
             return
         except OSError:
-            data = b""
-        pending.received += data
-        if data and b"\n" not in pending.received and len(pending.received) < MAX_LINE_BYTES:
-            self._await_line(pending)
+            received_bytes = b""
+        pending_connection.received += received_bytes
+        if (
+            received_bytes
+            and b"\n" not in pending_connection.received
+            and len(pending_connection.received) < MAX_LINE_BYTES
+        ):
+            self._await_line(pending_connection)
             return
-        self._forget_pending(pending)
-        if data:
-            self._make_client(pending)
+        self._forget_pending(pending_connection)
+        if received_bytes:
+            self._make_client(pending_connection)
         else:
-            pending.link.close()
+            pending_connection.link.close()
 
-    def _await_line(self, pending: "_PendingConnection") -> None:
+    def _await_line(self, pending_connection: "_PendingConnection") -> None:
         """Wait for more data of a connection; if too many connections wait, close one of them."""
-        if pending.link in self._pending_connections:
+        if pending_connection.link in self._pending_connections:
             return
         if len(self._pending_connections) >= MAX_PENDING_CONNECTIONS:
             self._drop_oldest_pending()
-        self._pending_connections[pending.link] = pending
-        asyncio.get_running_loop().add_reader(pending.link, self._receive, pending)
+        self._pending_connections[pending_connection.link] = pending_connection
+        asyncio.get_running_loop().add_reader(
+            pending_connection.link, self._receive, pending_connection
+        )
 
     def _drop_oldest_pending(self) -> bool:
         """Close the oldest waiting connection of the process that has most of them.
@@ -205,68 +211,74 @@ class Server:
         (pid, _), *_ = Counter(
             pending.peer.pid for pending in self._pending_connections.values()
         ).most_common(1)
-        oldest = next(
+        oldest_pending = next(
             pending for pending in self._pending_connections.values() if pending.peer.pid == pid
         )
-        self._forget_pending(oldest)
-        _refuse_connection(oldest.link)
+        self._forget_pending(oldest_pending)
+        _refuse_connection(oldest_pending.link)
         return True
 
-    def _forget_pending(self, pending: "_PendingConnection") -> None:
+    def _forget_pending(self, pending_connection: "_PendingConnection") -> None:
         """Stop waiting for the data of a connection."""
-        if self._pending_connections.pop(pending.link, None) is not None:
-            asyncio.get_running_loop().remove_reader(pending.link)
+        if self._pending_connections.pop(pending_connection.link, None) is not None:
+            asyncio.get_running_loop().remove_reader(pending_connection.link)
 
     # Clients
 
-    def _make_client(self, pending: "_PendingConnection") -> None:
+    def _make_client(self, pending_connection: "_PendingConnection") -> None:
         """Make a connection that has sent its first line a client, if there is room for one."""
         assert self._service is not None
         if len(self._clients) >= MAX_CLIENTS and not self._disconnect_idle_client():
-            self._refuse_unless_stop(pending)
+            self._refuse_unless_stop(pending_connection)
             return
-        uid = pending.peer.uid
+        uid = pending_connection.peer.uid
         if uid not in self._resolved_uids:
             self._resolved_uids.add(uid)
             # This runs in a thread, because the user database may be on a network.
             threading.Thread(target=resolve_user, args=(uid,), daemon=True).start()
-        client = _ClientConnection(self, self._service, pending.peer, bytes(pending.received))
+        client = _ClientConnection(
+            self, self._service, pending_connection.peer, bytes(pending_connection.received)
+        )
         self._clients.add(client)
-        client.connecting = asyncio.create_task(_connect(pending.link, client))
+        client.connecting = asyncio.create_task(_connect(pending_connection.link, client))
 
     def _disconnect_idle_client(self) -> bool:
         """Disconnect an idle client of the process that has most idle clients.
 
         Returns False if no client is idle.
         """
-        idle = [client for client in self._clients if client.is_idle]
-        if not idle:
+        idle_clients = [client for client in self._clients if client.is_idle]
+        if not idle_clients:
             return False
-        count = Counter(client.pid for client in idle)
-        longest = min(idle, key=lambda client: (-count[client.pid], client.last_received_s))
-        longest.write(_TOO_MANY_CLIENTS_LINE)
-        self._disconnect_when_sent(longest)
+        idle_count_by_pid = Counter(client.pid for client in idle_clients)
+        longest_idle = min(
+            idle_clients,
+            key=lambda client: (-idle_count_by_pid[client.pid], client.last_received_s),
+        )
+        longest_idle.write(_TOO_MANY_CLIENTS_LINE)
+        self._disconnect_when_sent(longest_idle)
         return True
 
-    def _refuse_unless_stop(self, pending: "_PendingConnection") -> None:
+    def _refuse_unless_stop(self, pending_connection: "_PendingConnection") -> None:
         """Refuse a connection for which there is no room, unless it requests a `stop`."""
-        line = bytes(pending.received).partition(b"\n")[0]
+        request_line = bytes(pending_connection.received).partition(b"\n")[0]
         with suppress(RequestError):
-            request = parse_request(line)
+            request = parse_request(request_line)
             if isinstance(request, StopSessionRequest):
-                task = asyncio.create_task(self._stop_and_close(request, pending))
-                self._stop_tasks.add(task)
-                task.add_done_callback(self._stop_tasks.discard)
+                stop_task = asyncio.create_task(self._stop_and_close(request, pending_connection))
+                self._stop_tasks.add(stop_task)
+                stop_task.add_done_callback(self._stop_tasks.discard)
                 return
-        _refuse_connection(pending.link)
+        _refuse_connection(pending_connection.link)
 
     async def _stop_and_close(
-        self, request: StopSessionRequest, pending: "_PendingConnection"
+        self, request: StopSessionRequest, pending_connection: "_PendingConnection"
     ) -> None:
         """Execute the `stop` of a connection, send the reply, and close the connection."""
         assert self._service is not None
         _send_last_line(
-            pending.link, _json_line(await _reply(self._service, request, pending.peer))
+            pending_connection.link,
+            _json_line(await _reply(self._service, request, pending_connection.peer)),
         )
 
     def _refuse_without_fd(self) -> None:
@@ -277,11 +289,11 @@ class Server:
             self._reserve_spare_fd()
         self._release_spare_fd()
         with suppress(OSError):
-            link, _ = self._listener.accept()
-            pending = self._identified_connection(link)
+            new_socket, _ = self._listener.accept()
+            pending_connection = self._identified_connection(new_socket)
             with suppress(BlockingIOError):
-                pending.received += link.recv(MAX_LINE_BYTES)
-            self._refuse_unless_stop(pending)
+                pending_connection.received += new_socket.recv(MAX_LINE_BYTES)
+            self._refuse_unless_stop(pending_connection)
         self._reserve_spare_fd()
 
     def _reserve_spare_fd(self) -> None:
@@ -291,9 +303,9 @@ class Server:
 
     def _release_spare_fd(self) -> None:
         """Release the reserved file descriptor."""
-        spare, self._spare_fd = self._spare_fd, None
-        if spare is not None:
-            os.close(spare)
+        spare_fd, self._spare_fd = self._spare_fd, None
+        if spare_fd is not None:
+            os.close(spare_fd)
 
 
 @dataclass(slots=True)
@@ -356,16 +368,18 @@ class _ClientConnection(asyncio.Protocol):
         if self._is_leaving:  # the client was dismissed before its connection was made
             self.disconnect()
             return
-        received, self._received = self._received, b""
-        self.data_received(received)
+        received_bytes, self._received = self._received, b""
+        self.data_received(received_bytes)
 
     def data_received(self, data: bytes) -> None:
         """Split received bytes, which may end within a line, into lines to be processed."""
         self._pending += data
-        *lines, rest = self._pending.split(b"\n")
-        self._pending = rest
-        self._waiting_lines.extend(bytes(line) for line in lines)
-        if len(rest) >= MAX_LINE_BYTES or any(len(line) >= MAX_LINE_BYTES for line in lines):
+        *complete_lines, incomplete_line = self._pending.split(b"\n")
+        self._pending = incomplete_line
+        self._waiting_lines.extend(bytes(complete_line) for complete_line in complete_lines)
+        if len(incomplete_line) >= MAX_LINE_BYTES or any(
+            len(complete_line) >= MAX_LINE_BYTES for complete_line in complete_lines
+        ):
             self.write(
                 _json_line(_refusal_document(None, f"A line has at most {MAX_LINE_BYTES} bytes."))
             )
@@ -417,9 +431,9 @@ class _ClientConnection(asyncio.Protocol):
         if not self._waiting_lines:
             self._close_if_done()
             return
-        line = self._waiting_lines.popleft()
+        request_line = self._waiting_lines.popleft()
         self.last_received_s = time.monotonic()
-        self._process_line(line)
+        self._process_line(request_line)
         if self._transport is None or self._transport.is_closing():
             return
         self._next_line_timer = asyncio.get_running_loop().call_later(
@@ -428,28 +442,32 @@ class _ClientConnection(asyncio.Protocol):
         if not self._waiting_lines:
             self._transport.resume_reading()
 
-    def _process_line(self, line: bytes) -> None:
+    def _process_line(self, request_line: bytes) -> None:
         """Parse a line, and start to execute the request; refuse an invalid line."""
         try:
-            request = parse_request(line)
+            request = parse_request(request_line)
         except RequestError as error:
             self.write(_json_line(_refusal_document(error.request_id, str(error))))
             return
         if request.command == "watch" and not self.is_subscribed:
             if not self._server.can_subscribe():
-                text = f"{MAX_SUBSCRIBERS} clients are watching already; use status instead."
+                refusal_text = (
+                    f"{MAX_SUBSCRIBERS} clients are watching already; use status instead."
+                )
                 self.write(
                     _json_line(
-                        _refusal_document(request.id, text, command="watch", wrong_use=False)
+                        _refusal_document(
+                            request.id, refusal_text, command="watch", wrong_use=False
+                        )
                     )
                 )
                 return
             self.is_subscribed = True
         if isinstance(request, WatchRequest):
             self._is_subscribed_to_signals |= request.signals
-        task = asyncio.create_task(self._execute_and_reply(request))
-        self._tasks.add(task)
-        task.add_done_callback(self._remove_task)
+        reply_task = asyncio.create_task(self._execute_and_reply(request))
+        self._tasks.add(reply_task)
+        reply_task.add_done_callback(self._remove_task)
 
     async def _execute_and_reply(self, request: AnyRequest) -> None:
         """Execute a request, and send the reply."""
@@ -469,25 +487,25 @@ class _ClientConnection(asyncio.Protocol):
 async def _reply(service: Service, request: AnyRequest, peer: Peer) -> Document:
     """Execute a request, and return the reply, or a refusal if that raises an error."""
     try:
-        reply = await service.execute(request, peer)
+        reply_document = await service.execute(request, peer)
     except CommandError as error:
         return _refusal_document(
             request.id, str(error), command=request.command, wrong_use=error.wrong_use
         )
     except Exception as error:
         _log.exception("unexpected error in a request")
-        text = f"Unexpected error in the daemon ({error!r}); its log says more."
-        return _refusal_document(request.id, text, command=request.command, wrong_use=False)
-    reply = {"reply": request.command, "ok": True, **reply}
-    return reply if request.id is None else reply | {"id": request.id}
+        error_text = f"Unexpected error in the daemon ({error!r}); its log says more."
+        return _refusal_document(request.id, error_text, command=request.command, wrong_use=False)
+    reply_document = {"reply": request.command, "ok": True, **reply_document}
+    return reply_document if request.id is None else reply_document | {"id": request.id}
 
 
-async def _connect(link: socket.socket, client: _ClientConnection) -> None:
+async def _connect(client_socket: socket.socket, client: _ClientConnection) -> None:
     """Pass an accepted socket to the event loop as the connection of a client."""
     try:
-        await asyncio.get_running_loop().connect_accepted_socket(lambda: client, link)
+        await asyncio.get_running_loop().connect_accepted_socket(lambda: client, client_socket)
     except OSError:
-        link.close()
+        client_socket.close()
         client.connection_lost(None)
 
 
@@ -500,11 +518,11 @@ def _json_line(document: Document) -> bytes:
 
 
 def _refusal_document(
-    request_id: Id | None, text: str, *, command: str | None = None, wrong_use: bool = True
+    request_id: Id | None, refusal_text: str, *, command: str | None = None, wrong_use: bool = True
 ) -> Document:
     """Return the reply that refuses a request, with the reason."""
-    reply = {"reply": command, "ok": False, "error": text, "wrong_use": wrong_use}
-    return reply if request_id is None else reply | {"id": request_id}
+    refusal_reply = {"reply": command, "ok": False, "error": refusal_text, "wrong_use": wrong_use}
+    return refusal_reply if request_id is None else refusal_reply | {"id": request_id}
 
 
 _TOO_MANY_CLIENTS_LINE = _json_line(
@@ -513,12 +531,12 @@ _TOO_MANY_CLIENTS_LINE = _json_line(
 )
 
 
-def _send_last_line(link: socket.socket, line: bytes) -> None:
-    """Send a last line without waiting, and close the connection."""
-    with link, suppress(OSError):
-        link.send(line)
+def _send_last_line(client_socket: socket.socket, last_line: bytes) -> None:
+    """Send a last reply to a client without waiting, and close the connection."""
+    with client_socket, suppress(OSError):
+        client_socket.send(last_line)
 
 
-def _refuse_connection(link: socket.socket) -> None:
+def _refuse_connection(client_socket: socket.socket) -> None:
     """Refuse and close a connection because there are too many clients."""
-    _send_last_line(link, _TOO_MANY_CLIENTS_LINE)
+    _send_last_line(client_socket, _TOO_MANY_CLIENTS_LINE)

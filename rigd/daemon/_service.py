@@ -111,7 +111,9 @@ class Service:
         self._publish = publish
         self._find_target = find_target
         self._announced_target = find_target()
-        self._failed_checks = [asdict(each) for each in check_on_paper(profile).failed]
+        self._failed_checks = [
+            asdict(failed_check) for failed_check in check_on_paper(profile).failed
+        ]
         self._fast = fast
         self._live = live
         self._state_machine = DaemonStateMachine(self._report_transition)
@@ -180,16 +182,18 @@ class Service:
         """Publish the signals since the last call, if a client has subscribed to them."""
         if not self._signal_watchers:
             return
-        series = self._series
-        planned_series = series.planned if series is not None and series.running else None
-        for block in self._rig.signals():
+        served_series = self._series
+        planned_series = (
+            served_series.planned if served_series is not None and served_series.running else None
+        )
+        for signal_block in self._rig.signals():
             self._publish(
                 signals_document(
-                    block,
+                    signal_block,
                     self._profile.rig.rate_hz,
                     None
                     if planned_series is None
-                    else planned_series.frequency_hz(block.last_tick),
+                    else planned_series.frequency_hz(signal_block.last_tick),
                 )
             )
 
@@ -259,8 +263,8 @@ class Service:
 
     def status(self) -> Document:
         """Return the status of daemon, rig and session as a dictionary for JSON."""
-        series = self._series
-        status = self._rig_status if self._rig.connected else None
+        served_series = self._series
+        rig_status = self._rig_status if self._rig.connected else None
         return {
             "daemon": daemon_document(
                 self._profile.name,
@@ -282,9 +286,9 @@ class Service:
             "doing": self._current_command,
             "zero_lost": self._rig.zero_lost,
             "controller": peer_document(self.controller),
-            "series": None if series is None else series.as_document(),
+            "series": None if served_series is None else served_series.as_document(),
             "progress": self._progress_document(),
-            "rig": None if status is None else rig_document(status, self._message_rates()),
+            "rig": None if rig_status is None else rig_document(rig_status, self._message_rates()),
             "last_check": self._last_check,
             "history": transition_documents(self._state_machine.history),
         }
@@ -303,16 +307,16 @@ class Service:
 
     def poll_status(self) -> None:
         """Read the rig's status, and publish the progress of a running session."""
-        self._rig_status = status = self._rig.status()
-        if status is None:
+        self._rig_status = rig_status = self._rig.status()
+        if rig_status is None:
             self._timed_message_counts.clear()
             return
         self._timed_message_counts.append(
-            (time.monotonic(), {t.name: t.written for t in status.topics})
+            (time.monotonic(), {t.name: t.written for t in rig_status.topics})
         )
-        progress = self._progress_document()
-        if progress is not None:
-            self._publish({"event": "progress", **progress})
+        progress_event = self._progress_document()
+        if progress_event is not None:
+            self._publish({"event": "progress", **progress_event})
 
     async def check_connection(self) -> None:
         """Check between sessions that the rig is still connected; otherwise enter a fault."""
@@ -356,7 +360,7 @@ class Service:
             raise CommandError("It was stopped before it began.")
 
     def _require_command_allowed(self, command: str) -> None:
-        """Raise if a command is not allowed in the present state, or if the rig is busy."""
+        """Raise CommandError if the state forbids a command, or if the rig is busy."""
         if self._is_closing:
             raise CommandError(_SHUTTING_DOWN)
         refusal = self._state_machine.refusal(command)
@@ -400,13 +404,13 @@ class Service:
         self._require_not_busy()
         self._current_command = "check"
         try:
-            reply = await background.perform(
+            check_reply = await background.perform(
                 background.CheckJob(self._profile, self._rig.calibration)
             )
         finally:
             self._current_command = ""
-        self._last_check = {"utc_ns": time.time_ns(), "verdict": reply["verdict"]}
-        return reply
+        self._last_check = {"utc_ns": time.time_ns(), "verdict": check_reply["verdict"]}
+        return check_reply
 
     async def _start(self, request: protocol.StartRequest) -> Document:
         """Plan a series of sessions, and start to run it; the reply contains the plan."""
@@ -418,14 +422,14 @@ class Service:
             )
         self._series_count += 1
         previous_series = self._series
-        series = self._series = ServedSeries(self._series_count, request, running=True)
+        served_series = self._series = ServedSeries(self._series_count, request, running=True)
         self._current_command = "planning"
         try:
             job = background.PlanJob(self._profile, request, self._folder, self._start_rad())
-            planned = await (
+            planned_series = await (
                 background.perform(job) if job.is_heavy else self._call_in_worker(job.perform)
             )
-            if series.stop.requested or self._is_closing:
+            if served_series.stop.requested or self._is_closing:
                 raise CommandError("It was stopped before it began.")
             refusal = self._state_machine.refusal("start")
             if refusal:
@@ -435,20 +439,20 @@ class Service:
             raise
         finally:
             self._current_command = ""
-        for warning in planned.plan.warnings:
-            _log.warning("series %d: %s", series.number, warning)
-        series.planned = planned
+        for plan_warning in planned_series.plan.warnings:
+            _log.warning("series %d: %s", served_series.number, plan_warning)
+        served_series.planned = planned_series
         repeat_text = f", {request.repeat} sessions" if request.repeat > 1 else ""
         self._state_machine.change_to(
-            DaemonState.RUNNING, f"{series.description} was started{repeat_text}"
+            DaemonState.RUNNING, f"{served_series.description} was started{repeat_text}"
         )
-        self._task = asyncio.create_task(self._run_series_to_end(series, planned))
-        return {"series": series.number, "plan": planned.plan_document()}
+        self._task = asyncio.create_task(self._run_series_to_end(served_series, planned_series))
+        return {"series": served_series.number, "plan": planned_series.plan_document()}
 
-    async def _measure(self, name: str, measure: Callable[[], Document]) -> Document:
-        """Execute a tare or zero in the worker thread, and return its result."""
-        self._require_command_allowed(name)
-        self._current_command = name
+    async def _measure(self, command_name: str, measure: Callable[[], Document]) -> Document:
+        """Tare the sensor or set the motor's zero in the worker thread, and return the result."""
+        self._require_command_allowed(command_name)
+        self._current_command = command_name
         try:
             return await self._call_in_worker(measure)
         except RigError as error:
@@ -473,91 +477,95 @@ class Service:
                     return {"zero_lost": self._rig.zero_lost}
             if self._is_closing:
                 raise CommandError(_SHUTTING_DOWN)
-            fault = self._fault_reason
+            fault_reason = self._fault_reason
             self._state_machine.change_to(DaemonState.IDLE, "reset by the operator")
-            await self._connect(reset_fault=True, fault=fault)
+            await self._connect(reset_fault=True, earlier_fault=fault_reason)
         finally:
             self._current_command = ""
         return {"zero_lost": self._rig.zero_lost}
 
-    async def _connect(self, *, reset_fault: bool, fault: str = "") -> None:
+    async def _connect(self, *, reset_fault: bool, earlier_fault: str = "") -> None:
         """Connect the rig, and enter the state ready, or a fault if that fails.
 
-        `fault` is the reason of the fault that is being reset, if there is one.
+        `earlier_fault` is the reason of the fault that is being reset, if there is one.
         """
         try:
-            target = self._find_target()
-            if target is not self._announced_target:
+            actuation_target = self._find_target()
+            if actuation_target is not self._announced_target:
                 raise RigError(
-                    f"{target.value.capitalize()} would move now, where it was "
+                    f"{actuation_target.value.capitalize()} would move now, where it was "
                     f"{self._announced_target.value} when the daemon was started; restart the "
                     "daemon if that is intended."
                 )
-            await self._call_in_worker(partial(self._rig.connect, target, reset_fault=reset_fault))
+            await self._call_in_worker(
+                partial(self._rig.connect, actuation_target, reset_fault=reset_fault)
+            )
         except RigError as error:
-            self._enter_fault(str(error), fault)
+            self._enter_fault(str(error), earlier_fault)
             raise CommandError(str(error)) from None
         except Exception as error:
             _log.exception("unexpected error while the rig was being connected")
             await self._disconnect_safely()
-            reason = f"The rig could not be connected: unexpected error ({error!r})."
-            self._enter_fault(reason, fault)
-            raise CommandError(reason) from None
+            failure_reason = f"The rig could not be connected: unexpected error ({error!r})."
+            self._enter_fault(failure_reason, earlier_fault)
+            raise CommandError(failure_reason) from None
         if self._is_closing:
             await self._call_in_worker(self._rig.disconnect)
             raise CommandError(_SHUTTING_DOWN)
-        self._state_machine.change_to(DaemonState.READY, f"{target.value} is connected")
+        self._state_machine.change_to(DaemonState.READY, f"{actuation_target.value} is connected")
 
-    def _enter_fault(self, reason: str, fault: str) -> None:
+    def _enter_fault(self, reason: str, earlier_fault: str) -> None:
         """Enter the state of fault for a reason.
 
-        `fault` is the reason of an earlier fault that could not be reset, or empty.
+        `earlier_fault` is the reason of an earlier fault that could not be reset, or empty.
         """
-        is_same_fault = not fault or fault == reason
+        is_same_fault = not earlier_fault or earlier_fault == reason
         self._state_machine.change_to(
-            DaemonState.FAULT, reason if is_same_fault else f"{reason} Not reset: {fault}"
+            DaemonState.FAULT, reason if is_same_fault else f"{reason} Not reset: {earlier_fault}"
         )
-        self._fault_reason = fault or reason
+        self._fault_reason = earlier_fault or reason
 
     # Series
 
     def _start_rad(self) -> float:
         """Return the motor angle relative to the rig's zero, or 0 if unknown."""
-        status = self._rig.status()
-        return 0.0 if status is None else status.angle_rad
+        rig_status = self._rig.status()
+        return 0.0 if rig_status is None else rig_status.angle_rad
 
-    async def _run_series_to_end(self, series: ServedSeries, planned: Series) -> None:
+    async def _run_series_to_end(self, series: ServedSeries, planned_series: Series) -> None:
         """Run a series to its end in the worker thread, and enter the state that follows."""
-        fault = ""
-        loop = asyncio.get_running_loop()
+        fault_reason = ""
+        event_loop = asyncio.get_running_loop()
         try:
-            await self._call_in_worker(partial(self._run_series, series, planned, loop))
+            await self._call_in_worker(
+                partial(self._run_series, series, planned_series, event_loop)
+            )
         except (UserError, RigError, ProbeFailedError, SessionFailedError) as error:
             series.reason = str(error)
             if not error.wrong_use:
-                path = error.path if isinstance(error, SessionFailedError) else None
-                fault = series.reason = f"{error} {remaining_file_text(path)}"
+                session_path = error.path if isinstance(error, SessionFailedError) else None
+                fault_reason = series.reason = f"{error} {remaining_file_text(session_path)}"
         except Exception as error:
             # After an unexpected error the rig is disconnected, because nothing else may switch it
             # off.
             _log.exception("unexpected error in a session")
-            fault = series.reason = f"The session failed: unexpected error ({error!r})."
+            fault_reason = series.reason = f"The session failed: unexpected error ({error!r})."
             await self._disconnect_safely()
         else:
             last_result = series.results[-1] if series.results else None
             if last_result is not None and not last_result.went_well:
                 series.reason = last_result.reason
                 if last_result.fault:
-                    fault = last_result.reason
+                    fault_reason = last_result.reason
         if not self._rig.connected:
-            fault = fault or series.reason or "The connection to the devices is lost."
+            fault_reason = fault_reason or series.reason or "The connection to the devices is lost."
         try:
             self._publish_signals()  # the last signals are sent before the report of the end
         except Exception:
             _log.exception("the last signals could not be sent")
         series.running = False
-        series.failed = bool(fault or (series.reason and not series.stop.requested))
-        self._state_machine.change_to(*series.state_after(fault))
+        series.failed = bool(fault_reason or (series.reason and not series.stop.requested))
+        self._state_machine.change_to(*series.state_after(fault_reason))
         self._publish({"event": "series", **series.as_document()})
 
     async def _disconnect_safely(self) -> None:
@@ -568,25 +576,25 @@ class Service:
             _log.exception("the rig could not be disconnected")
 
     def _run_series(
-        self, series: ServedSeries, planned: Series, loop: asyncio.AbstractEventLoop
+        self, series: ServedSeries, planned_series: Series, event_loop: asyncio.AbstractEventLoop
     ) -> None:
         """Run the sessions of a series one after another; called in the worker thread."""
 
         def publish(event: Document) -> None:
-            loop.call_soon_threadsafe(self._publish, event)
+            event_loop.call_soon_threadsafe(self._publish, event)
 
-        reporter = SeriesReporter(series, publish, self._can_receive_stop)
+        series_reporter = SeriesReporter(series, publish, self._can_receive_stop)
         try:
-            planned.run(
+            planned_series.run(
                 self._rig,
                 series.stop,
-                reporter,
+                series_reporter,
                 live=self._live,
                 can_receive_stop=self._can_receive_stop,
                 quick_looks=self._quick_looks,
             )
         except SessionFailedError as error:
-            reporter.on_result(error.result(), look_follows=False)
+            series_reporter.on_result(error.result(), look_follows=False)
             raise
 
     def _can_receive_stop(self) -> bool:
@@ -600,12 +608,12 @@ class Service:
 
     def _progress_document(self) -> Document | None:
         """Return the progress of the running session for JSON, or None if none is running."""
-        series, status = self._series, self._rig_status
-        if series is None or not series.running or series.planned is None or status is None:
+        series, rig_status = self._series, self._rig_status
+        if series is None or not series.running or series.planned is None or rig_status is None:
             return None
         rate_hz = None if self._fast else self._profile.rig.rate_hz
-        document = progress_document(status, series.planned.ticks, rate_hz)
-        return {"session": series.session, "repeat": series.request.repeat, **document}
+        progress_event = progress_document(rig_status, series.planned.ticks, rate_hz)
+        return {"session": series.session, "repeat": series.request.repeat, **progress_event}
 
     def _message_rates(self) -> dict[str, float | None]:
         """Return the measured message rate of each topic, in messages per second."""
@@ -616,17 +624,22 @@ class Service:
             self._timed_message_counts[-1],
         )
         return {
-            name: max(0, written - earlier_counts.get(name, 0)) / (latest_s - earlier_s)
-            for name, written in latest_counts.items()
+            topic_name: max(0, message_count - earlier_counts.get(topic_name, 0))
+            / (latest_s - earlier_s)
+            for topic_name, message_count in latest_counts.items()
         }
 
     def _report_transition(self, transition: Transition) -> None:
         """Log and publish a change of the daemon's state."""
         if transition.after is DaemonState.FAULT:
             self._fault_reason = transition.reason
-        level = logging.ERROR if transition.after is DaemonState.FAULT else logging.INFO
+        logging_level = logging.ERROR if transition.after is DaemonState.FAULT else logging.INFO
         _log.log(
-            level, "state: %s -> %s: %s", transition.before, transition.after, transition.reason
+            logging_level,
+            "state: %s -> %s: %s",
+            transition.before,
+            transition.after,
+            transition.reason,
         )
         self._publish({"event": "state", **transition_document(transition)})
 
@@ -634,8 +647,8 @@ class Service:
         """Log and publish a quick look; either thread may call this."""
         if self._series is not None:
             quick_look.note(self._series.results)
-        for line in quick_look.lines:
-            _log.info("%s", line)
+        for report_line in quick_look.lines:
+            _log.info("%s", report_line)
         if self._loop is not None:
             self._loop.call_soon_threadsafe(
                 self._publish, {"event": "quick_look", **quick_look.as_dict()}

@@ -184,7 +184,7 @@ class Peer:
 
 
 def peer_document(peer: Peer | None) -> Document | None:
-    """Return process and user of a client as a dictionary for JSON, or None without client."""
+    """Return process id and user of a client as a dictionary for JSON, or None without client."""
     return None if peer is None else {"pid": peer.pid, "uid": peer.uid, "user": peer.user}
 
 
@@ -250,27 +250,30 @@ def signals_document(block: SignalBlock, rate_hz: float, frequency_hz: float | N
         "rate_hz": rate_hz,
         "t_ns": block.t_ns,
         **{
-            name: base64.b64encode(values.astype("<f4").tobytes()).decode("ascii")
-            for name, values in block.signals.items()
+            signal_name: base64.b64encode(signal_values.astype("<f4").tobytes()).decode("ascii")
+            for signal_name, signal_values in block.signals.items()
         },
         "gauges": None
         if block.gauges is None
         else {
-            name: {
+            signal_name: {
                 "value": gauge.value,
                 "limit": gauge.limit,
                 "unit": gauge.unit,
                 "fraction": gauge.fraction,
             }
-            for name, gauge in block.gauges.items()
+            for signal_name, gauge in block.gauges.items()
         },
         "frequency_hz": frequency_hz,
     }
 
 
-def _finite_or_none(values: Mapping[str, float]) -> Document:
+def _finite_or_none(numbers_by_name: Mapping[str, float]) -> Document:
     """Return a copy of a mapping with None in place of numbers that are not finite, for JSON."""
-    return {name: value if isfinite(value) else None for name, value in values.items()}
+    return {
+        quantity_name: quantity_value if isfinite(quantity_value) else None
+        for quantity_name, quantity_value in numbers_by_name.items()
+    }
 
 
 def _view_document(view: LiveAddress | None) -> Document | None:
@@ -307,38 +310,40 @@ def fit_document(fit: Mapping[str, Any]) -> Document:
 
     `fit` has the format of `RunResult.fit`.
     """
-    return {name: _shortened_value(fit[name]) for name in _PUBLISHED_FIT_KEYS if name in fit}
+    return {
+        fit_key: _shortened_value(fit[fit_key]) for fit_key in _PUBLISHED_FIT_KEYS if fit_key in fit
+    }
 
 
-def _shortened_value(value: Any) -> Any:  # noqa: ANN401 - what JSON has
+def _shortened_value(json_value: Any) -> Any:  # noqa: ANN401 - what JSON has
     """Return a JSON value in which lists are cut to 16 items, and texts to 400 characters."""
-    if isinstance(value, str):
-        return value[:_MAX_TEXT_CHARACTERS]
-    if isinstance(value, Mapping):
+    if isinstance(json_value, str):
+        return json_value[:_MAX_TEXT_CHARACTERS]
+    if isinstance(json_value, Mapping):
         return {
-            key: _shortened_value(member)
-            for key, member in value.items()
+            key: _shortened_value(member_name)
+            for key, member_name in json_value.items()
             if key not in _OMITTED_KEYS
         }
-    if isinstance(value, list | tuple):
-        return [_shortened_value(item) for item in value[:_MAX_LIST_ITEMS]]
-    return value
+    if isinstance(json_value, list | tuple):
+        return [_shortened_value(list_item) for list_item in json_value[:_MAX_LIST_ITEMS]]
+    return json_value
 
 
-def progress_document(status: RigStatus, total: int, rate_hz: float | None) -> Document:
+def progress_document(status: RigStatus, record_ticks: int, rate_hz: float | None) -> Document:
     """Return the progress of a session as a dictionary for JSON.
 
-    `total` is the number of ticks of the record. `rate_hz` is the sample rate, or None under the
-    virtual clock, for which no remaining time is stated.
+    `record_ticks` is the number of ticks of the record. `rate_hz` is the sample rate, or None
+    under the virtual clock, for which no remaining time is stated.
     """
     # Before tick 0 the status may have the counts of the previous session.
-    remaining_ticks = max(0, total - status.tick)
+    remaining_ticks = max(0, record_ticks - status.tick)
     return {
         "phase": status.phase.name.lower(),
         "activity": status.activity.value,
         "tick": status.tick,
-        "total": total,
-        "percent": round(100.0 * status.tick / total, 1) if total else 100.0,
+        "total": record_ticks,
+        "percent": round(100.0 * status.tick / record_ticks, 1) if record_ticks else 100.0,
         "time_left_s": None if rate_hz is None else round(remaining_ticks / rate_hz, 1),
         "missed": status.missed,
         "late": status.late,

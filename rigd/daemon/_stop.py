@@ -82,7 +82,7 @@ class StopReport:
 
     @property
     def sure(self) -> bool:
-        """Whether it is certain that no session of this user is running any more."""
+        """Whether certainly no session of this user is running any more."""
         return not (self.running or self.doubts)
 
 
@@ -96,15 +96,15 @@ def stop_all(rig: str | None, *, wait: bool = True) -> StopReport:
     wait
         Whether to wait until the sessions have ended, for at most 10 s.
     """
-    return _StopOfAll(None if rig is None else file_name(rig), wait=wait).run()
+    return _StopOfAll(None if rig is None else file_name(rig), is_end_awaited=wait).run()
 
 
 class _StopOfAll:
     """Stop of all sessions of a user; `rig` is the rig's name in file names, or None for all."""
 
-    def __init__(self, rig: str | None, *, wait: bool) -> None:
+    def __init__(self, rig: str | None, *, is_end_awaited: bool) -> None:
         self._rig = rig
-        self._is_end_awaited = wait
+        self._is_end_awaited = is_end_awaited
         self._uid = os.getuid()
         self._report = StopReport()
         self._own_supervisors: dict[tuple[int, int], _SupervisorStop] = {}
@@ -117,9 +117,11 @@ class _StopOfAll:
         daemons = self._find_daemons()
         for daemon in daemons:
             daemon.begin()
-        unended = self._stop_supervisors(daemons)
+        unended_supervisors = self._stop_supervisors(daemons)
         ended_pids = {
-            each.process.pid for each in self._own_supervisors.values() if each not in unended
+            supervisor_stop.process.pid
+            for supervisor_stop in self._own_supervisors.values()
+            if supervisor_stop not in unended_supervisors
         }
         trusted_pids = set()
         for daemon in daemons:
@@ -128,12 +130,13 @@ class _StopOfAll:
                 trusted_pids.add(daemon.pid)
         for supervisor in self._own_supervisors.values():
             if supervisor.process.pid not in trusted_pids:
-                has_ended = supervisor not in unended
+                has_ended = supervisor not in unended_supervisors
                 supervisor.report_to(self._report, ended=has_ended, waited=self._is_end_awaited)
-        for other in self._supervisors_of_others:
-            if other.has_session and other.process.pid not in trusted_pids:
+        for other_supervisor in self._supervisors_of_others:
+            if other_supervisor.has_session and other_supervisor.process.pid not in trusted_pids:
                 self._report.others.append(
-                    f"{other.description} of user {_user_name(other.process.uid)}"
+                    f"{other_supervisor.description} of user "
+                    f"{_user_name(other_supervisor.process.uid)}"
                 )
         return self._report
 
@@ -150,17 +153,21 @@ class _StopOfAll:
         report.searched.append("the listening sockets (/proc/net/unix)")
         report.searched.append(f"{tempfile.gettempdir()}/rigd-{self._uid or ''}*")
         try:
-            paths = set(own_sockets())
+            socket_paths = set(own_sockets())
         except OSError as error:
             report.doubts.append(f"The list of sockets cannot be read ({error.strerror}).")
-            paths = set()
+            socket_paths = set()
         for folder in [*known_folders(self._uid or None), GROUP_FOLDER]:
             report.searched.append(str(folder))
-            fault = folder_fault(folder, shared=folder == GROUP_FOLDER)
-            if fault:
-                report.doubts.append(fault)
+            folder_fault_text = folder_fault(folder, shared=folder == GROUP_FOLDER)
+            if folder_fault_text:
+                report.doubts.append(folder_fault_text)
             try:
-                sockets = [path for path in folder.iterdir() if path.name.endswith(SOCKET_SUFFIX)]
+                group_sockets = [
+                    daemon_socket
+                    for daemon_socket in folder.iterdir()
+                    if daemon_socket.name.endswith(SOCKET_SUFFIX)
+                ]
             except (FileNotFoundError, NotADirectoryError):
                 continue
             except PermissionError as error:
@@ -170,16 +177,24 @@ class _StopOfAll:
             except OSError as error:
                 report.doubts.append(f"The folder {folder} cannot be read ({error.strerror}).")
                 continue
-            paths.update(sockets)
+            socket_paths.update(group_sockets)
         daemons = []
-        for path in sorted(paths):
-            rig = path.name.removesuffix(SOCKET_SUFFIX)
+        for daemon_socket in sorted(socket_paths):
+            rig = daemon_socket.name.removesuffix(SOCKET_SUFFIX)
             if self._rig in (None, rig):
                 with suppress(ConnectionRefusedError, FileNotFoundError):  # of a dead daemon
                     try:
-                        daemons.append(_DaemonStop(path, peer_at(path), wait=self._is_end_awaited))
+                        daemons.append(
+                            _DaemonStop(
+                                daemon_socket,
+                                peer_at(daemon_socket),
+                                is_end_awaited=self._is_end_awaited,
+                            )
+                        )
                     except PermissionError as error:
-                        report.doubts.append(f"{path} cannot be opened ({error.strerror}).")
+                        report.doubts.append(
+                            f"{daemon_socket} cannot be opened ({error.strerror})."
+                        )
         return daemons
 
     # Other processes, by the process table
@@ -192,7 +207,7 @@ class _StopOfAll:
         self._report.searched.insert(0, "the process table (/proc)")
         while True:
             try:
-                table = read_processes()
+                process_table = read_processes()
             except OSError as error:
                 self._report.doubts.append(
                     f"The process table cannot be read ({error.strerror}): sessions in the "
@@ -202,26 +217,26 @@ class _StopOfAll:
                     daemon.join(2.0 * _END_TIMEOUT_S)
                 return []
             sufficient_pids = {daemon.pid for daemon in daemons if self._is_reached(daemon)}
-            unended = []
-            for supervisor in self._update_supervisors(table):
+            unended_supervisors = []
+            for supervisor in self._update_supervisors(process_table):
                 if supervisor.process.pid in sufficient_pids:
                     continue
                 self._own_supervisors.setdefault(supervisor.key, supervisor)
                 supervisor.send_due_signals(self._elapsed_s)
                 if not supervisor.is_over:
-                    unended.append(supervisor)
+                    unended_supervisors.append(supervisor)
             awaited_daemons = [daemon for daemon in daemons if self._is_awaited(daemon)]
-            if not (awaited_daemons or (unended and self._is_end_awaited)):
-                return unended
+            if not (awaited_daemons or (unended_supervisors and self._is_end_awaited)):
+                return unended_supervisors
             if self._elapsed_s > _END_TIMEOUT_S and not awaited_daemons:
-                return unended
-            if unended or not awaited_daemons:
+                return unended_supervisors
+            if unended_supervisors or not awaited_daemons:
                 time.sleep(_POLL_S)
             else:  # reading the process table takes processor time that the daemon may need
                 awaited_daemons[0].join(_DAEMON_POLL_INTERVAL_S)
 
     def _is_reached(self, daemon: "_DaemonStop") -> bool:
-        """Return whether a daemon's report is trusted and still in time, so that it suffices."""
+        """Return whether a daemon's reply is trusted and in time, so that no signal is needed."""
         return daemon.doubt == "" and (daemon.is_done or self._elapsed_s < _STOP_CONTROL_DELAY_S)
 
     def _is_awaited(self, daemon: "_DaemonStop") -> bool:
@@ -229,28 +244,33 @@ class _StopOfAll:
         if daemon.is_done:
             return False
         supervisors = self._own_supervisors.values()
-        if any(each.suspended and each.process.pid == daemon.pid for each in supervisors):
+        if any(
+            supervisor.suspended and supervisor.process.pid == daemon.pid
+            for supervisor in supervisors
+        ):
             return False
         patience_s = _DOUBTED_REPLY_TIMEOUT_S if daemon.doubt else 2.0 * _END_TIMEOUT_S
         return self._elapsed_s < patience_s
 
-    def _update_supervisors(self, table: Sequence[RunningProcess]) -> "list[_SupervisorStop]":
+    def _update_supervisors(
+        self, process_table: Sequence[RunningProcess]
+    ) -> "list[_SupervisorStop]":
         """Return the supervisors of this user in a process table, with their present state.
 
         The supervisors of other users are stored separately.
         """
         self._supervisors_of_others.clear()
         own_supervisors = []
-        for process, controls in _find_supervisors(table):
+        for process, control_processes in _find_supervisors(process_table):
             if self._uid not in (0, process.uid):
-                self._supervisors_of_others.append(_SupervisorStop(process, controls))
+                self._supervisors_of_others.append(_SupervisorStop(process, control_processes))
                 continue
             supervisor = self._own_supervisors.get((process.pid, process.start_ticks or 0))
             if supervisor is None:
-                supervisor = _SupervisorStop(process, controls)
+                supervisor = _SupervisorStop(process, control_processes)
                 if self._rig is not None and not supervisor.may_run_rig(self._rig):
                     continue
-            supervisor.process, supervisor.controls = process, controls
+            supervisor.process, supervisor.controls = process, control_processes
             own_supervisors.append(supervisor)
         return own_supervisors
 
@@ -261,9 +281,9 @@ class _StopOfAll:
 class _DaemonStop:
     """Stop of a daemon through its socket, in a thread; `peer` is its process id and user id."""
 
-    def __init__(self, path: Path, peer: tuple[int, int] | None, *, wait: bool) -> None:
+    def __init__(self, path: Path, peer: tuple[int, int] | None, *, is_end_awaited: bool) -> None:
         self._path = path
-        self._is_end_awaited = wait
+        self._is_end_awaited = is_end_awaited
         self._reply: dict[str, Any] = {}
         self._status: dict[str, Any] | None = None
         self._error: RigdError | None = None
@@ -288,12 +308,12 @@ class _DaemonStop:
     def _stop(self) -> None:
         """Stop the daemon's session, and wait for its end if requested; run in the thread."""
         try:
-            reply = stop_session(self._path)
-            self.pid, uid = reply["peer"]
+            stop_reply = stop_session(self._path)
+            self.pid, uid = stop_reply["peer"]
             self.doubt = self._reason_to_doubt(self.pid, uid)
             if self._is_end_awaited:
-                self._status = await_end(self._path, _END_TIMEOUT_S, reply["peer"])
-            self._reply = reply
+                self._status = await_end(self._path, _END_TIMEOUT_S, stop_reply["peer"])
+            self._reply = stop_reply
         except RigdError as error:
             self._error = error
 
@@ -377,9 +397,9 @@ class _DaemonStop:
 class _SupervisorStop:
     """Process that runs sessions, with its control processes, or an orphaned control process."""
 
-    def __init__(self, process: RunningProcess, controls: list[RunningProcess]) -> None:
+    def __init__(self, process: RunningProcess, control_processes: list[RunningProcess]) -> None:
         self.process = process
-        self.controls = controls
+        self.controls = control_processes
         self._rigd_command = _rigd_arguments(process.command)
         self._start_time = process.start_ticks or 0
         self._rig = held_rig(process.pid) or self._rig_of_command_line
@@ -402,19 +422,19 @@ class _SupervisorStop:
         command_words = takewhile(
             lambda argument: not argument.startswith("-"), self._rigd_command[:2]
         )
-        name = " ".join(["rigd", *command_words]) if self._rigd_command else "a session"
+        command_name = " ".join(["rigd", *command_words]) if self._rigd_command else "a session"
         rig_name = self._rig or _option_value(self._rigd_command, "--profile")
         rig = "an unknown rig" if rig_name is None else f"the rig {rig_name}"
-        printable_text = "".join(c if c.isprintable() else "?" for c in f"{name} on {rig}")
+        printable_text = "".join(c if c.isprintable() else "?" for c in f"{command_name} on {rig}")
         return f"{printable_text} (process {self.process.pid})"
 
     @property
     def _rig_of_command_line(self) -> str | None:
         """Name of the rig from the command line, or None if it states the path of a profile."""
-        profile = _option_value(self._rigd_command, "--profile")
-        if profile is None:
+        profile_option = _option_value(self._rigd_command, "--profile")
+        if profile_option is None:
             return "sim" if self._is_foreground_command else None
-        return None if "/" in profile or profile.endswith(".toml") else profile
+        return None if "/" in profile_option or profile_option.endswith(".toml") else profile_option
 
     @property
     def _is_foreground_command(self) -> bool:
@@ -424,14 +444,16 @@ class _SupervisorStop:
     @property
     def has_session(self) -> bool:
         """Whether a session may be running or the torque be on."""
-        if any(control.name != IDLE_NAME for control in self.controls):
+        if any(control_process.name != IDLE_NAME for control_process in self.controls):
             return True
         return self._is_foreground_command and not self.process.ignores(STOP_SIGNAL)
 
     @property
     def _was_session_observed(self) -> bool:
         """Whether a session was observed, so that its file may still be open."""
-        self._was_session_seen |= any(control.name == SESSION_NAME for control in self.controls)
+        self._was_session_seen |= any(
+            control_process.name == SESSION_NAME for control_process in self.controls
+        )
         return self._was_session_seen
 
     @property
@@ -439,7 +461,7 @@ class _SupervisorStop:
         """Whether no session is running, and none can begin any more."""
         if self.process.suspended and self.process.has_pending(STOP_SIGNAL):
             self.suspended = True
-            return all(control.name == IDLE_NAME for control in self.controls)
+            return all(control_process.name == IDLE_NAME for control_process in self.controls)
         has_reacted = time.monotonic() - self._last_signal_s > _SIGNAL_REACTION_TIME_S
         has_obeyed = (
             self._is_signal_sent and has_reacted and not self.process.has_pending(STOP_SIGNAL)
@@ -456,9 +478,9 @@ class _SupervisorStop:
 
     def send_due_signals(self, elapsed_s: float) -> None:
         """Send the signals that are due, `elapsed_s` seconds after the stop began."""
-        for control in self.controls:
-            if control.suspended:  # a suspended control process leaves its last torque on
-                self._send_unless_ended(control, signal.SIGCONT)
+        for control_process in self.controls:
+            if control_process.suspended:  # a suspended control process leaves its last torque on
+                self._send_unless_ended(control_process, signal.SIGCONT)
         now_s = time.monotonic()
         if now_s - self._last_signal_s > _REPEAT_SIGNAL_INTERVAL_S and (
             self.has_session or not self._is_signal_sent
@@ -477,20 +499,20 @@ class _SupervisorStop:
         elif not self._is_foreground_command:
             self._stop_control()
         elif not process.ignores(STOP_SIGNAL):  # the process is starting, or an older version
-            number = signal.SIGINT if process.handles(signal.SIGINT) else signal.SIGTERM
-            self._is_signal_sent = send_signal(process, self._start_time, number)
+            child_signal = signal.SIGINT if process.handles(signal.SIGINT) else signal.SIGTERM
+            self._is_signal_sent = send_signal(process, self._start_time, child_signal)
 
     def _stop_control(self) -> None:
         """Send SIGTERM to the control processes that are not idle."""
-        for control in self.controls:
-            if control.name != IDLE_NAME:
-                self._send_unless_ended(control, signal.SIGTERM)
+        for control_process in self.controls:
+            if control_process.name != IDLE_NAME:
+                self._send_unless_ended(control_process, signal.SIGTERM)
 
-    def _send_unless_ended(self, process: RunningProcess, number: int) -> None:
+    def _send_unless_ended(self, process: RunningProcess, signal_number: int) -> None:
         """Send a signal to a process, unless it has ended."""
         start_ticks = process.start_ticks
         if start_ticks is not None:
-            send_signal(process, start_ticks, number)
+            send_signal(process, start_ticks, signal_number)
 
     def report_to(self, report: StopReport, *, ended: bool, waited: bool) -> None:
         """Add the result for this process to a report."""
@@ -510,61 +532,71 @@ class _SupervisorStop:
 
 
 def _find_supervisors(
-    table: Sequence[RunningProcess],
+    process_table: Sequence[RunningProcess],
 ) -> list[tuple[RunningProcess, list[RunningProcess]]]:
     """Return the processes of a table that run sessions, each with its control processes."""
-    process_by_pid = {process.pid: process for process in table}
+    process_by_pid = {process.pid: process for process in process_table}
     controls_by_supervisor: dict[int, list[RunningProcess]] = {}
-    for process in table:
+    for process in process_table:
         supervisor_pid = supervisor_of_control(process.command)
         if supervisor_pid is None or process.uid < 0:
             continue
-        owner = process_by_pid.get(supervisor_pid)
+        supervisor_process = process_by_pid.get(supervisor_pid)
         # Any process can have this command line, so only the parent, of the same user, is trusted.
-        is_orphaned = owner is None or (owner.uid, supervisor_pid) != (process.uid, process.parent)
+        is_orphaned = supervisor_process is None or (supervisor_process.uid, supervisor_pid) != (
+            process.uid,
+            process.parent,
+        )
         controls_by_supervisor.setdefault(
             process.pid if is_orphaned else supervisor_pid, []
         ).append(process)
-    for process in table:
+    for process in process_table:
         arguments = _rigd_arguments(process.command)
-        if process.uid < 0 or arguments[:1] not in [(name,) for name in _SESSION_COMMANDS]:
+        if process.uid < 0 or arguments[:1] not in [
+            (process_name,) for process_name in _SESSION_COMMANDS
+        ]:
             continue
-        parent = process_by_pid.get(process.parent)
-        is_forked = parent is not None and parent.command == process.command
+        parent_process = process_by_pid.get(process.parent)
+        is_forked = parent_process is not None and parent_process.command == process.command
         only_estimates = "--from" in arguments and not process.handles(STOP_SIGNAL)
         if not (is_forked or only_estimates or process.ignores(STOP_SIGNAL)):
             controls_by_supervisor.setdefault(process.pid, [])
     return [
-        (process_by_pid[pid], controls) for pid, controls in sorted(controls_by_supervisor.items())
+        (process_by_pid[pid], control_processes)
+        for pid, control_processes in sorted(controls_by_supervisor.items())
     ]
 
 
-def _rigd_arguments(command: Sequence[str]) -> tuple[str, ...]:
+def _rigd_arguments(command_line: Sequence[str]) -> tuple[str, ...]:
     """Return the arguments after ``rigd`` in a command line of Python, or () without ``rigd``."""
-    if not command or not Path(command[0]).name.startswith("python"):
+    if not command_line or not Path(command_line[0]).name.startswith("python"):
         return ()
-    for index, argument in enumerate(command[1:], start=1):
+    for argument_index, argument in enumerate(command_line[1:], start=1):
         if Path(argument).name == "rigd":
-            return tuple(command[index + 1 :])
+            return tuple(command_line[argument_index + 1 :])
         if not argument.startswith("-"):
             break
     return ()
 
 
-def _option_value(arguments: Sequence[str], name: str) -> str | None:
+def _option_value(arguments: Sequence[str], wanted_option: str) -> str | None:
     """Return the value of an option in a command line, or None if the option is absent."""
-    for index, argument in enumerate(arguments):
-        option, equals, value = argument.partition("=")
-        if option == name:
-            return value if equals else "".join(arguments[index + 1 : index + 2])
+    for argument_index, argument in enumerate(arguments):
+        option_name, equals_sign, option_value = argument.partition("=")
+        if option_name == wanted_option:
+            return (
+                option_value
+                if equals_sign
+                else "".join(arguments[argument_index + 1 : argument_index + 2])
+            )
     return None
 
 
 def _may_folder_belong_to(folder: Path, uid: int) -> bool:
     """Return whether an unreadable folder, or its nearest readable parent, belongs to a user."""
-    for path in (folder, *folder.parents):
+    for existing_path in (folder, *folder.parents):
         with suppress(OSError):
-            return path.stat().st_uid == uid
+            return existing_path.stat().st_uid == uid
     return True
 
 

@@ -75,12 +75,12 @@ def bind(path: Path, group: str | None) -> socket.socket:
         or a running daemon uses it.
     """
     group_id = None if group is None else _group_number(group)
-    fault = folder_fault(path.parent, shared=group is not None)
-    if fault:
-        raise AddressError(fault)
+    folder_fault_text = folder_fault(path.parent, shared=group is not None)
+    if folder_fault_text:
+        raise AddressError(folder_fault_text)
     if answers(path):
         raise AddressError(f"Another daemon answers on {path}; see rigd status.")
-    listener = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+    bound_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
     try:
         if group_id is None:
             path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
@@ -89,16 +89,16 @@ def bind(path: Path, group: str | None) -> socket.socket:
         path.unlink(missing_ok=True)
         previous_umask = os.umask(0o177)
         try:
-            listener.bind(os.fspath(path))
+            bound_socket.bind(os.fspath(path))
         finally:
             os.umask(previous_umask)
         if group_id is not None:
             os.chown(path, -1, group_id, follow_symlinks=False)
             path.chmod(0o660)
     except OSError as error:
-        listener.close()
+        bound_socket.close()
         raise AddressError(_creation_error_text(path, group, error)) from None
-    return listener
+    return bound_socket
 
 
 def running() -> list[Path]:
@@ -147,16 +147,20 @@ def _not_found_reason(rig: str | None) -> str:
 
     `rig` is the rig's name as in file names, or None for any rig.
     """
-    fault = folder_fault(GROUP_FOLDER, shared=True)
-    sockets_in_unsafe_folder = address_files(f"*{SOCKET_SUFFIX}", GROUP_FOLDER) if fault else []
+    folder_fault_text = folder_fault(GROUP_FOLDER, shared=True)
+    sockets_in_unsafe_folder = (
+        address_files(f"*{SOCKET_SUFFIX}", GROUP_FOLDER) if folder_fault_text else []
+    )
     sockets_elsewhere = []
     with suppress(OSError):
         sockets_elsewhere = [
-            path for path in own_sockets() if rig in (None, path.name.removesuffix(SOCKET_SUFFIX))
+            socket_file
+            for socket_file in own_sockets()
+            if rig in (None, socket_file.name.removesuffix(SOCKET_SUFFIX))
         ]
     folders = " or ".join(map(str, _searched_folders()))
     if sockets_in_unsafe_folder:
-        return f"answers in {folders}. {fault} Without one there, start it with "
+        return f"answers in {folders}. {folder_fault_text} Without one there, start it with "
     if sockets_elsewhere:
         return (
             f"answers in {folders}, but one listens on {sockets_elsewhere[0]}: set XDG_RUNTIME_DIR "
@@ -175,15 +179,18 @@ def own_sockets() -> list[Path]:
     OSError
         If the system has no list of sockets.
     """
-    sockets = []
+    socket_paths = []
     for path in listening_sockets():
         folder = path.parent.name
         if path.name.endswith(SOCKET_SUFFIX) and (folder == "rigd" or folder.startswith("rigd-")):
             with suppress(OSError, ValueError):  # it was removed, or is in another user's folder
-                status = path.lstat()
-                if stat.S_ISSOCK(status.st_mode) and os.getuid() in (0, status.st_uid):
-                    sockets.append(path)
-    return sockets
+                socket_status = path.lstat()
+                if stat.S_ISSOCK(socket_status.st_mode) and os.getuid() in (
+                    0,
+                    socket_status.st_uid,
+                ):
+                    socket_paths.append(path)
+    return socket_paths
 
 
 def peer_at(path: Path) -> tuple[int, int] | None:
@@ -201,12 +208,12 @@ def peer_at(path: Path) -> tuple[int, int] | None:
     OSError
         If no process listens there, or this user may not connect.
     """
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as link:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK) as probe_socket:
         try:
-            link.connect(os.fspath(path))
+            probe_socket.connect(os.fspath(path))
         except BlockingIOError:
             return None
-        return peer_of(link)
+        return peer_of(probe_socket)
 
 
 def _group_number(group: str) -> int:
@@ -220,20 +227,21 @@ def _group_number(group: str) -> int:
         ) from None
 
 
-def _can_group_enter(group: int, folder: Path) -> bool:
+def _can_group_enter(group_id: int, folder: Path) -> bool:
     """Return whether the members of a group can enter a folder."""
-    status = folder.stat()
+    folder_status = folder.stat()
     return bool(
-        status.st_mode & stat.S_IXOTH or (status.st_gid == group and status.st_mode & stat.S_IXGRP)
+        folder_status.st_mode & stat.S_IXOTH
+        or (folder_status.st_gid == group_id and folder_status.st_mode & stat.S_IXGRP)
     )
 
 
 def _creation_error_text(path: Path, group: str | None, error: OSError) -> str:
     """Return the error message for a socket that cannot be created, with the remedy."""
-    remedy = (
+    remedy_text = (
         "set XDG_RUNTIME_DIR to a folder with a short name that is yours."
         if group is None
         else f"have the administrator make its folder: install -d -o $USER -g {group} -m 2750 "
         f"{path.parent}; and be a member of {group} yourself."
     )
-    return f"The socket {path} cannot be made ({error.strerror or error}); {remedy}"
+    return f"The socket {path} cannot be made ({error.strerror or error}); {remedy_text}"

@@ -106,7 +106,7 @@ class CheckJob:
         from rigd.checks import check_without_devices
         from rigd.checks.rows import overall
 
-        rows = check_without_devices(self.profile, self.calibration)
+        check_rows = check_without_devices(self.profile, self.calibration)
         return {
             "rows": [
                 {
@@ -115,9 +115,9 @@ class CheckJob:
                     "text": f"{row.found} (wanted: {row.wanted})" if row.wanted else row.found,
                     "remedy": row.detail,
                 }
-                for row in rows
+                for row in check_rows
             ],
-            "verdict": overall(rows),
+            "verdict": overall(check_rows),
         }
 
 
@@ -142,10 +142,14 @@ class PlanJob:
 
         This is assumed for an excitation from a file, and for a long record.
         """
-        values = self.request.parameters.items()
-        total_duration_s = sum(value for name, value in values if name.endswith("_s"))
+        parameter_items = self.request.parameters.items()
+        total_duration_s = sum(
+            parameter_value
+            for parameter_name, parameter_value in parameter_items
+            if parameter_name.endswith("_s")
+        )
         return total_duration_s > _LIGHT_RECORD_S or any(
-            isinstance(value, Path) for _, value in values
+            isinstance(parameter_value, Path) for _, parameter_value in parameter_items
         )
 
     def perform(self) -> Series:
@@ -190,7 +194,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         If the job is refused, fails, or takes longer than 50 s.
     """
     try:
-        process = await asyncio.create_subprocess_exec(
+        job_process = await asyncio.create_subprocess_exec(
             *(*OWN_PYTHON, "-m", "rigd.daemon.background"),
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
@@ -200,20 +204,22 @@ async def perform(job: BackgroundJob[Result]) -> Result:
     except OSError as error:
         raise CommandError(f"No process can be started for it ({error.strerror}).") from None
     try:
-        output, _ = await asyncio.wait_for(process.communicate(pickle.dumps(job)), _JOB_TIMEOUT_S)
-        answer = pickle.loads(output)
+        process_output, _ = await asyncio.wait_for(
+            job_process.communicate(pickle.dumps(job)), _JOB_TIMEOUT_S
+        )
+        result_or_error = pickle.loads(process_output)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None
     except (EOFError, pickle.UnpicklingError):
-        raise CommandError(f"Its process ended with exit code {process.returncode}.") from None
+        raise CommandError(f"Its process ended with exit code {job_process.returncode}.") from None
     finally:
-        if process.returncode is None:
-            process.kill()
-            await process.wait()
-    if isinstance(answer, CommandError):
-        raise answer
-    done: Result = answer
-    return done
+        if job_process.returncode is None:
+            job_process.kill()
+            await job_process.wait()
+    if isinstance(result_or_error, CommandError):
+        raise result_or_error
+    job_result: Result = result_or_error
+    return job_result
 
 
 def main() -> None:
@@ -229,25 +235,25 @@ def main() -> None:
     if job.during_sessions:
         os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
     try:
-        result = job.perform()
+        result_or_error = job.perform()
     except RigdError as error:
-        result = CommandError(str(error), wrong_use=error.wrong_use)
+        result_or_error = CommandError(str(error), wrong_use=error.wrong_use)
     except MemoryError:
-        result = CommandError(
+        result_or_error = CommandError(
             "There is not enough free memory to predict such a session; shorten it, or close other "
             "programs.",
             wrong_use=True,
         )
-    if isinstance(result, dict):
-        json.dumps(result, allow_nan=False)  # raises if the reply is not JSON
-    pickle.dump(result, sys.stdout.buffer)
+    if isinstance(result_or_error, dict):
+        json.dumps(result_or_error, allow_nan=False)  # raises if the reply is not JSON
+    pickle.dump(result_or_error, sys.stdout.buffer)
 
 
 def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:
     """Return the maximum address space of a job in bytes, from the memory available now."""
-    text = meminfo.read_text()
-    available = int(text.partition("MemAvailable:")[2].split()[0]) * 1024
-    return int(min(max(_MEMORY_FRACTION * available, _MIN_MEMORY_BYTES), _MAX_MEMORY_BYTES))
+    meminfo_text = meminfo.read_text()
+    available_bytes = int(meminfo_text.partition("MemAvailable:")[2].split()[0]) * 1024
+    return int(min(max(_MEMORY_FRACTION * available_bytes, _MIN_MEMORY_BYTES), _MAX_MEMORY_BYTES))
 
 
 if __name__ == "__main__":

@@ -129,22 +129,24 @@ class Client:
     def _connect(self) -> None:
         """Connect to the daemon; raise DaemonGoneError if that fails or takes too long."""
         self._received = b""
-        self._socket = link = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        self._socket = new_socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
         try:
             # The timeout of the kernel is used, because with Python's a full queue fails at once.
-            timeout = _TIMEVAL_FORMAT.pack(*divmod(round(self._connect_timeout_s * 1e6), 1_000_000))
-            link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, timeout)
-            link.connect(str(self._path))
-            self.pid, self.uid = peer_of(link)
+            packed_timeout = _TIMEVAL_FORMAT.pack(
+                *divmod(round(self._connect_timeout_s * 1e6), 1_000_000)
+            )
+            new_socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, packed_timeout)
+            new_socket.connect(str(self._path))
+            self.pid, self.uid = peer_of(new_socket)
         except BlockingIOError:
-            link.close()
+            new_socket.close()
             raise DaemonGoneError(
                 f"The daemon on {self._path} takes no connection within "
                 f"{self._connect_timeout_s:g} s: it is suspended, or overloaded by other clients. "
                 f"{UNKNOWN_STATE}"
             ) from None
         except OSError as error:
-            link.close()
+            new_socket.close()
             raise DaemonGoneError(
                 f"The daemon on {self._path} cannot be reached ({error.strerror or error})."
             ) from None
@@ -240,15 +242,15 @@ class Client:
                 self.send("stop")
                 is_stop_sent = True
                 deadline_s = min(deadline_s, time.monotonic() + _STOP_TIMEOUT_S)
-            message = self._next_message(min(remaining_s, _STOP_POLL_INTERVAL_S))
-            if message is None:
+            reply_message = self._next_message(min(remaining_s, _STOP_POLL_INTERVAL_S))
+            if reply_message is None:
                 continue
-            if "event" in message:
-                self._events.append(message)
-            elif not message.get("ok"):
-                raise _refusal_error(message)
+            if "event" in reply_message:
+                self._events.append(reply_message)
+            elif not reply_message.get("ok"):
+                raise _refusal_error(reply_message)
             else:
-                return message
+                return reply_message
         raise DaemonGoneError(
             f"The daemon (process {self.pid}) does not answer within {self._reply_timeout_s:g} s. "
             f"{UNKNOWN_STATE}"
@@ -269,10 +271,10 @@ class Client:
         DaemonGoneError
             If the request cannot be sent.
         """
-        line = json.dumps({"command": command, **fields}).encode() + b"\n"
+        request_line = json.dumps({"command": command, **fields}).encode() + b"\n"
         try:
             self._socket.settimeout(_REPLY_TIMEOUT_S)
-            self._socket.sendall(line)
+            self._socket.sendall(request_line)
         except OSError:
             # The daemon may have sent the reason before it closed the connection.
             self._raise_refusal()
@@ -294,17 +296,17 @@ class Client:
         while b"\n" not in self._received:
             self._socket.settimeout(max(1e-3, deadline_s - time.monotonic()))
             try:
-                data = self._socket.recv(65_536)
+                received_bytes = self._socket.recv(65_536)
             except TimeoutError:
                 return None
             except OSError:
-                data = b""
-            if not data:
+                received_bytes = b""
+            if not received_bytes:
                 raise self._connection_lost_error()
-            self._received += data
-        line, self._received = self._received.split(b"\n", 1)
+            self._received += received_bytes
+        message_line, self._received = self._received.split(b"\n", 1)
         try:
-            message = json.loads(line)
+            message = json.loads(message_line)
         except ValueError:
             message = None
         if not isinstance(message, dict):
@@ -314,9 +316,9 @@ class Client:
     def _raise_refusal(self) -> None:
         """Raise the daemon's refusal if it has sent one before it closed the connection."""
         try:
-            while (message := self._next_message(0.1)) is not None:
-                if "error" in message:
-                    raise _refusal_error(message)
+            while (last_message := self._next_message(0.1)) is not None:
+                if "error" in last_message:
+                    raise _refusal_error(last_message)
         except DaemonGoneError:
             return
 
@@ -331,10 +333,13 @@ class _TooManyClientsError(RefusedByDaemonError):
     """Raised if the daemon did not execute a request because it has too many clients."""
 
 
-def _refusal_error(message: Document) -> RefusedByDaemonError:
+def _refusal_error(refusal_reply: Document) -> RefusedByDaemonError:
     """Return the error that a reply of the daemon reports."""
-    error_class = _TooManyClientsError if message.get("crowded") else RefusedByDaemonError
-    return error_class(str(message.get("error", message)), wrong_use=bool(message.get("wrong_use")))
+    error_class = _TooManyClientsError if refusal_reply.get("crowded") else RefusedByDaemonError
+    return error_class(
+        str(refusal_reply.get("error", refusal_reply)),
+        wrong_use=bool(refusal_reply.get("wrong_use")),
+    )
 
 
 # Stop
@@ -372,22 +377,22 @@ def stop_session(path: Path) -> Document:
                 peer = client.pid, client.uid
                 return client.ask("stop") | {"signalled": signalled, "peer": peer}
         except (DaemonGoneError, _TooManyClientsError) as error:
-            failure = str(error)
-        waited_s = time.monotonic() - began_s
-        if peer is not None and not signalled and waited_s > _STOP_SIGNAL_DELAY_S:
+            last_failure = str(error)
+        elapsed_s = time.monotonic() - began_s
+        if peer is not None and not signalled and elapsed_s > _STOP_SIGNAL_DELAY_S:
             signalled = _signal_stop(peer[0])
-        if waited_s > _STOP_TIMEOUT_S or not path.exists():
+        if elapsed_s > _STOP_TIMEOUT_S or not path.exists():
             break
         # A daemon that lacks processor time stops its session, but replies late.
         reply_timeout_s = min(2.0 * reply_timeout_s, _STOP_TIMEOUT_S)
         time.sleep(_RETRY_PAUSE_S)
     if peer is None:
-        raise DaemonGoneError(failure)
+        raise DaemonGoneError(last_failure)
     if not signalled:
-        raise DaemonGoneError(failure, peer)
+        raise DaemonGoneError(last_failure, peer)
     raise DaemonGoneError(
         f"The daemon (process {peer[0]}) was sent {STOP_SIGNAL.name}, which asks it to stop, and "
-        f"has not replied for {waited_s:.0f} s. {UNKNOWN_STATE}"
+        f"has not replied for {elapsed_s:.0f} s. {UNKNOWN_STATE}"
     )
 
 
@@ -422,17 +427,17 @@ def await_end(
             raise DaemonGoneError(f"Another process listens on {path} now. {UNKNOWN_STATE}")
         while True:
             try:
-                status = client.ask("status")
+                daemon_status = client.ask("status")
             except _TooManyClientsError:
                 return None
-            series = status["series"]
+            served_series = daemon_status["series"]
             # A stop during planning takes effect after the planning, before the session begins.
-            if status["state"] not in ("running", "stopping") and (
-                series is None
-                or not series["running"]
-                or (series.get("stopped") and status.get("doing") == "planning")
+            if daemon_status["state"] not in ("running", "stopping") and (
+                served_series is None
+                or not served_series["running"]
+                or (served_series.get("stopped") and daemon_status.get("doing") == "planning")
             ):
-                return status
+                return daemon_status
             if time.monotonic() > deadline_s:
                 return None
             time.sleep(_RETRY_PAUSE_S)
@@ -532,31 +537,44 @@ def find_views(rig: str | None) -> list[LiveAddress]:
         Name of the rig's profile, or None for all rigs.
     """
     own_views = running_views()
-    views = [view for view in own_views if rig in (None, view.rig)]
-    if not views:
+    matching_views = [live_view for live_view in own_views if rig in (None, live_view.rig)]
+    if not matching_views:
         # The runtime folder of another user's daemon is not readable.
-        daemon_views = (_view_of_daemon(path) for path in running())
-        views = [view for view in daemon_views if view is not None and rig in (None, view.rig)]
-    return views
+        daemon_views = (_view_of_daemon(daemon_socket) for daemon_socket in running())
+        matching_views = [
+            live_view
+            for live_view in daemon_views
+            if live_view is not None and rig in (None, live_view.rig)
+        ]
+    return matching_views
 
 
 def daemons() -> dict[str, bool]:
     """Return the rigs with a running daemon: profile name → whether it has a live view."""
-    statuses = (_status_of_daemon(path) for path in running())
+    statuses = (_status_of_daemon(daemon_socket) for daemon_socket in running())
     return {
-        status["daemon"]["profile"]: status["daemon"]["live"]
-        for status in statuses
-        if status is not None
+        daemon_status["daemon"]["profile"]: daemon_status["daemon"]["live"]
+        for daemon_status in statuses
+        if daemon_status is not None
     }
 
 
 def _view_of_daemon(path: Path) -> LiveAddress | None:
     """Return the address of a daemon's live view, or None if it has none."""
-    status = _status_of_daemon(path)
-    view = None if status is None or status["rig"] is None else status["rig"]["live_view"]
-    if view is None:
+    daemon_status = _status_of_daemon(path)
+    view_document = (
+        None
+        if daemon_status is None or daemon_status["rig"] is None
+        else daemon_status["rig"]["live_view"]
+    )
+    if view_document is None:
         return None
-    return LiveAddress(**{field.name: view[field.name] for field in fields(LiveAddress)})
+    return LiveAddress(
+        **{
+            address_field.name: view_document[address_field.name]
+            for address_field in fields(LiveAddress)
+        }
+    )
 
 
 def _status_of_daemon(path: Path) -> dict[str, Any] | None:

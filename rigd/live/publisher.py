@@ -422,7 +422,10 @@ def last_response(session: "LiveSession", shown_last: LastResponse | None) -> La
     if session.folder is None:
         return shown_last
     newest = last_quick_look(
-        session.folder, specimen, but=session.subject.name, usable=itemgetter("response")
+        session.folder,
+        specimen,
+        excluded_session=session.subject.name,
+        is_usable=itemgetter("response"),
     )
     if newest is None:
         return shown_last

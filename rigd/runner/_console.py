@@ -31,14 +31,14 @@ def plan_lines(plan: Mapping[str, Any]) -> Iterator[str]:
     """
     limits = plan.get("limits", {})
 
-    def peak(name: str, unit: str) -> str:
-        limit = f" (limit {limits[name]:g})" if name in limits else ""
-        return f"{plan[f'peak_{name}']:.3g} {unit}{limit}"
+    def peak(peak_name: str, unit: str) -> str:
+        limit_text = f" (limit {limits[peak_name]:g})" if peak_name in limits else ""
+        return f"{plan[f'peak_{peak_name}']:.3g} {unit}{limit_text}"
 
-    subject = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
-    sweep = f"{plan['sweep']}, " if plan.get("sweep") else ""
-    at_most = "at most " if plan.get("ends_itself") else ""
-    yield f"{subject}{sweep}record of {at_most}{plan['record_s']:g} s."
+    subject_prefix = f"{plan['excitation']} on {plan['profile']}, " if "profile" in plan else ""
+    sweep_prefix = f"{plan['sweep']}, " if plan.get("sweep") else ""
+    maximum_prefix = "at most " if plan.get("ends_itself") else ""
+    yield f"{subject_prefix}{sweep_prefix}record of {maximum_prefix}{plan['record_s']:g} s."
     yield (
         f"Predicted peaks: angle {peak('angle_rad', 'rad')}, "
         f"speed {peak('velocity_rad_s', 'rad/s')}, torque {peak('torque_nm', 'N·m')}."
@@ -91,7 +91,14 @@ class ProgressLine:
         self._thread.start()
 
     def update(
-        self, phase: Phase, tick: int, total: int, *, missed: int, late: int, number: str = ""
+        self,
+        phase: Phase,
+        tick: int,
+        total: int,
+        *,
+        missed: int,
+        late: int,
+        session_number_text: str = "",
     ) -> None:
         """Show the present progress of the session.
 
@@ -110,7 +117,7 @@ class ProgressLine:
         # Before tick 0 the counter still has the value of the previous session.
         self._has_record_begun |= phase is Phase.RUNNING
         self._state = {
-            "description": f"{phase.words} {number}".rstrip(),
+            "description": f"{phase.words} {session_number_text}".rstrip(),
             "completed": tick if self._has_record_begun else 0,
             "total": total,
             "counts": f"{missed} missed, {late} late" if missed else "",
@@ -134,11 +141,13 @@ class ProgressLine:
 
     def _write_until_closed(self) -> None:
         """Write the line and the messages until the line is closed; run in a thread."""
-        closed = False
-        while not closed:
+        is_closed = False
+        while not is_closed:
             self._has_changed.wait()
             self._has_changed.clear()
-            closed = self._is_closed  # read first, so that all earlier messages are still written
+            is_closed = (
+                self._is_closed
+            )  # read first, so that all earlier messages are still written
             with self._lock:
                 messages, self._messages = self._messages, []
             with contextlib.suppress(OSError):  # the session continues without a terminal

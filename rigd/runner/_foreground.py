@@ -58,7 +58,7 @@ class SeriesFailedError(FailureError):
 
 
 def run_in_foreground(
-    build: Callable[..., Excitation],
+    build_excitation: Callable[..., Excitation],
     group: ProcessGroup,
     stop: StopRequest,
     *,
@@ -104,7 +104,7 @@ def run_in_foreground(
         Make a quick look at each session, and wait some seconds for the last one.
     from_angle
         Whether the excitation depends on the motor angle. The rig is then connected first, and
-        `build` receives the angle as ``start_rad``.
+        `build_excitation` receives the angle as ``start_rad``.
     prepare
         Function that returns a modified profile before the sessions are planned.
     obstacles
@@ -123,13 +123,13 @@ def run_in_foreground(
     SeriesFailedError
         If a session cannot be run, or failed.
     """
-    write: _PrintLine = partial(_print, err=quiet_stdout)
+    print_line: _PrintLine = partial(_print, to_stderr=quiet_stdout)
     results: list[RunResult] = []
 
     def report(quick_look: QuickLook) -> None:
         quick_look.note(results)
-        for line in quick_look.lines:
-            write(line)
+        for report_line in quick_look.lines:
+            print_line(report_line)
 
     quick_looks = QuickLooks(report) if quick_look else None
     try:
@@ -144,21 +144,21 @@ def run_in_foreground(
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)
             specimen_profile = with_specimen(profile, specimen)
-            _print(describe_actuation_target(profile.rig, target), err=True)
+            _print(describe_actuation_target(profile.rig, target), to_stderr=True)
             for difference in simulated_differently(profile.rig):
-                write(f"Warning: the simulated rig has {difference}.")
+                print_line(f"Warning: the simulated rig has {difference}.")
             is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
             is_hardware = target is ActuationTarget.HARDWARE
             locks.enter_context(
-                RigLock(profile.name, "rigd run", hardware=is_hardware, alone=is_exclusive)
+                RigLock(profile.name, "rigd run", hardware=is_hardware, exclusive=is_exclusive)
             )
             rig = Rig(profile, fast=fast, group=group)
             if from_angle and not stop.requested:
                 rig.connect(target)
-                build = partial(build, start_rad=rig.angle_rad)
-            series = Series(
+                build_excitation = partial(build_excitation, start_rad=rig.angle_rad)
+            session_series = Series(
                 specimen_profile,
-                build(specimen_profile),
+                build_excitation(specimen_profile),
                 folder,
                 repeat=repeat,
                 notes=notes,
@@ -167,13 +167,13 @@ def run_in_foreground(
                 watch_fit=watch_fit,
                 identifies_motor=identifies_motor,
             )
-            results = series.results
-            for line in plan_lines(series.plan_document()):
-                write(line)
+            results = session_series.results
+            for line in plan_lines(session_series.plan_document()):
+                print_line(line)
             if not (stop.requested or rig.connected):
                 rig.connect(target)
-            with _TerminalProgress(series.ticks, repeat, write) as operator:
-                series.run(rig, stop, operator, live=live, quick_looks=quick_looks)
+            with _TerminalProgress(session_series.ticks, repeat, print_line) as operator:
+                session_series.run(rig, stop, operator, live=live, quick_looks=quick_looks)
         if stop.requested:
             _print_stop(results, repeat)
         if quick_looks is not None:
@@ -195,10 +195,10 @@ def run_in_foreground(
 class _TerminalProgress:
     """Prints the progress and the results of a series of sessions to the terminal."""
 
-    def __init__(self, ticks: int, repeat: int, write: _PrintLine) -> None:
-        self._ticks = ticks
-        self._repeat = repeat
-        self._print = write
+    def __init__(self, record_ticks: int, session_count: int, print_line: _PrintLine) -> None:
+        self._ticks = record_ticks
+        self._repeat = session_count
+        self._print = print_line
         self._progress_line: ProgressLine | None = None
         self._number = ""
         self._last_view_text = ""
@@ -234,7 +234,7 @@ class _TerminalProgress:
             self._ticks,
             missed=progress.missed,
             late=progress.late,
-            number=self._number,
+            session_number_text=self._number,
         )
 
     def on_result(self, result: RunResult, *, look_follows: bool) -> None:  # noqa: ARG002
@@ -251,10 +251,10 @@ class _TerminalProgress:
             self._progress_line = None
 
 
-def _print(text: str, *, err: bool) -> None:
-    """Print a line to standard output or, if `err` is True, to standard error."""
+def _print(text: str, *, to_stderr: bool) -> None:
+    """Print a line to standard error if `to_stderr` is True, else to standard output."""
     with contextlib.suppress(OSError):  # the session continues without a terminal
-        typer.echo(text, err=err)
+        typer.echo(text, err=to_stderr)
 
 
 def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
@@ -269,7 +269,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
     stop.on_request = skip
     quick_looks.poll()
     if quick_looks.busy:
-        _print("Quick look at the session; Ctrl-C skips it.", err=True)
+        _print("Quick look at the session; Ctrl-C skips it.", to_stderr=True)
     deadline_s = time.monotonic() + _QUICK_LOOK_MAX_WAIT_S
     while (
         quick_looks.busy
@@ -288,7 +288,7 @@ def _await_quick_looks(quick_looks: QuickLooks, stop: StopRequest) -> None:
         _print(
             f"The quick look {reason} and was skipped: python -m analysis.quick_look FILE makes "
             "it.",
-            err=True,
+            to_stderr=True,
         )
     stop.requested = was_stopped  # this Ctrl-C skipped the quick look only
 
@@ -303,5 +303,5 @@ def _print_stop(results: Sequence[RunResult], repeat: int) -> None:
     count_text = f" after {len(results)} of {repeat} sessions" if results else ""
     _print(
         f"Stopped: no record{count_text}. Stopped by the operator before the session began.",
-        err=True,
+        to_stderr=True,
     )

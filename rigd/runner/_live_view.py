@@ -107,10 +107,10 @@ class LiveView:
         self, is_condition_met: Callable[[], bool], timeout_s: float, stop: StopRequest
     ) -> None:
         """Process messages until a condition is met, the publisher fails, or time has run out."""
-        deadline = time.monotonic() + timeout_s
+        deadline_s = time.monotonic() + timeout_s
         while (
             not (is_condition_met() or self._failure or stop.requested)
-            and time.monotonic() < deadline
+            and time.monotonic() < deadline_s
         ):
             self._process_message_for(0.1)
 
@@ -172,8 +172,8 @@ class LiveView:
         """Restart the publisher if its last heartbeat is too long ago."""
         assert LIVE.hung_after_s is not None
         timeout_s = LIVE.hung_after_s if self._has_address else _START_TIMEOUT_S
-        beat = self._group.channels.shared_state[StateField.LIVE_BEAT]
-        if self._heartbeat.stalled_for(beat, time.monotonic()) > timeout_s:
+        heartbeat_count = self._group.channels.shared_state[StateField.LIVE_BEAT]
+        if self._heartbeat.stalled_for(heartbeat_count, time.monotonic()) > timeout_s:
             self._restart(f"The live process was killed: no response for {timeout_s:g} s.")
 
     def _restart(self, reason: str) -> None:
@@ -194,28 +194,28 @@ class LiveView:
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
-    rig, excitation = order.profile.rig, order.excitation
+    rig_parameters, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
-    if rig.devices.drive == rig.devices.sensor == "sim":
+    if rig_parameters.devices.drive == rig_parameters.devices.sensor == "sim":
         absent_plots |= BUS_PLOT_COMPONENTS
     if fast:
         absent_plots |= REAL_TIME_PLOT_COMPONENTS
     return Subject(
         name=order.path.stem,
-        rate_hz=rig.rate_hz,
+        rate_hz=rig_parameters.rate_hz,
         ticks=excitation.reference_rad.size,
         sweep=sweep_ticks(excitation.segments),
-        beam=rig.beam,
-        damping=rig.damping,
-        tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
-        angle_delay_s=rig.encoder.delay_s,
-        torque_delay_s=rig.sensor.delay_s,
+        beam=rig_parameters.beam,
+        damping=rig_parameters.damping,
+        tool_inertia_kg_m2=rig_parameters.sensor.tool_inertia_kg_m2,
+        angle_delay_s=rig_parameters.encoder.delay_s,
+        torque_delay_s=rig_parameters.sensor.delay_s,
         excitation=excitation.kind,
         sweep_hz=linear_sweep_band_hz(excitation.kind, excitation.parameters),
         back=excitation.segments.get("back"),
         specimen=dict(order.notes).get("specimen", ""),
         limits=gauge_limits(order.profile),
-        thermal_time_constant_s=rig.motor.thermal_time_constant_s,
+        thermal_time_constant_s=rig_parameters.motor.thermal_time_constant_s,
         absent=frozenset(absent_plots),
         fit_modes=_fit_modes(order),
     )
@@ -230,7 +230,8 @@ def _fit_modes(order: Order) -> int | None:
     if excitation.search is None and not order.watch_fit:
         return None
     sweep_limits = (
-        excitation.parameters.get(name, _DEFAULT_FIT_BAND_HZ) for name in ("start_hz", "stop_hz")
+        excitation.parameters.get(frequency_key, _DEFAULT_FIT_BAND_HZ)
+        for frequency_key in ("start_hz", "stop_hz")
     )
     highest_hz = max(float(end) for end in sweep_limits)
     expected_hz = undamped_frequencies_rad_s(order.profile.rig.beam, _MAX_FIT_MODES) / math.tau
@@ -242,17 +243,21 @@ def gauge_limits(profile: Profile) -> dict[str, float]:
 
     The limit of missed ticks is in percent.
     """
-    limits, motor, sensor = profile.limits, profile.rig.motor, profile.rig.sensor
-    axes = ("fx", "fy", "fz", "tx", "ty", "tz")
+    limits, motor_parameters, sensor_parameters = (
+        profile.limits,
+        profile.rig.motor,
+        profile.rig.sensor,
+    )
+    wrench_axes = ("fx", "fy", "fz", "tx", "ty", "tz")
     return {
         "angle": limits.angle_rad,
         "velocity": limits.velocity_rad_s,
         "tracking_error": limits.tracking_error_rad,
         # A torque command beyond this limit is clipped.
-        "torque_command": motor.peak_torque_nm,
-        "i2t": motor.continuous_torque_nm,
+        "torque_command": motor_parameters.peak_torque_nm,
+        "i2t": motor_parameters.continuous_torque_nm,
         "missed": limits.missed_percent,
     } | {
-        axis: limits.sensor_range_percent / 100.0 * end
-        for axis, end in zip(axes, sensor.range, strict=True)
+        wrench_axis: limits.sensor_range_percent / 100.0 * end
+        for wrench_axis, end in zip(wrench_axes, sensor_parameters.range, strict=True)
     }

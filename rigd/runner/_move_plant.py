@@ -40,30 +40,32 @@ def loop_model_with(profile: Profile, identified_beam: IdentifiedBeam | None) ->
 
     If `identified_beam` is None, the model has the values of the profile.
     """
-    model = profile.loop_model()
+    loop_model = profile.loop_model()
     if identified_beam is None:
-        return model
-    model = with_beam(model, identified_beam.loaded_beam)
+        return loop_model
+    loop_model = with_beam(loop_model, identified_beam.loaded_beam)
     if identified_beam.tool_inertia_kg_m2 is not None:
-        model = replace(model, tool_inertia_kg_m2=identified_beam.tool_inertia_kg_m2)
+        loop_model = replace(loop_model, tool_inertia_kg_m2=identified_beam.tool_inertia_kg_m2)
     if identified_beam.delay_s is not None:
         # Only the difference of the two delays is identified, and neither can be negative.
-        angle_s = max(model.angle_delay_s, -identified_beam.delay_s)
-        model = replace(
-            model, angle_delay_s=angle_s, torque_delay_s=angle_s + identified_beam.delay_s
+        angle_delay_s = max(loop_model.angle_delay_s, -identified_beam.delay_s)
+        loop_model = replace(
+            loop_model,
+            angle_delay_s=angle_delay_s,
+            torque_delay_s=angle_delay_s + identified_beam.delay_s,
         )
-    return model
+    return loop_model
 
 
-def with_beam(model: LoopModel, loaded: LoadedBeam) -> LoopModel:
+def with_beam(model: LoopModel, loaded_beam: LoadedBeam) -> LoopModel:
     """Return a copy of a loop model with another beam, tip mass and root compliance."""
     return replace(
         model,
-        beam=loaded.beam,
-        damping=loaded.damping,
-        tip_mass_kg=loaded.tip_mass_kg,
-        root_compliance_rad_per_nm=loaded.root_compliance_rad_per_nm,
-        stiffness_offsets=loaded.stiffness_offsets,
+        beam=loaded_beam.beam,
+        damping=loaded_beam.damping,
+        tip_mass_kg=loaded_beam.tip_mass_kg,
+        root_compliance_rad_per_nm=loaded_beam.root_compliance_rad_per_nm,
+        stiffness_offsets=loaded_beam.stiffness_offsets,
     )
 
 
@@ -80,41 +82,41 @@ def move_plant_of(
     # The friction compensation (tanh of the speed) is not linear, and its maximum is subtracted
     # from the available torque.
     settings = replace(model.settings, friction_compensation_nm=0.0)
-    loop = close_loop(replace(model, settings=settings))
-    check_stability(loop)
-    locked_hub_poles, closed_loop_poles = mode_poles(loop)
+    uncompensated_loop = close_loop(replace(model, settings=settings))
+    check_stability(uncompensated_loop)
+    locked_hub_poles, closed_loop_poles = mode_poles(uncompensated_loop)
     # Torque of a mode for the angle's acceleration: 2 Re(r exp(p t)), r its residue in G(s)/s².
     torque_per_angle = 2.0 * np.abs(model.loaded_beam.residues(locked_hub_poles))
-    uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
+    frequency_uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
     if identified_beam is not None:
-        uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
-    motor, rig = profile.control_motor, profile.rig
+        frequency_uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
+    control_motor, rig = profile.control_motor, profile.rig
     disturbances = Disturbances(
-        motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
+        control_motor.coulomb_nm, rig.encoder.resolution_rad, torque_noise_nm(profile)
     )
-    compensated_loop = replace(loop, model=model)
+    compensated_loop = replace(uncompensated_loop, model=model)
 
     def respond_disturbed(reference_rad: Real, modes: int) -> tuple[Real, Real]:
-        response = simulate_disturbed(
+        disturbed_response = simulate_disturbed(
             compensated_loop, reference_rad, disturbances, modes=modes, draws=_NOISE_REALISATIONS
         )
-        return response.angle_rad, response.mode_torque_nm
+        return disturbed_response.angle_rad, disturbed_response.mode_torque_nm
 
     return MovePlant(
         rate_hz=model.rate_hz,
-        respond=loop.simulate,
+        respond=uncompensated_loop.simulate,
         disturbed=respond_disturbed,
         poles_rad_s=closed_loop_poles,
         torque_per_state_nm_s=torque_per_angle
-        * np.abs(loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),
-        frequency_uncertainty=np.array(uncertainty),
+        * np.abs(uncompensated_loop.response(np.abs(closed_loop_poles) / (2.0 * math.pi))),
+        frequency_uncertainty=np.array(frequency_uncertainty),
         torque_noise_nm=disturbances.torque_noise_nm,
         settling_s=_SETTLING_TIME_CONSTANTS / settings.pole_rad_s,
-        peak_torque_nm=motor.peak_torque_nm,
+        peak_torque_nm=control_motor.peak_torque_nm,
         friction_nm=profile.control.friction_compensation_nm,
         largest_acceleration_rad_s2=_MAX_REFERENCE_ACCELERATION_RATIO
-        * motor.peak_torque_nm
-        / motor.inertia_kg_m2,
+        * control_motor.peak_torque_nm
+        / control_motor.inertia_kg_m2,
         velocity_rad_s=profile.limits.velocity_rad_s,
         tracking_error_rad=profile.limits.tracking_error_rad,
         coupling_torque_nm=coupling_limit_nm,
@@ -129,10 +131,10 @@ def torque_noise_nm(profile: Profile) -> float:
     It is computed from the simulated noise, or from the resolution of a real sensor.
     """
     rig = profile.rig
-    axes = np.array(rig.sensor.resolution)
+    axis_noise = np.array(rig.sensor.resolution)
     if rig.simulation is not None:
-        axes = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
-    return float(np.linalg.norm(np.array(rig.sensor.projection) * axes))
+        axis_noise = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
+    return float(np.linalg.norm(np.array(rig.sensor.projection) * axis_noise))
 
 
 def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
@@ -143,10 +145,11 @@ def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
     poles of the closed loop. They are near those of the beam with locked hub, and differ if the
     loop damps a mode.
     """
-    model = loop.model
-    locked_hub_poles = model.loaded_beam.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
+    loop_model = loop.model
+    locked_hub_poles = loop_model.loaded_beam.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
     locked_hub_poles = locked_hub_poles[
-        (locked_hub_poles.imag > 0.0) & (np.abs(locked_hub_poles) < 0.5 * math.pi * model.rate_hz)
+        (locked_hub_poles.imag > 0.0)
+        & (np.abs(locked_hub_poles) < 0.5 * math.pi * loop_model.rate_hz)
     ]
     closed_loop_poles = [
         loop.poles_rad_s[np.argmin(np.abs(loop.poles_rad_s - s))] for s in locked_hub_poles

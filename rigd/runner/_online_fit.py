@@ -130,7 +130,7 @@ class FitSupervisor:
         `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
         """
         self._send(RecordEnded(ticks))
-        begun_s = time.monotonic()
+        began_s = time.monotonic()
         while self._has_begun and not (
             self._failure or (self._last_report is not None and self._last_report.final)
         ):
@@ -138,26 +138,28 @@ class FitSupervisor:
             call_while_waiting()
             if (
                 self._shared_state[StateField.STOP] != Stop.NO
-                and time.monotonic() > begun_s + _STOPPED_FIT_TIMEOUT_S
+                and time.monotonic() > began_s + _STOPPED_FIT_TIMEOUT_S
             ):
                 self._skip_reason = "A stop skipped the fit of the whole record."
                 break
-            if time.monotonic() > begun_s + _FINAL_FIT_TIMEOUT_S:
+            if time.monotonic() > began_s + _FINAL_FIT_TIMEOUT_S:
                 self._continue_without_process("The fit of the whole record took too long.")
-        estimate = {} if self._last_report is None else self._last_report.document
-        document = {key: estimate[key] for key in _STORED_KEYS if key in estimate}
+        last_estimate = {} if self._last_report is None else self._last_report.document
+        fit_document = {key: last_estimate[key] for key in _STORED_KEYS if key in last_estimate}
         if self._search is not None:
             targets = self._search.targets
-            estimates = target_estimates(document, targets) if "modes" in document else []
-            reached, self.unmet_reason = self._assess_precision(estimates)
-            document["search"] = {
+            target_results = (
+                target_estimates(fit_document, targets) if "modes" in fit_document else []
+            )
+            is_precision_reached, self.unmet_reason = self._assess_precision(target_results)
+            fit_document["search"] = {
                 "asked": [str(target) for target in targets],
-                "targets": targets_json(estimates),
-                "reached": reached,
+                "targets": targets_json(target_results),
+                "reached": is_precision_reached,
                 "reason": self.unmet_reason or self._success_sentence,
                 "pieces": self._planned_segments,
             }
-        return document
+        return fit_document
 
     @property
     def _end_reason(self) -> str:
@@ -172,10 +174,10 @@ class FitSupervisor:
         return "Reached by the fit of the whole record."
 
     def _assess_precision(self, estimates: Sequence[TargetEstimate]) -> tuple[bool | None, str]:
-        """Return whether the whole record has the requested precision, and text if it has not.
+        """Return whether the whole record has the requested precision, and the reason if not.
 
         The first value is None if the whole record was not fitted, whatever earlier estimates
-        stated. The text is empty if the precision was reached.
+        stated. The reason is empty if the precision was reached.
         """
         report, search_end = self._last_report, self._search_end
         was_reached_before = search_end is not None and search_end.reached
@@ -188,29 +190,33 @@ class FitSupervisor:
             unknown_reason = "Its fit has no modes."
         if unknown_reason:
             search_text = "Reached on the way." if was_reached_before else self._end_reason
-            parts = ["" if search_text == unknown_reason else search_text]
-            parts.append(f"Not known whether the whole record has the precision: {unknown_reason}")
-            parts.append(f"Last estimate: {estimates_text(estimates)}." if estimates else "")
-            return None, " ".join(filter(None, parts))
-        imprecise_estimates = [each for each in estimates if not each.ratio <= 1.0]
+            sentences = ["" if search_text == unknown_reason else search_text]
+            sentences.append(
+                f"Not known whether the whole record has the precision: {unknown_reason}"
+            )
+            sentences.append(f"Last estimate: {estimates_text(estimates)}." if estimates else "")
+            return None, " ".join(filter(None, sentences))
+        imprecise_estimates = [
+            target_estimate for target_estimate in estimates if not target_estimate.ratio <= 1.0
+        ]
         if not imprecise_estimates:
             return True, ""
-        reason = self._end_reason
+        unmet_text = self._end_reason
         if was_reached_before:
-            reason = self._failure or "Reached on the way, but not by the whole record."
-        return False, f"{reason} So far: {estimates_text(imprecise_estimates)}.".strip()
+            unmet_text = self._failure or "Reached on the way, but not by the whole record."
+        return False, f"{unmet_text} So far: {estimates_text(imprecise_estimates)}.".strip()
 
     @property
     def failure(self) -> str:
         """Sentence that states why the process failed during its search; empty if it did not."""
         return self._failure if self._search is not None and self._search_end is None else ""
 
-    def _send(self, message: object) -> None:
+    def _send(self, fit_message: object) -> None:
         """Send a message to the fit process, unless it has failed."""
         if self._failure:
             return
         try:
-            self._group[FIT].send(message)
+            self._group[FIT].send(fit_message)
         except ChildError as error:
             self._continue_without_process(str(error))
 
@@ -233,7 +239,7 @@ class FitSupervisor:
                 self._last_report = message
                 self._new_estimates.append(document)
                 self._events += [
-                    LogEvent(0, "info", line, notable=True) for line in document["text"]
+                    LogEvent(0, "info", text_line, notable=True) for text_line in document["text"]
                 ]
             case PlannedSegment(name, document):
                 self._planned_segments.append({"name": name, **document})

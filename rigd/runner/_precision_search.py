@@ -80,7 +80,7 @@ class TargetEstimate:
 
     @property
     def ratio(self) -> float:
-        """Ratio of the standard deviation to the requested standard deviation."""
+        """Ratio of the estimate's standard deviation to the requested one; at most 1 suffices."""
         return self.std / self.target_std if self.target_std > 0.0 else inf
 
 
@@ -92,35 +92,51 @@ def target_estimates(
     docs/online_fit.md describes the document. A modal target without a mode number applies to each
     mode in the excited frequency band.
     """
-    return [each for target in targets for each in _estimates_of(document, target)]
+    return [estimate for target in targets for estimate in _estimates_of(document, target)]
 
 
 def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[TargetEstimate]:
     """Yield the estimates of one requested quantity, one for each mode to which it applies."""
-    key = _MODAL_QUANTITY_KEYS.get(target.quantity)
-    if key is None:
+    quantity_key = _MODAL_QUANTITY_KEYS.get(target.quantity)
+    if quantity_key is None:
         yield _estimate_of_entry(target, document.get("parameters", {}).get(target.quantity))
         return
     # The fit also reports modes above the band, which no segment excites.
     modes_in_band = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
-    modes = [m for m in modes_in_band if target.mode in (None, m["mode"])]
-    for mode in modes:
-        estimate = _estimate_of_entry(replace(target, mode=int(mode["mode"])), mode[key])
-        yield estimate if mode["shown"] else replace(estimate, std=inf, doubt=_NOT_VISIBLE)
-    if not modes:
-        why = "no such mode was found in the band"
-        yield TargetEstimate(target.quantity, target.mode, None, inf, target.std, why)
+    matching_modes = [m for m in modes_in_band if target.mode in (None, m["mode"])]
+    for mode_document in matching_modes:
+        target_estimate = _estimate_of_entry(
+            replace(target, mode=int(mode_document["mode"])), mode_document[quantity_key]
+        )
+        yield (
+            target_estimate
+            if mode_document["shown"]
+            else replace(target_estimate, std=inf, doubt=_NOT_VISIBLE)
+        )
+    if not matching_modes:
+        missing_reason = "no such mode was found in the band"
+        yield TargetEstimate(target.quantity, target.mode, None, inf, target.std, missing_reason)
 
 
 def _estimate_of_entry(target: Target, entry: Mapping[str, Any] | None) -> TargetEstimate:
     """Return the estimate of a requested quantity from its entry in the fit's document."""
-    of = target.quantity, target.mode
+    quantity_and_mode = target.quantity, target.mode
     if entry is None or entry["value"] is None:
-        return TargetEstimate(*of, None, inf, target.std, "it is not part of what was found")
-    value, std, doubt = float(entry["value"]), entry["std"], entry["flag"] or ""
-    target_std = target.std * (abs(value) if target.relative else 1.0)
+        return TargetEstimate(
+            *quantity_and_mode, None, inf, target.std, "it is not part of what was found"
+        )
+    estimated_value, estimated_std, doubt_text = (
+        float(entry["value"]),
+        entry["std"],
+        entry["flag"] or "",
+    )
+    target_std = target.std * (abs(estimated_value) if target.relative else 1.0)
     return TargetEstimate(
-        *of, value, inf if doubt or std is None else float(std), target_std, doubt
+        *quantity_and_mode,
+        estimated_value,
+        inf if doubt_text or estimated_std is None else float(estimated_std),
+        target_std,
+        doubt_text,
     )
 
 
@@ -132,12 +148,16 @@ def beam_estimate(
     `uniformity` is the relative standard deviation of each mode's frequency from the frequency of a
     uniform beam. If all targets are modal, the parameters are those of the modal model.
     """
-    names, noise = document["covariance"]["names"], document["noise"]
-    estimate = BeamEstimate.from_dict({**document["plant"], "names": names, "noise": noise})
+    parameter_names, noise_document = document["covariance"]["names"], document["noise"]
+    estimated_beam = BeamEstimate.from_dict(
+        {**document["plant"], "names": parameter_names, "noise": noise_document}
+    )
     if uniformity and all(target.quantity in _MODAL_QUANTITY_KEYS for target in targets):
-        return estimate.modal()
+        return estimated_beam.modal()
     # The tolerance is wider if the modes deviate by more than the stated uniformity.
-    return estimate.with_tolerance(max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0))
+    return estimated_beam.with_tolerance(
+        max(uniformity, (document["uniformity_percent"] or 0.0) / 100.0)
+    )
 
 
 # The search
@@ -209,44 +229,50 @@ class ExcitationPlanner:
         segment was available in time. `held_ticks_before` of these precede the segment that began
         last.
         """
-        last = self._intervals[-1]
-        last.record_tick = last.reference_tick + held_ticks_before
+        last_interval = self._intervals[-1]
+        last_interval.record_tick = last_interval.reference_tick + held_ticks_before
         self._has_full_fit |= self.may_be_last
         if document["problem"] or "plant" not in document:
-            problem = document["problem"] or "Nothing could be fitted."
+            problem_text = document["problem"] or "Nothing could be fitted."
             if self._column_names:
                 # Earlier fits succeeded: the record now has a gap, or the sensor is stuck.
-                yield self._end_message(f"Given up: {problem}", reached=False)
+                yield self._end_message(f"Given up: {problem_text}", reached=False)
             else:
-                yield from self._repeat_scan(problem, held_ticks)
+                yield from self._repeat_scan(problem_text, held_ticks)
             return
         estimates = target_estimates(document, self._targets)
         time_s = document["tick"] / self._rate_hz
-        self._forecast.add(time_s, max(each.ratio for each in estimates))
-        doubt = document["doubt"] or ""
+        self._forecast.add(time_s, max(flagged_estimate.ratio for flagged_estimate in estimates))
+        doubt_text = document["doubt"] or ""
         # A doubt from the structure with most parameters is first checked with all structures.
         yield self._report_message(
-            document, estimates, time_s, quietly=bool(doubt) and not self.may_be_last
+            document, estimates, time_s, without_table_row=bool(doubt_text) and not self.may_be_last
         )
-        if self.may_be_last and all(each.ratio <= 1.0 for each in estimates):
+        if self.may_be_last and all(
+            flagged_estimate.ratio <= 1.0 for flagged_estimate in estimates
+        ):
             yield self._end_message(f"Reached: {estimates_text(estimates)}.", reached=True)
             return
         if self.may_be_last:
-            flagged_estimates = [each for each in estimates if each.doubt not in ("", _NOT_VISIBLE)]
-            if flagged_estimates and last.name == "pause" and not doubt:
+            flagged_estimates = [
+                flagged_estimate
+                for flagged_estimate in estimates
+                if flagged_estimate.doubt not in ("", _NOT_VISIBLE)
+            ]
+            if flagged_estimates and last_interval.name == "pause" and not doubt_text:
                 # The plan is fulfilled, but the estimate is flagged as no property of the antenna.
-                doubt = f"{flagged_estimates[0].name}: {flagged_estimates[0].doubt}"
+                doubt_text = f"{flagged_estimates[0].name}: {flagged_estimates[0].doubt}"
                 self._tightening *= _TIGHTENING_FACTOR
-            self._doubtful_count = self._doubtful_count + 1 if doubt else 0
+            self._doubtful_count = self._doubtful_count + 1 if doubt_text else 0
         if self._doubtful_count >= _MAX_DOUBTFUL_FITS:
-            findings = " ".join(document["findings"])
-            reason = f"The record is doubtful: {doubt}. {findings} Take a chirp."
-            yield self._end_message(reason.replace("  ", " "), reached=False)
+            findings_text = " ".join(document["findings"])
+            rescan_reason = f"The record is doubtful: {doubt_text}. {findings_text} Take a chirp."
+            yield self._end_message(rescan_reason.replace("  ", " "), reached=False)
             return
         try:
             estimate = beam_estimate(document, self._targets, self._uniformity)
             yield from self._plan_segment_or_pause(
-                estimate, document["tick"], estimates, held_ticks, doubt
+                estimate, document["tick"], estimates, held_ticks, doubt_text
             )
         except (RigdError, ArithmeticError, ValueError) as error:
             # The estimate is too inaccurate for planning.
@@ -264,19 +290,21 @@ class ExcitationPlanner:
             and self.due_tick is not None
         )
 
-    def has_last_segment_begun(self, begun: int) -> bool:
+    def has_last_segment_begun(self, begun_until_tick: int) -> bool:
         """Return whether the last planned segment has begun, so that its record tick is known.
 
-        `begun` is the tick of the reference at which the segment that began last ends, or 0 if none
-        has begun.
+        `begun_until_tick` is the tick of the reference at which the segment that began last
+        ends, or 0 if none has begun.
         """
-        return len(self._intervals) == 1 or begun > self._intervals[-1].reference_tick
+        return len(self._intervals) == 1 or begun_until_tick > self._intervals[-1].reference_tick
 
-    def end_of_record(self, ticks: int, held_ticks_before: int, begun: int) -> SearchEnded:
+    def end_of_record(
+        self, ticks: int, held_ticks_before: int, begun_until_tick: int
+    ) -> SearchEnded:
         """Return the message that ends the search after a record of `ticks` ticks has ended."""
-        if self.has_last_segment_begun(begun):
-            last = self._intervals[-1]
-            last.record_tick = last.reference_tick + held_ticks_before
+        if self.has_last_segment_begun(begun_until_tick):
+            last_interval = self._intervals[-1]
+            last_interval.record_tick = last_interval.reference_tick + held_ticks_before
         else:
             self._intervals.pop()
         return self._end_message(
@@ -291,10 +319,10 @@ class ExcitationPlanner:
     def _plan_segment_or_pause(
         self,
         estimate: BeamEstimate,
-        tick: int,
+        record_tick: int,
         estimates: Sequence[TargetEstimate],
         held_ticks: int,
-        doubt: str,
+        doubt_text: str,
     ) -> Iterator[object]:
         """Append the next segment, or a pause if the planned segments are expected to suffice."""
         reference_rad = self._reference_rad(held_ticks)
@@ -307,56 +335,78 @@ class ExcitationPlanner:
             else:
                 self._append_pause(min(PAUSE_S, remaining_s))
             return
-        plant = self._preview.plant_with(estimate.loaded_beam)
-        angle_rad = plant.respond(reference_rad).angle_rad
-        segment = next_segment(
+        move_plant = self._preview.plant_with(estimate.loaded_beam)
+        angle_rad = move_plant.respond(reference_rad).angle_rad
+        next_planned_segment = next_segment(
             estimate,
             angle_rad,
-            self._corrected_targets(estimate, angle_rad[:tick], estimates),
+            self._corrected_targets(estimate, angle_rad[:record_tick], estimates),
             self._preview,
             remaining_s - PAUSE_S,
             tip_slope_rad=self._tip_slope_rad,
             through=self._modes_to_excite(estimates),
         )
-        if not self.may_be_last and all(each.ratio <= _SUFFICIENT_RATIO for each in segment.now):
+        if not self.may_be_last and all(
+            target_forecast.ratio <= _SUFFICIENT_RATIO
+            for target_forecast in next_planned_segment.now
+        ):
             self._append_pause(PAUSE_S)
             return
-        impossible_reasons = [f"{each.impossible}." for each in segment.now if each.impossible]
+        impossible_reasons = [
+            f"{target_forecast.impossible}."
+            for target_forecast in next_planned_segment.now
+            if target_forecast.impossible
+        ]
         # Two forecasts: from the information of possible segments, and from the progress so far.
-        is_too_slow = segment.forecast.seconds > _UNREACHABLE_TIME_RATIO * remaining_s
-        reason = (
+        is_too_slow = next_planned_segment.forecast.seconds > _UNREACHABLE_TIME_RATIO * remaining_s
+        unreachable_reason = (
             impossible_reasons[0]
             if impossible_reasons
             else is_too_slow and self._forecast.unreachable_reason(remaining_s)
         )
-        self._unreachable_count = self._unreachable_count + 1 if reason else 0
+        self._unreachable_count = self._unreachable_count + 1 if unreachable_reason else 0
         if self._unreachable_count >= _MAX_UNREACHABLE_FORECASTS:
-            yield self._end_message(f"Out of reach: {reason}", reached=False)
+            yield self._end_message(f"Out of reach: {unreachable_reason}", reached=False)
             return
         self._segment_count += 1
-        self._append(f"piece_{self._segment_count}", segment.reference_rad)
+        self._append(f"piece_{self._segment_count}", next_planned_segment.reference_rad)
         self.due_tick = self._intervals[-1].reference_tick
         # Another structure, such as a compliant clamp, may fit where a uniform beam does not.
-        self.may_be_last = bool(doubt) and not self.may_be_last
-        yield PlannedSegment(segment.name, self._expectation_document(segment, estimates))
+        self.may_be_last = bool(doubt_text) and not self.may_be_last
+        yield PlannedSegment(
+            next_planned_segment.name, self._expectation_document(next_planned_segment, estimates)
+        )
 
     def _corrected_targets(
         self, estimate: BeamEstimate, angle_rad: Real, estimates: Sequence[TargetEstimate]
     ) -> list[Target]:
-        """Return the requested deviations with which the next segment is designed.
+        """Return the requested standard deviations with which the next segment is designed.
 
         The design predicts standard deviations of the beam model, but a fit reports those of the
         modal model. Each requested deviation is therefore divided by the ratio of reported to
         predicted deviation for the record so far.
         """
-        std_by_name = {each.name: each.std for each in estimates}
-        corrected = []
-        for each in expected_precisions(angle_rad, estimate, self._targets, self._rate_hz):
-            factor = std_by_name.get(each.target.name, inf) / max(each.std, 1e-300)
-            factor = float(np.clip(factor, *_CORRECTION_FACTOR_RANGE)) if isfinite(factor) else 1.0
-            self._correction_factors[each.target.name] = factor
-            corrected.append(replace(each.target, std=self._tightening * each.target.std / factor))
-        return corrected
+        std_by_name = {target_estimate.name: target_estimate.std for target_estimate in estimates}
+        corrected_targets = []
+        for target_estimate in expected_precisions(
+            angle_rad, estimate, self._targets, self._rate_hz
+        ):
+            correction_factor = std_by_name.get(target_estimate.target.name, inf) / max(
+                target_estimate.std, 1e-300
+            )
+            correction_factor = (
+                float(np.clip(correction_factor, *_CORRECTION_FACTOR_RANGE))
+                if isfinite(correction_factor)
+                else 1.0
+            )
+            self._correction_factors[target_estimate.target.name] = correction_factor
+            corrected_targets.append(
+                replace(
+                    target_estimate.target,
+                    std=self._tightening * target_estimate.target.std / correction_factor,
+                )
+            )
+        return corrected_targets
 
     def _modes_to_excite(self, estimates: Sequence[TargetEstimate]) -> list[int]:
         """Return the numbers of modes that the next segment must excite, since none shows so far.
@@ -365,14 +415,18 @@ class ExcitationPlanner:
         the record requires that the mode itself is visible. Only every second segment is bound to
         excite such modes.
         """
-        unseen_modes = [each.mode for each in estimates if each.doubt == _NOT_VISIBLE and each.mode]
+        unseen_modes = [
+            target_estimate.mode
+            for target_estimate in estimates
+            if target_estimate.doubt == _NOT_VISIBLE and target_estimate.mode
+        ]
         self._excites_unseen_modes = (
             bool(unseen_modes) and self._segment_count > 0 and not self._excites_unseen_modes
         )
         return unseen_modes if self._excites_unseen_modes else []
 
     def _repeat_scan(self, reason: str, held_ticks: int) -> Iterator[object]:
-        """Append the scan again after an unusable estimate, or end the search.
+        """Append the first chirp, the scan, again after an unusable estimate, or end the search.
 
         Yields the message for the supervisor. `reason` states why the estimate is unusable.
         """
@@ -386,7 +440,7 @@ class ExcitationPlanner:
         yield PlannedSegment("the scan once more", {"why": reason})
 
     def _append_scan(self, name: str, held_ticks: int) -> bool:
-        """Append the first scan under another name; return whether enough time was left."""
+        """Append the first chirp again as segment `name`; return whether enough time was left."""
         scan_rad = self._intervals[0].reference_rad
         if self._max_ticks - self._writer.ticks - held_ticks < scan_rad.size:
             return False
@@ -401,15 +455,17 @@ class ExcitationPlanner:
 
     def _append(self, name: str, reference_rad: Real) -> None:
         """Append a named segment to the reference that the control loop reads."""
-        tick = self._writer.ticks
-        self._intervals.append(_PlannedInterval(name, reference_rad, tick, tick))
+        first_tick = self._writer.ticks
+        self._intervals.append(_PlannedInterval(name, reference_rad, first_tick, first_tick))
         self._writer.append(reference_rad)
 
     def _reference_rad(self, held_ticks: int) -> Real:
         """Return the reference angle (n,) in the record up to the end of the last segment."""
         reference_rad = np.zeros(self._writer.ticks + held_ticks)
-        for each in self._intervals:
-            reference_rad[each.record_tick : each.record_tick + each.size] = each.reference_rad
+        for interval in self._intervals:
+            reference_rad[interval.record_tick : interval.record_tick + interval.size] = (
+                interval.reference_rad
+            )
         return reference_rad
 
     def _report_message(
@@ -418,33 +474,37 @@ class ExcitationPlanner:
         estimates: Sequence[TargetEstimate],
         time_s: float,
         *,
-        quietly: bool,
+        without_table_row: bool,
     ) -> FitReport:
         """Return the message that reports an estimate, with a row of the printed table.
 
-        The row is left out if `quietly` is True.
+        The row is left out if `without_table_row` is True.
         """
         search_document = {"left_s": self._forecast.remaining_s, "targets": targets_json(estimates)}
         validity = Validity.of_document(document.get("validity"))
-        text = [] if quietly else self._table_rows(estimates, time_s, validity)
-        return FitReport({**document, "search": search_document, "text": text})
+        table_rows = [] if without_table_row else self._table_rows(estimates, time_s, validity)
+        return FitReport({**document, "search": search_document, "text": table_rows})
 
     def _table_rows(
         self, estimates: Sequence[TargetEstimate], time_s: float, validity: Validity
     ) -> list[str]:
         """Return the next row of the printed table, after a heading if its columns changed."""
-        rows = []
-        column_names = [each.name for each in estimates]
+        table_rows = []
+        column_names = [target_estimate.name for target_estimate in estimates]
         if column_names != self._column_names:
             self._column_names = column_names
-            headings = "".join(f"{name:<{_COLUMN_WIDTH}}" for name in column_names)
-            note = f"± one standard deviation; tip slope {validity.short}"
-            rows.append(f"  time  {headings}left   ({note})")
+            heading_text = "".join(
+                f"{column_name:<{_COLUMN_WIDTH}}" for column_name in column_names
+            )
+            heading_note = f"± one standard deviation; tip slope {validity.short}"
+            table_rows.append(f"  time  {heading_text}left   ({heading_note})")
         remaining_s = self._forecast.remaining_s
-        cells = "".join(f"{_cell_text(each):<{_COLUMN_WIDTH}}" for each in estimates)
+        row_text = "".join(
+            f"{_cell_text(target_estimate):<{_COLUMN_WIDTH}}" for target_estimate in estimates
+        )
         return [
-            *rows,
-            f"{time_s:5.1f} s {cells}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
+            *table_rows,
+            f"{time_s:5.1f} s {row_text}{'' if remaining_s is None else f'{remaining_s:.0f} s'}",
         ]
 
     def targets_document(self, document: Mapping[str, Any]) -> dict[str, Any]:
@@ -454,20 +514,25 @@ class ExcitationPlanner:
     def _expectation_document(
         self, segment: Segment, estimates: Sequence[TargetEstimate]
     ) -> dict[str, Any]:
-        """Return the expected precision after a segment, and the present one, for JSON."""
+        """Return the present standard deviations, and those expected after a segment, for JSON."""
         return {
             "duration_s": segment.reference_rad.size / self._rate_hz,
-            "stated": {each.name: each.std for each in estimates if isfinite(each.std)},
+            "stated": {
+                target_forecast.name: target_forecast.std
+                for target_forecast in estimates
+                if isfinite(target_forecast.std)
+            },
             "expected": [
                 {
-                    "name": each.target.name,
-                    "std": self._correction_factors[each.target.name] * each.std,
-                    "asked_std": self._correction_factors[each.target.name]
-                    * each.target_std
+                    "name": target_forecast.target.name,
+                    "std": self._correction_factors[target_forecast.target.name]
+                    * target_forecast.std,
+                    "asked_std": self._correction_factors[target_forecast.target.name]
+                    * target_forecast.target_std
                     / self._tightening,
                 }
-                for each in segment.expected
-                if isfinite(each.std)
+                for target_forecast in segment.expected
+                if isfinite(target_forecast.std)
             ],
             "share_of_limits": segment.fraction_of_limits,
             "left_s": self._forecast.remaining_s,
@@ -476,28 +541,28 @@ class ExcitationPlanner:
     def _end_message(self, reason: str, *, reached: bool) -> SearchEnded:
         """Return the message that ends the search with the planned segments."""
         self.due_tick = None
-        segments = {
-            each.name: (each.record_tick, each.record_tick + each.size)
-            for each in self._intervals
-            if each.name != "pause"
+        segment_ticks = {
+            interval.name: (interval.record_tick, interval.record_tick + interval.size)
+            for interval in self._intervals
+            if interval.name != "pause"
         }
-        segments["sweep"] = (self._intervals[0].record_tick, self._max_ticks)
-        return SearchEnded(reached, reason, segments)
+        segment_ticks["sweep"] = (self._intervals[0].record_tick, self._max_ticks)
+        return SearchEnded(reached, reason, segment_ticks)
 
 
 class _TimeForecast:
     """Forecast of the time until the requested precision is reached.
 
-    It extrapolates the largest ratio of reported to requested deviation. The inverse square of this
-    ratio is proportional to the information, which grows linearly with time under the most
-    informative excitation.
+    It extrapolates the largest ratio of reported to requested standard deviation. The inverse
+    square of this ratio is proportional to the information, which grows linearly with time under
+    the most informative excitation.
     """
 
     def __init__(self) -> None:
         self._information_at_times: list[tuple[float, float]] = []
 
     def add(self, time_s: float, ratio: float) -> None:
-        """Add the ratio of reported to requested deviation at a time of the record."""
+        """Add the ratio of reported to requested standard deviation at a time of the record."""
         if isfinite(ratio):
             self._information_at_times.append((time_s, ratio**-2))
 
@@ -532,50 +597,53 @@ class _TimeForecast:
         if required_s is None or required_s <= _UNREACHABLE_TIME_RATIO * available_s:
             return ""
         now_s, present_information = self._information_at_times[-1]
-        ratio = (
+        reachable_ratio = (
             present_information + (1.0 - present_information) * available_s / required_s
         ) ** -0.5
         return (
             f"it would take about {required_s:.0f} s more, and the {available_s:.0f} s that are "
-            f"left will do for {ratio:.2g} times the deviation asked for. Ask for that, or give "
-            f"--at-most {1.2 * (now_s + required_s):.0f}."
+            f"left will do for {reachable_ratio:.2g} times the deviation asked for. Ask for "
+            f"that, or give --at-most {1.2 * (now_s + required_s):.0f}."
         )
 
 
-def _cell_text(each: TargetEstimate) -> str:
+def _cell_text(estimate: TargetEstimate) -> str:
     """Return the text of a table cell with an estimate; damping ratios are in percent."""
-    if each.value is None or each.doubt:
-        return each.doubt if each.doubt == _NOT_VISIBLE else "doubtful"
-    scale, unit = (100.0, " %") if each.name.startswith("damping") else (1.0, "")
-    half = scale * each.std
-    return f"{with_half_width(scale * each.value, (-half, half))}{unit}"
+    if estimate.value is None or estimate.doubt:
+        return estimate.doubt if estimate.doubt == _NOT_VISIBLE else "doubtful"
+    display_scale, unit_text = (100.0, " %") if estimate.name.startswith("damping") else (1.0, "")
+    scaled_std = display_scale * estimate.std
+    return (
+        f"{with_half_width(display_scale * estimate.value, (-scaled_std, scaled_std))}{unit_text}"
+    )
 
 
 def targets_json(estimates: Sequence[TargetEstimate]) -> list[dict[str, Any]]:
     """Return the estimates of requested quantities as a list of dictionaries for JSON."""
     return [
         {
-            "name": each.name,
-            "quantity": each.quantity,
-            "mode": each.mode,
-            "value": each.value,
-            "std": each.std if isfinite(each.std) else None,
-            "asked_std": each.target_std if isfinite(each.target_std) else None,
-            "doubt": each.doubt,
+            "name": estimate.name,
+            "quantity": estimate.quantity,
+            "mode": estimate.mode,
+            "value": estimate.value,
+            "std": estimate.std if isfinite(estimate.std) else None,
+            "asked_std": estimate.target_std if isfinite(estimate.target_std) else None,
+            "doubt": estimate.doubt,
         }
-        for each in estimates
+        for estimate in estimates
     ]
 
 
 def estimates_text(estimates: Sequence[TargetEstimate]) -> str:
     """Return one line of text with the estimates and their standard deviations."""
-    return ", ".join(_estimate_text(each) for each in estimates)
+    return ", ".join(_estimate_text(estimate) for estimate in estimates)
 
 
-def _estimate_text(each: TargetEstimate) -> str:
-    """Return text with one estimate and its standard deviation, or with its doubt."""
-    if each.value is None or each.doubt:
-        return f"{each.name}: {each.doubt}"
+def _estimate_text(estimate: TargetEstimate) -> str:
+    """Return text with one estimate and its standard deviation, or why it is doubtful."""
+    if estimate.value is None or estimate.doubt:
+        return f"{estimate.name}: {estimate.doubt}"
     return (
-        f"{each.name} {each.value:.5g}, standard deviation {with_percentage(each.std, each.value)}"
+        f"{estimate.name} {estimate.value:.5g}, standard deviation "
+        f"{with_percentage(estimate.std, estimate.value)}"
     )

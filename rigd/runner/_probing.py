@@ -54,13 +54,17 @@ class ProbeResult:
 
     def as_metadata(self) -> dict[str, str]:
         """Return the probing move's result as metadata of a session file."""
-        numbers = self.estimate.as_dict()
-        return {f"probe_{key}": repr(numbers[key]) for key in numbers if numbers[key] is not None}
+        estimate_values = self.estimate.as_dict()
+        return {
+            f"probe_{key}": repr(estimate_values[key])
+            for key in estimate_values
+            if estimate_values[key] is not None
+        }
 
     def lines(self, profile: Profile) -> list[str]:
         """Return lines of text that report the probing move's result to the operator."""
         estimate = self.estimate
-        rows = (
+        ratio_rows = (
             ("coupling torque over the beam's at the measured angle", estimate.coupling_ratio,
              estimate.coupling_std),
             ("torque of the motor over the torque commanded", estimate.torque_ratio,
@@ -68,17 +72,19 @@ class ProbeResult:
             ("inertia of the motor over motor.inertia_kg_m2", estimate.inertia_ratio,
              estimate.inertia_std),
         )  # fmt: skip
-        lines = [
-            f"{title}: not known" if ratio is None else f"{title}: {ratio:.2f} ± {std:.2f}"
-            for title, ratio, std in rows
+        report_lines = [
+            f"{ratio_title}: not known"
+            if measured_ratio is None
+            else f"{ratio_title}: {measured_ratio:.2f} ± {std:.2f}"
+            for ratio_title, measured_ratio, std in ratio_rows
         ]
         if estimate.coulomb_nm is not None:
             stated_nm = profile.rig.motor.coulomb_nm
-            lines.append(
+            report_lines.append(
                 f"Coulomb friction: {estimate.coulomb_nm:.3f} N·m (motor.coulomb_nm: {stated_nm:g})"
             )
-        travel = f"{estimate.travel_rad:.2g} rad, {estimate.speed_rad_s:.2g} rad/s"
-        return [*lines, f"travel and speed, as measured: {travel}"]
+        travel_text = f"{estimate.travel_rad:.2g} rad, {estimate.speed_rad_s:.2g} rad/s"
+        return [*report_lines, f"travel and speed, as measured: {travel_text}"]
 
 
 def verify_by_probing(
@@ -97,17 +103,17 @@ def verify_by_probing(
     """
     if _is_identified(profile) or _is_simulated_with_profile(profile):
         return None
-    result = read_stored_result(profile, rig)
-    if result is None or result.contradiction(profile, motor=motor):
+    probe_result = read_stored_result(profile, rig)
+    if probe_result is None or probe_result.contradiction(profile, motor=motor):
         report("info", probing_announcement(profile))
-        result = run_probing_move(profile, rig, stop)
-        contradiction_text = result.contradiction(profile, motor=motor)
+        probe_result = run_probing_move(profile, rig, stop)
+        contradiction_text = probe_result.contradiction(profile, motor=motor)
         if contradiction_text:
             raise ProbeFailedError(contradiction_text)
-        report("info", f"Probing move passed: {'; '.join(result.lines(profile))}.")
-    for warning in doubts(result.estimate):
-        report("warning", warning)
-    return result
+        report("info", f"Probing move passed: {'; '.join(probe_result.lines(profile))}.")
+    for warning_text in doubts(probe_result.estimate):
+        report("warning", warning_text)
+    return probe_result
 
 
 def _is_identified(profile: Profile) -> bool:
@@ -123,30 +129,38 @@ def _is_simulated_with_profile(profile: Profile) -> bool:
     if simulator is None:
         return False
     profile_values = _verified_values(described(profile.rig))
-    return all(simulator.rig.get(key) == value for key, value in profile_values.items())
+    return all(
+        simulator.rig.get(key) == profile_value for key, profile_value in profile_values.items()
+    )
 
 
 def probing_announcement(profile: Profile) -> str:
     """Return a sentence for the operator that announces the motion of a probing move."""
-    plan = plan_probe(probed_rig(profile))
+    probe_plan = plan_probe(probed_rig(profile))
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
-        f"{plan.travel_rad:.2g} rad to one side and back at {plan.speed_rad_s:.2g} and "
-        f"{plan.fast_rad_s:.2g} rad/s, at most {plan.torque_limit_nm:.2g} N·m."
+        f"{probe_plan.travel_rad:.2g} rad to one side and back at {probe_plan.speed_rad_s:.2g} and "
+        f"{probe_plan.fast_rad_s:.2g} rad/s, at most {probe_plan.torque_limit_nm:.2g} N·m."
     )
 
 
 def run_probing_move(profile: Profile, rig: Rig, stop: StopRequest) -> ProbeResult:
     """Make a probing move on a connected rig, and store its result."""
-    result = _result_of_document(rig.probe(profile, stop))
-    document = {"key": _validity_key(profile, rig), "boot": _boot_id(), "end": result.end.name}
-    path = _result_path(profile)
+    probe_result = _result_of_document(rig.probe(profile, stop))
+    result_document = {
+        "key": _validity_key(profile, rig),
+        "boot": _boot_id(),
+        "end": probe_result.end.name,
+    }
+    result_path = _result_path(profile)
     with contextlib.suppress(OSError):
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        new_path = path.with_suffix(".new")
-        new_path.write_text(json.dumps(document | result.estimate.as_dict()), encoding="utf-8")
-        new_path.replace(path)
-    return result
+        result_path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        temporary_path = result_path.with_suffix(".new")
+        temporary_path.write_text(
+            json.dumps(result_document | probe_result.estimate.as_dict()), encoding="utf-8"
+        )
+        temporary_path.replace(result_path)
+    return probe_result
 
 
 def probe_in_foreground(
@@ -156,7 +170,7 @@ def probe_in_foreground(
     profile_name: str,
     fast: bool,
     hardware: bool,
-    says: Callable[[str], None],
+    report_line: Callable[[str], None],
 ) -> tuple[Profile, ProbeResult]:
     """Make a probing move for `rigd probe`, even if motor and encoder were measured.
 
@@ -186,39 +200,46 @@ def probe_in_foreground(
         If the rig cannot be connected, or the move is stopped or ended by an interlock.
     """
     with contextlib.ExitStack() as locks, group:
-        profile, target = load_rig(profile_name, fast=fast, hardware=hardware)
-        says(describe_actuation_target(profile.rig, target))
-        is_exclusive = not (fast and target is ActuationTarget.SIMULATED)
-        is_hardware = target is ActuationTarget.HARDWARE
+        profile, actuation_target = load_rig(profile_name, fast=fast, hardware=hardware)
+        report_line(describe_actuation_target(profile.rig, actuation_target))
+        is_exclusive = not (fast and actuation_target is ActuationTarget.SIMULATED)
+        is_hardware = actuation_target is ActuationTarget.HARDWARE
         locks.enter_context(
-            RigLock(profile.name, "rigd probe", hardware=is_hardware, alone=is_exclusive)
+            RigLock(profile.name, "rigd probe", hardware=is_hardware, exclusive=is_exclusive)
         )
         rig = Rig(profile, fast=fast, group=group)
-        rig.connect(target)
-        says(probing_announcement(profile))
+        rig.connect(actuation_target)
+        report_line(probing_announcement(profile))
         return profile, run_probing_move(profile, rig, stop)
 
 
 def read_stored_result(profile: Profile, rig: Rig) -> ProbeResult | None:
     """Return the stored result of the last probing move, or None if there is no valid one."""
     try:
-        document = json.loads(_result_path(profile).read_text("utf-8"))
-        if document.pop("key") != _validity_key(profile, rig) or document.pop("boot") != _boot_id():
+        stored_document = json.loads(_result_path(profile).read_text("utf-8"))
+        if (
+            stored_document.pop("key") != _validity_key(profile, rig)
+            or stored_document.pop("boot") != _boot_id()
+        ):
             return None
-        return _result_of_document(document)
+        return _result_of_document(stored_document)
     except (OSError, ValueError, TypeError, KeyError, AttributeError):
         return None
 
 
 def _result_of_document(document: Mapping[str, Any]) -> ProbeResult:
     """Return the result of a probing move from its document."""
-    estimate_fields = {key: value for key, value in document.items() if key != "end"}
+    estimate_fields = {key: field_value for key, field_value in document.items() if key != "end"}
     return ProbeResult(ProbeEnd[document["end"]], ProbeEstimate(**estimate_fields))
 
 
-def _verified_values(values: Mapping[str, object]) -> dict[str, object]:
+def _verified_values(profile_values: Mapping[str, object]) -> dict[str, object]:
     """Return those values of a profile that a probing move verifies."""
-    return {key: value for key, value in values.items() if key.startswith(_VERIFIED_KEY_PREFIXES)}
+    return {
+        key: profile_value
+        for key, profile_value in profile_values.items()
+        if key.startswith(_VERIFIED_KEY_PREFIXES)
+    }
 
 
 def _validity_key(profile: Profile, rig: Rig) -> str:

@@ -71,9 +71,9 @@ class ProcessGroup:
         Processor cores for processes that are started later, or empty for those of this process.
     """
 
-    def __init__(self, *, live: bool, also: Collection[Process] = ()) -> None:
+    def __init__(self, *, live: bool, extra_processes: Collection[Process] = ()) -> None:
         self.live = live
-        self._also = frozenset(also)
+        self._also = frozenset(extra_processes)
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
@@ -82,8 +82,8 @@ class ProcessGroup:
         try:
             while len(self._fds) < _SHARED_MEMORY_FILES:
                 self._fds.append(shared_memory_fd())
-            wanted = {CONTROL, RECORDER, *self._also} | ({LIVE} if live else set())
-            for process in (process for process in PROCESSES if process in wanted):
+            wanted_processes = {CONTROL, RECORDER, *self._also} | ({LIVE} if live else set())
+            for process in (process for process in PROCESSES if process in wanted_processes):
                 self._start(process)
         except (OSError, ChildError):
             self.end()
@@ -182,10 +182,10 @@ class ProcessGroup:
         """End all processes and release the shared memory; may be called repeatedly."""
         if self._channels is not None:
             self._channels.ask_to_stop()
-        with contextlib.ExitStack() as ending:  # continues after an error of one process
+        with contextlib.ExitStack() as ending_children:  # continues after an error of one process
             for process in reversed(PROCESSES):
                 if process in self._children:
-                    ending.callback(self._children.pop(process).stop, process.grace_s)
+                    ending_children.callback(self._children.pop(process).stop, process.grace_s)
         if self._channels is not None:
             self._channels.close()
             self._channels = None

@@ -175,7 +175,7 @@ class Rig:
         self,
         order: Order,
         stop: StopRequest,
-        watcher: ProgressCallback,
+        on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
     ) -> RunResult:
         """Run one session to its end, and return its result.
@@ -207,20 +207,22 @@ class Rig:
             self._precedence.cover()
         _reset_session_fields(group.channels.shared_state)
         group.channels.clear()
-        session = SessionRun(order, group, self._connection, self._view, watcher, can_receive_stop)
-        outcome = reason = ""
+        session_run = SessionRun(
+            order, group, self._connection, self._view, on_progress, can_receive_stop
+        )
+        end_outcome = end_reason = ""
         try:
-            result = replace(session.run(stop), hardware=not self.simulated)
-            outcome, reason = result.outcome, result.reason
-            return result
+            run_result = replace(session_run.run(stop), hardware=not self.simulated)
+            end_outcome, end_reason = run_result.outcome, run_result.reason
+            return run_result
         except SessionFailedError as error:
             error.hardware = not self.simulated
-            outcome, reason = "fault", str(error)
+            end_outcome, end_reason = "fault", str(error)
             raise
         finally:
             if self._view is not None:
-                self._view.finish(outcome, reason)
-            if session.device_failed:
+                self._view.finish(end_outcome, end_reason)
+            if session_run.device_failed:
                 self._await_closed_devices()
             # Collected between sessions: remaining objects of a session would fragment the memory,
             # and a long series would take 4 kB more for each session.
@@ -273,9 +275,9 @@ class Rig:
         RigError
             If the motor moves.
         """
-        reply = self._measure(Zero(), 0.0)
+        zero_reply = self._measure(Zero(), 0.0)
         self._is_zero_set, self.zero_lost = True, False
-        return reply
+        return zero_reply
 
     def probe(self, profile: Profile, stop: StopRequest) -> dict[str, Any]:
         """Make the probing move, which estimates friction and the scales of motor and sensors.
@@ -312,17 +314,17 @@ class Rig:
             request_stop()
         try:
             group.control.send(Probe(profile))
-            reply = self._await_probe(group, profile)
+            probe_reply = self._await_probe(group, profile)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
         finally:
             stop.on_request = _ignore_stop_request
             _reset_session_fields(shared_state)
-        if isinstance(reply, Refused):
-            raise RigError(reply.reason)
-        assert isinstance(reply, Measured)
-        return reply.values
+        if isinstance(probe_reply, Refused):
+            raise RigError(probe_reply.reason)
+        assert isinstance(probe_reply, Measured)
+        return probe_reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
         """Monitor the control process until it sends the result of a probing move, return that.
@@ -336,17 +338,17 @@ class Rig:
             if self._fast
             else CONTROL.hung_after_s + _ENABLE_TIMEOUT_S
         )
-        until_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
+        deadline_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
-            reply = group.control.poll(_POLL_S)
+            probe_reply = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            if isinstance(reply, Ended):
-                raise RigError(reply.reason or "It was stopped.")
-            if reply is not None:
-                return reply
+            if isinstance(probe_reply, Ended):
+                raise RigError(probe_reply.reason or "It was stopped.")
+            if probe_reply is not None:
+                return probe_reply
             now_s = time.monotonic()
             stalled_s = heartbeat.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
-            if stalled_s > hung_after_s or now_s > until_s:
+            if stalled_s > hung_after_s or now_s > deadline_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -366,33 +368,33 @@ class Rig:
         if self._view is not None:
             self._view.check()
         try:
-            message = group.control.poll(0.0)
+            control_message = group.control.poll(0.0)
         except ChildError as error:
-            message = Ended(str(error))
+            control_message = Ended(str(error))
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
         stalled_s = self._heartbeat.stalled_for(
             shared_state[StateField.CONTROL_BEAT], time.monotonic()
         )
-        if message is None and stalled_s > CONTROL.hung_after_s:
+        if control_message is None and stalled_s > CONTROL.hung_after_s:
             group.control.kill()
-            message = Ended(
+            control_message = Ended(
                 f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
             )
-        if message is not None:
+        if control_message is not None:
             self.disconnect()
-            reason = message.reason if isinstance(message, Ended) else ""
-            raise RigError(reason or "The control process was asked to end.")
+            loss_reason = control_message.reason if isinstance(control_message, Ended) else ""
+            raise RigError(loss_reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
         """Return the rig's present status, or None without connection; any thread may call this."""
         with self._status_lock:
-            group, view = self._group, self._view
+            group, live_view = self._group, self._view
             if group is None or not group.has_memory:
                 return None
-            address = None if view is None else view.address
-            return replace(self._status_reader.read(group), live_view=address)
+            view_address = None if live_view is None else live_view.address
+            return replace(self._status_reader.read(group), live_view=view_address)
 
     def signals(self) -> list[SignalBlock]:
         """Return the signals that were recorded since the last call; any thread may call this.
@@ -422,10 +424,13 @@ class Rig:
         """Raise the priority of this process, and return the granted settings as metadata."""
         if self._fast:
             return {}
-        realtime = self._profile.realtime
-        self._precedence = Precedence(realtime.supervision_priority, realtime.cpu)
+        realtime_settings = self._profile.realtime
+        self._precedence = Precedence(realtime_settings.supervision_priority, realtime_settings.cpu)
         group.cores = self._precedence.cores_before
-        return {f"supervisor_{name}": text for name, text in self._precedence.take().items()}
+        return {
+            f"supervisor_{setting_name}": setting_text
+            for setting_name, setting_text in self._precedence.take().items()
+        }
 
     def _reset_fault(self, target: ActuationTarget | None) -> None:
         """Reset the fault of the drive; raise RigError if that fails."""
@@ -442,22 +447,22 @@ class Rig:
             raise RigError("The rig is not connected.")
         return self._group
 
-    def _measure(self, order: Tare | Zero, duration_s: float) -> dict[str, Any]:
-        """Make the control process measure a tare or zero between sessions; return the result.
+    def _measure(self, measurement_order: Tare | Zero, duration_s: float) -> dict[str, Any]:
+        """Make the control process tare the sensor or set the zero; return the result.
 
         `duration_s` is the measuring time.
         """
         group = self._connected_group()
         try:
-            group.control.send(order)
-            reply = self._await_message(_MEASUREMENT_TIMEOUT_S + duration_s)
+            group.control.send(measurement_order)
+            measurement_reply = self._await_message(_MEASUREMENT_TIMEOUT_S + duration_s)
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if isinstance(reply, Refused):
-            raise RigError(reply.reason)
-        assert isinstance(reply, Measured)
-        return reply.values
+        if isinstance(measurement_reply, Refused):
+            raise RigError(measurement_reply.reason)
+        assert isinstance(measurement_reply, Measured)
+        return measurement_reply.values
 
     def _await_message(self, timeout_s: float) -> object:
         """Wait for a message of the control process, and return it.
@@ -466,15 +471,15 @@ class Rig:
         died.
         """
         assert self._group is not None
-        message = self._group.control.poll(timeout_s)
-        if message is None:
+        control_message = self._group.control.poll(timeout_s)
+        if control_message is None:
             raise RigError(
                 f"The control process does not answer within {timeout_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
-        if isinstance(message, Ended):
-            raise RigError(message.reason or "It was stopped.")
-        return message
+        if isinstance(control_message, Ended):
+            raise RigError(control_message.reason or "It was stopped.")
+        return control_message
 
     def _await_closed_devices(self) -> None:
         """Wait until the control process has closed all devices after one failed; disconnect."""

@@ -112,7 +112,9 @@ class Series:
         self._excitation = excitation
         self._folder = folder
         self._repeat = repeat
-        self._notes = {name: text for name, text in (notes or {}).items() if text}
+        self._notes = {
+            note_name: note_text for note_name, note_text in (notes or {}).items() if note_text
+        }
         check_required(profile, self._notes)
         if excitation.stays and repeat > 1:
             raise RefusedError(
@@ -182,21 +184,25 @@ class Series:
             if stop.requested and rig.connected:
                 return  # the probing move was stopped, and nothing failed
             raise
-        for number in range(1, self._repeat + 1):
-            if quick_looks is not None and number > 1:
+        for session_number in range(1, self._repeat + 1):
+            if quick_looks is not None and session_number > 1:
                 _await_quick_look(quick_looks, rig, stop)
             if stop.requested:
                 return
             self._require_disk_space()
             is_numbered = self._repeat > 1
-            path = choose_path(self._folder, self._excitation.kind, number if is_numbered else None)
-            notes = self._notes | ({"series": f"{number} of {self._repeat}"} if is_numbered else {})
-            watcher.on_start(number, path)
-            order = Order(
+            session_path = choose_path(
+                self._folder, self._excitation.kind, session_number if is_numbered else None
+            )
+            session_notes = self._notes | (
+                {"series": f"{session_number} of {self._repeat}"} if is_numbered else {}
+            )
+            watcher.on_start(session_number, session_path)
+            session_order = Order(
                 self._profile,
                 self._excitation,
-                path,
-                tuple(notes.items()),
+                session_path,
+                tuple(session_notes.items()),
                 tuple(
                     (
                         predicted_metadata(self._profile, self.plan.prediction, self._excitation)
@@ -206,22 +212,22 @@ class Series:
                 self.plan.ending,
                 self._touch,
                 self._watch_fit,
-                self._session_seed(number),
+                self._session_seed(session_number),
                 self.plan.clearance.accepted,
             )
             with contextlib.nullcontext() if quick_looks is None else quick_looks.suspended():
                 if live:
-                    watcher.on_live_view(rig.show(order, stop))
-                result = rig.run(order, stop, watcher.on_progress, can_receive_stop)
-            self.results.append(result)
+                    watcher.on_live_view(rig.show(session_order, stop))
+                run_result = rig.run(session_order, stop, watcher.on_progress, can_receive_stop)
+            self.results.append(run_result)
             # The record of a vibration-free move contains no information on the modes.
-            analysed_path = result.path if self._excitation.shows_modes else None
+            analysed_path = run_result.path if self._excitation.shows_modes else None
             watcher.on_result(
-                result, look_follows=quick_looks is not None and analysed_path is not None
+                run_result, look_follows=quick_looks is not None and analysed_path is not None
             )
             if quick_looks is not None and analysed_path is not None:
                 quick_looks.begin(analysed_path)
-            if not result.went_well:
+            if not run_result.went_well:
                 return
 
     def _session_seed(self, number: int) -> int | None:
@@ -242,10 +248,10 @@ class Series:
             return {}
         from rigd.runner import _probing  # late: a simulation in this process needs none
 
-        result = _probing.verify_by_probing(
+        probe_result = _probing.verify_by_probing(
             self._profile, rig, stop, watcher.on_message, motor=not self._identifies_motor
         )
-        return {} if result is None else result.as_metadata()
+        return {} if probe_result is None else probe_result.as_metadata()
 
     def _require_disk_space(self) -> None:
         """Raise NoRoomError if the disk lacks space for the next session."""

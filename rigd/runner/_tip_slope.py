@@ -98,8 +98,8 @@ def slope_remedy(excitation: Excitation, slope_rad: float, limit_rad: float) -> 
     """Return advice on how to change or allow a session beyond the limit of the tip slope."""
     factor_text = ""
     if excitation.kind == "file":
-        factor = _rounded_down(limit_rad / slope_rad)
-        factor_text = f" to {factor:g} of it" if factor > 0 else ""
+        amplitude_factor = _rounded_down(limit_rad / slope_rad)
+        factor_text = f" to {amplitude_factor:g} of it" if amplitude_factor > 0 else ""
     exemption_text = (
         f" (chirps of up to {PAPER_AMPLITUDE_RAD:g} rad, as in the reference paper, are exempt)"
         if excitation.kind == "chirp"
@@ -113,25 +113,25 @@ def tip_in_words(tip: TipMotion | None, beam: Beam, excitation: Excitation) -> s
     """Return text on the predicted tip motion and the linear model's error; "" without beam."""
     if tip is None:
         return ""
-    error = linear_model_error(tip.slope_rad)
+    linear_error = linear_model_error(tip.slope_rad)
     if not is_physical(tip, beam):
-        error_text = f"up to {100 * error:.2g}" if error < 1.0 else "above 100"
+        error_text = f"up to {100 * linear_error:.2g}" if linear_error < 1.0 else "above 100"
         motion_text = (
             f"Predicted tip slope: {tip.slope_rad:.2g} rad. The linear model does not hold there "
             f"(error {error_text} %): the predicted deflection is larger than the beam allows, and "
             "deflection and speed of the tip are not known"
         )
     else:
-        fraction = tip.deflection_m / beam.length_m
+        peak_fraction = tip.deflection_m / beam.length_m
         motion_text = (
-            f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * fraction:.2g} % of the "
-            f"length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
+            f"Predicted tip deflection: {tip.deflection_m:.3g} m ({100 * peak_fraction:.2g} % of "
+            f"the length), tip speed {tip.speed_m_s:.3g} m/s, slope {tip.slope_rad:.2g} rad."
         )
         if not tip.slope_rad > SMALL_SLOPE_RAD:
             return motion_text
         motion_text += (
             f" At slopes above {SMALL_SLOPE_RAD:g} rad the linear model is not exact (error at "
-            f"most {100 * error:.2g} %), and air drag may limit the motion"
+            f"most {100 * linear_error:.2g} %), and air drag may limit the motion"
         )
     if excitation.kind in KINDS_WITH_TARGET_ANGLE:
         return f"{motion_text}{_STEEP_SLOPE_EFFECTS[excitation.kind]}."

@@ -57,15 +57,18 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
         "tool_inertia_kg_m2": sensor.tool_inertia_kg_m2,
         "sensor_filter": _sensor_filter(rig),
     }
-    path = str(excitation.parameters["file"])
-    if path:
-        model = TouchModel.from_analysis(path, length_m=rig.beam.length_m, **stated_values)
+    analysis_path = str(excitation.parameters["file"])
+    if analysis_path:
+        touch_model = TouchModel.from_analysis(
+            analysis_path, length_m=rig.beam.length_m, **stated_values
+        )
     else:
-        model = TouchModel.assumed(rig.beam, rig.damping, **stated_values)
-    beam = watched_beam(model, rig.rate_hz, _reading_noise(profile))
+        touch_model = TouchModel.assumed(rig.beam, rig.damping, **stated_values)
+    beam_prediction = watched_beam(touch_model, rig.rate_hz, _reading_noise(profile))
     shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(
-        TouchOrder(beam, DetectorSettings(), excitation.approach, shear_projection), model
+        TouchOrder(beam_prediction, DetectorSettings(), excitation.approach, shear_projection),
+        touch_model,
     )
 
 
@@ -73,29 +76,32 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     """Return the low-pass filters in the sensor's signal path that a profile states."""
     from rigd.touch import SensorFilter
 
-    low_pass = rig.sensor.filter_hz, rig.sensor.filter_order
+    low_pass_hz_and_order = rig.sensor.filter_hz, rig.sensor.filter_order
     serial_settings = rig.ati_serial
     if serial_settings is None:
-        return SensorFilter(*low_pass)
-    records = serial_settings.records_per_tick(rig.rate_hz)
+        return SensorFilter(*low_pass_hz_and_order)
+    records_per_tick = serial_settings.records_per_tick(rig.rate_hz)
     return SensorFilter.of_records(
-        *low_pass, serial_settings.filter, records, 1 / serial_settings.stream_hz
+        *low_pass_hz_and_order,
+        serial_settings.filter,
+        records_per_tick,
+        1 / serial_settings.stream_hz,
     )
 
 
 def _reading_noise(profile: Profile) -> "ChannelNoise":
-    """Return the noise of torque, shear force and angle readings.
+    """Return the standard deviations of torque, shear force and angle readings.
 
     Only the ratios are used, since the size of the noise is measured at rest.
     """
     from rigd.touch import ChannelNoise
 
     rig = profile.rig
-    axes = np.array(rig.sensor.resolution)
+    axis_noise = np.array(rig.sensor.resolution)
     if rig.simulation is not None:
-        axes = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
+        axis_noise = np.repeat([rig.simulation.force_noise_n, rig.simulation.torque_noise_nm], 3)
     torque_nm, shear_n = (
-        float(np.linalg.norm(np.array(projection) * axes))
+        float(np.linalg.norm(np.array(projection) * axis_noise))
         for projection in (rig.sensor.projection, rig.sensor.shear_projection)
     )
     return ChannelNoise(
@@ -157,31 +163,41 @@ class TouchEstimates:
         events, self._events = self._events, []
         return events
 
-    def finish(self, touches: int, call_while_waiting: Callable[[], None]) -> list[dict[str, Any]]:
+    def finish(
+        self, touch_count: int, call_while_waiting: Callable[[], None]
+    ) -> list[dict[str, Any]]:
         """Wait for the final estimates of all detected touches; return a JSON dictionary for each.
 
-        `touches` is the number of detected touches. A touch without an estimate has its number
+        `touch_count` is the number of detected touches. A touch without an estimate has its number
         only. ``final_reports`` is false if there is only the first, less accurate estimate.
         """
         deadline_s = time.monotonic() + _FINAL_ESTIMATES_TIMEOUT_S
 
         def is_estimate_missing() -> bool:
-            final_reports = [report for report in self._reports.values() if report.final]
+            final_reports = [
+                touch_report for touch_report in self._reports.values() if touch_report.final
+            ]
             return (
-                len(final_reports) < touches and not self._failure and time.monotonic() < deadline_s
+                len(final_reports) < touch_count
+                and not self._failure
+                and time.monotonic() < deadline_s
             )
 
         while is_estimate_missing():
             self._process_messages(_POLL_S)
             call_while_waiting()
         return [
-            _touch_document(number, self._reports.get(number)) for number in range(1, touches + 1)
+            _touch_document(touch_number, self._reports.get(touch_number))
+            for touch_number in range(1, touch_count + 1)
         ]
 
     def encoded_touches(self) -> bytes:
         """Return the latest estimate of each touch as encoded messages for the session file."""
-        touches = [(report.tick, report.document) for _, report in sorted(self._reports.items())]
-        return packed_touches(touches, self._rate_hz)
+        ticks_and_documents = [
+            (touch_report.tick, touch_report.document)
+            for _, touch_report in sorted(self._reports.items())
+        ]
+        return packed_touches(ticks_and_documents, self._rate_hz)
 
     def take_new_estimates(self) -> list[dict[str, Any]]:
         """Return the estimates that were received since the last call."""
@@ -204,15 +220,15 @@ class TouchEstimates:
 
     def _add_estimate(self, report: TouchReport) -> None:
         """Add an estimate to those for the live view and to the events for the operator."""
-        touch = _touch_document(report.number, report)
-        self._new_estimates.append(touch)
-        self._events.append(LogEvent(0, "info", touch_line(touch), notable=True))
+        touch_document = _touch_document(report.number, report)
+        self._new_estimates.append(touch_document)
+        self._events.append(LogEvent(0, "info", touch_line(touch_document), notable=True))
 
     def _continue_without_process(self, reason: str) -> None:
         """Continue the session without the touch process, and add an event that states why."""
         self._failure = reason
-        text = f"{reason} Touches are detected but not estimated; the session continues."
-        self._events.append(LogEvent(0, "warning", text))
+        event_text = f"{reason} Touches are detected but not estimated; the session continues."
+        self._events.append(LogEvent(0, "warning", event_text))
 
 
 def _touch_document(number: int, report: TouchReport | None) -> dict[str, Any]:

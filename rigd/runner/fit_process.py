@@ -109,16 +109,20 @@ class FitProgram:
 
     def end_error(self) -> FitProgramError:
         """Return the error that states how the program ended, after waiting for its end."""
-        code = self._process.wait()
-        how = f"was killed by signal {-code}" if code < 0 else f"ended with exit code {code}"
-        return FitProgramError(f"The fit program {how}.")
+        exit_code = self._process.wait()
+        end_text = (
+            f"was killed by signal {-exit_code}"
+            if exit_code < 0
+            else f"ended with exit code {exit_code}"
+        )
+        return FitProgramError(f"The fit program {end_text}.")
 
     def _read_estimates(self) -> None:
         """Read the program's estimates into a queue until it ends; run in a thread."""
         assert self._process.stdout is not None
         with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
-            for line in self._process.stdout:
-                self._estimates.put(json.loads(line))
+            for output_line in self._process.stdout:
+                self._estimates.put(json.loads(output_line))
         self._estimates.put(None)
 
     def __enter__(self) -> Self:
@@ -163,41 +167,43 @@ class _SessionFit:
                 return
             self._request_if_possible(is_drained=not has_passed_samples)
             try:
-                message = self._parent.poll(0.0 if has_passed_samples else _IDLE_WAIT_S)
+                supervisor_message = self._parent.poll(0.0 if has_passed_samples else _IDLE_WAIT_S)
             except EOFError:
                 return
-            match message:
+            match supervisor_message:
                 case FileHeader():
-                    self._start_fits(message)
+                    self._start_fits(supervisor_message)
                 case RecordEnded(ticks):
                     self._record_ticks = ticks
                     if self._search is not None and self._search.due_tick is not None:
-                        held_ticks_before, begun = (
+                        held_ticks_before, begun_until_tick = (
                             self._shared_state[StateField.HELD_BEFORE],
                             self._shared_state[StateField.BEGUN],
                         )
                         self._parent.send(
-                            self._search.end_of_record(ticks, held_ticks_before, begun)
+                            self._search.end_of_record(ticks, held_ticks_before, begun_until_tick)
                         )
 
     def _start_fits(self, header: FileHeader) -> None:
         """Send the header of the session file to the fit program, and prepare the planning."""
         job = self._job
         if job.search is not None:
-            writer = ReferenceWriter(job.reference, self._shared_state)
+            reference_writer = ReferenceWriter(job.reference, self._shared_state)
             start_rad = float(header.metadata["start_angle_rad"])
-            self._search = ExcitationPlanner(job.search, job.profile, writer, start_rad=start_rad)
-        every_s = _FIT_INTERVAL_S if job.search is None else None
-        start = StreamStart(dict(header.metadata), dict(header.segments), every_s)
-        write_start(self._program.input, start)
+            self._search = ExcitationPlanner(
+                job.search, job.profile, reference_writer, start_rad=start_rad
+            )
+        fit_interval_s = _FIT_INTERVAL_S if job.search is None else None
+        stream_start = StreamStart(dict(header.metadata), dict(header.segments), fit_interval_s)
+        write_start(self._program.input, stream_start)
 
     def _pass_samples(self) -> bool:
         """Pass new samples to the fit program; return whether there were any."""
-        block = self._reader.take(_MAX_BLOCK_SAMPLES)
-        if not block:
+        sample_bytes = self._reader.take(_MAX_BLOCK_SAMPLES)
+        if not sample_bytes:
             return False
-        write_samples(self._program.input, block)
-        self._passed_ticks = int(decode_samples(block[-SAMPLE_SIZE:])["tick"][0]) + 1
+        write_samples(self._program.input, sample_bytes)
+        self._passed_ticks = int(decode_samples(sample_bytes[-SAMPLE_SIZE:])["tick"][0]) + 1
         return True
 
     def _request_if_possible(self, *, is_drained: bool) -> None:
@@ -207,20 +213,22 @@ class _SessionFit:
         """
         if self._pending is not None:
             return
-        search = self._search
+        excitation_planner = self._search
         if self._record_ticks is not None:
             if is_drained:
                 self._request_estimate(self._record_ticks, whole=True)
         elif (
-            search is not None
-            and search.due_tick is not None
-            and search.has_last_segment_begun(self._shared_state[StateField.BEGUN])
+            excitation_planner is not None
+            and excitation_planner.due_tick is not None
+            and excitation_planner.has_last_segment_begun(self._shared_state[StateField.BEGUN])
         ):
             # The count of held ticks is read after the samples, because the loop increases it
             # before it publishes the sample.
-            tick = search.due_tick + self._shared_state[StateField.HELD]
-            if self._passed_ticks >= tick:
-                self._request_estimate(tick, whole=search.may_be_last, from_last=True)
+            request_tick = excitation_planner.due_tick + self._shared_state[StateField.HELD]
+            if self._passed_ticks >= request_tick:
+                self._request_estimate(
+                    request_tick, whole=excitation_planner.may_be_last, from_last=True
+                )
 
     def _request_estimate(self, tick: int, *, whole: bool, from_last: bool = False) -> None:
         """Request an estimate from the samples before a tick; see `EstimateRequest`."""
@@ -235,39 +243,46 @@ class _SessionFit:
 
         Returns whether the estimate is the final one, of the whole record.
         """
-        request, search = self._pending, self._search
-        if request is not None and request.id != estimate["id"]:
-            request = None
+        pending_request, excitation_planner = self._pending, self._search
+        if pending_request is not None and pending_request.id != estimate["id"]:
+            pending_request = None
         # Only the last estimate is requested without start values from the previous one.
         is_final = (
-            request is not None and request.tick == self._record_ticks and not request.from_last
+            pending_request is not None
+            and pending_request.tick == self._record_ticks
+            and not pending_request.from_last
         )
         was_early_fit = self._is_early_fit_pending
-        if request is not None:
+        if pending_request is not None:
             self._pending, self._is_early_fit_pending = None, False
-        if search is not None and not is_final:
-            if request is not None and self._record_ticks is None and not was_early_fit:
-                self._plan_next_segment(search, request, estimate)
+        if excitation_planner is not None and not is_final:
+            if pending_request is not None and self._record_ticks is None and not was_early_fit:
+                self._plan_next_segment(excitation_planner, pending_request, estimate)
             return False
         estimate["text"] = estimate_lines(estimate, self._previous_estimate)
-        if search is None:
+        if excitation_planner is None:
             self._previous_estimate = estimate
         else:
-            estimate["search"] = search.targets_document(estimate)
+            estimate["search"] = excitation_planner.targets_document(estimate)
         self._parent.send(FitReport(estimate, final=is_final))
         return is_final
 
     def _plan_next_segment(
-        self, search: ExcitationPlanner, request: EstimateRequest, estimate: dict[str, Any]
+        self,
+        excitation_planner: ExcitationPlanner,
+        request: EstimateRequest,
+        estimate: dict[str, Any],
     ) -> None:
         """Plan the next segment from an estimate, and send the plan to the supervisor."""
         held_ticks, held_ticks_before = (
             self._shared_state[StateField.HELD],
             self._shared_state[StateField.HELD_BEFORE],
         )
-        for message in search.plan_next(estimate, held_ticks, held_ticks_before):
-            self._parent.send(message)
-        if search.needs_early_fit:
+        for planner_message in excitation_planner.plan_next(
+            estimate, held_ticks, held_ticks_before
+        ):
+            self._parent.send(planner_message)
+        if excitation_planner.needs_early_fit:
             # This fit of all structures provides start values for the check of the whole record.
             self._request_estimate(request.tick, whole=True, from_last=True)
             self._is_early_fit_pending = True

@@ -149,9 +149,11 @@ class RigPreview:
         ControlDesignError
             If the loop is unstable and the predicted response overflows.
         """
-        response = self._closed_loop.simulate(reference_rad)
-        always_limited, clippable = _limited_peaks(self._profile, _peaks(reference_rad, response))
-        return _largest_fraction(always_limited + clippable)
+        loop_response = self._closed_loop.simulate(reference_rad)
+        fixed_peaks, clippable_peaks = _limited_peaks(
+            self._profile, _peaks(reference_rad, loop_response)
+        )
+        return _largest_fraction(fixed_peaks + clippable_peaks)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
         """Return the model of motor, beam and closed loop with which a move is planned.
@@ -174,8 +176,10 @@ class RigPreview:
             If the beam's damping cannot be realised by a model with poles.
         """
         identified_beam = read_identified_beam(path, self.beam.length_m, use) if path else None
-        model = loop_model_with(self._profile, identified_beam)
-        return move_plant_of(self._profile, model, _sensor_limit_nm(self._profile), identified_beam)
+        loop_model = loop_model_with(self._profile, identified_beam)
+        return move_plant_of(
+            self._profile, loop_model, _sensor_limit_nm(self._profile), identified_beam
+        )
 
     def tip_slope_rad(self, reference_rad: Real) -> float:
         """Return the predicted peak slope of the beam's free end for a reference angle (n,)."""
@@ -205,16 +209,20 @@ class RigPreview:
         if self._last_estimated_plant is not None and self._last_estimated_plant[0] == beam:
             return self._last_estimated_plant[1]
         profile = self._profile
-        limit_nm = _sensor_limit_nm(profile)
+        coupling_limit_nm = _sensor_limit_nm(profile)
         try:
-            plant = move_plant_of(profile, with_beam(profile.loop_model(), beam), limit_nm)
+            move_plant = move_plant_of(
+                profile, with_beam(profile.loop_model(), beam), coupling_limit_nm
+            )
         except (ControlDesignError, RealisationError):
             beam_with_stated_damping = replace(beam, damping=profile.rig.damping)
-            plant = move_plant_of(
-                profile, with_beam(profile.loop_model(), beam_with_stated_damping), limit_nm
+            move_plant = move_plant_of(
+                profile,
+                with_beam(profile.loop_model(), beam_with_stated_damping),
+                coupling_limit_nm,
             )
-        self._last_estimated_plant = beam, plant
-        return plant
+        self._last_estimated_plant = beam, move_plant
+        return move_plant
 
 
 def excitation_for(
@@ -266,7 +274,7 @@ def plan_session(
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
 ) -> Plan:
-    """Return the plan of a session, which states whether checks and limits allow the session.
+    """Return the plan of a session; its field `refused` states why it is not allowed, if so.
 
     Parameters
     ----------
@@ -289,27 +297,31 @@ def predict_session(
     RealisationError
         If the beam's damping cannot be realised by a model with poles.
     """
-    clearance = check_on_paper(profile, accept)
-    loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
-    prediction = predict(loop, excitation)
+    paper_check = check_on_paper(profile, accept)
+    closed_loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
+    prediction = predict(closed_loop, excitation)
     violations, torque_violations = (
-        [violation_text for peak in peaks if (violation_text := peak.violation_text())]
-        for peaks in _limited_peaks(profile, prediction)
+        [
+            violation_text
+            for limited_peak in limited_peaks
+            if (violation_text := limited_peak.violation_text())
+        ]
+        for limited_peaks in _limited_peaks(profile, prediction)
     )
-    refusals = list(clearance.refusals)
+    refusals = list(paper_check.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
     slope_violation = tip_slope is not None and tip_slope.violation_text()
     if violations or slope_violation or (torque_violations and not force):
-        advice = _amplitude_advice(profile, excitation, force=force)
-        refusals += [f"{violation_text}; {advice}." for violation_text in violations]
+        amplitude_advice = _amplitude_advice(profile, excitation, force=force)
+        refusals += [f"{violation_text}; {amplitude_advice}." for violation_text in violations]
         if tip_slope is not None and slope_violation:
-            remedy = slope_remedy(excitation, tip_slope.value, tip_slope.limit)
-            refusals.append(f"{slope_violation}; {advice}{remedy}.")
+            slope_advice = slope_remedy(excitation, tip_slope.value, tip_slope.limit)
+            refusals.append(f"{slope_violation}; {amplitude_advice}{slope_advice}.")
         refusals += [
-            f"{violation_text}; {advice}, or allow clipping with --force."
+            f"{violation_text}; {amplitude_advice}, or allow clipping with --force."
             for violation_text in torque_violations
         ]
-    warnings = [*clearance.warnings, *([instability_warning] if instability_warning else [])]
+    warnings = [*paper_check.warnings, *([instability_warning] if instability_warning else [])]
     if not refusals:
         warnings += [
             f"{violation_text}: it will be clipped and flagged."
@@ -322,8 +334,8 @@ def predict_session(
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
         refused="\n".join(refusals),
-        ending=_motion_after_record(loop, stays=excitation.stays),
-        clearance=clearance,
+        ending=_motion_after_record(closed_loop, stays=excitation.stays),
+        clearance=paper_check,
     )
 
 
@@ -372,35 +384,35 @@ def largest_amplitude(
     """
     if excitation.kind in ("modes", "until") or not _has_amplitude(excitation.kind):
         return None
-    loop, _ = stable_loop(profile.loop_model())
+    closed_loop, _ = stable_loop(profile.loop_model())
     stated_amplitude_rad = abs(float(excitation.parameters["amplitude_rad"]))
     # Chirps are not exempt here, so that the linear model is valid for the proposed amplitude.
-    tip_slope = _limited_tip_slope(profile, predict(loop, excitation))
+    tip_slope = _limited_tip_slope(profile, predict(closed_loop, excitation))
 
     def largest_fraction_at(amplitude_rad: float) -> float:
-        scale = amplitude_rad / stated_amplitude_rad
-        reference_rad = excitation.reference_rad * scale
-        always_limited, clippable = _limited_peaks(
-            profile, _peaks(reference_rad, loop.simulate(reference_rad))
+        amplitude_scale = amplitude_rad / stated_amplitude_rad
+        reference_rad = excitation.reference_rad * amplitude_scale
+        fixed_peaks, clippable_peaks = _limited_peaks(
+            profile, _peaks(reference_rad, closed_loop.simulate(reference_rad))
         )
         if tip_slope is not None:
-            always_limited += (replace(tip_slope, value=tip_slope.value * scale),)
-        return _largest_fraction(always_limited if force else always_limited + clippable)
+            fixed_peaks += (replace(tip_slope, value=tip_slope.value * amplitude_scale),)
+        return _largest_fraction(fixed_peaks if force else fixed_peaks + clippable_peaks)
 
     # All peaks are proportional to the amplitude, except for the friction compensation.
     amplitude_rad = min(stated_amplitude_rad, _MAX_AMPLITUDE_RAD)
     for _ in range(_MAX_ITERATIONS):
-        fraction = largest_fraction_at(amplitude_rad)
-        if not 0.0 < fraction < math.inf:
+        limit_fraction = largest_fraction_at(amplitude_rad)
+        if not 0.0 < limit_fraction < math.inf:
             return None
-        amplitude_rad = min(amplitude_rad / fraction, _MAX_AMPLITUDE_RAD)
-        if 0.999 < fraction <= 1.0:
+        amplitude_rad = min(amplitude_rad / limit_fraction, _MAX_AMPLITUDE_RAD)
+        if 0.999 < limit_fraction <= 1.0:
             break
-    digit_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
-    digits = math.floor(amplitude_rad / digit_rad)
-    while digits > 0 and not largest_fraction_at(digits * digit_rad) <= 1.0:
-        digits -= 1
-    return float(f"{digits * digit_rad:.3g}") if digits else None
+    digit_step_rad = 10.0 ** (math.floor(math.log10(amplitude_rad)) - 2)
+    digit_count = math.floor(amplitude_rad / digit_step_rad)
+    while digit_count > 0 and not largest_fraction_at(digit_count * digit_step_rad) <= 1.0:
+        digit_count -= 1
+    return float(f"{digit_count * digit_step_rad:.3g}") if digit_count else None
 
 
 def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
@@ -418,7 +430,7 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
         "sweep": _motion_text(excitation),
         "profile": profile.name,
         "parameters": dict(excitation.parameters),
-        "segments": {name: list(ends) for name, ends in excitation.segments.items()},
+        "segments": {name: list(end_text) for name, end_text in excitation.segments.items()},
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
         "ends_itself": excitation.search is not None,
         **asdict(plan.prediction),
@@ -432,7 +444,7 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
             "tip_slope_rad": profile.limits.tip_slope_rad,
         },
         "refused": plan.refused or None,
-        "failed_checks": [asdict(each) for each in plan.clearance.failed],
+        "failed_checks": [asdict(failed_check) for failed_check in plan.clearance.failed],
         "tip_in_words": plan.tip_in_words,
         "beam": asdict(profile.rig.beam),
         "damping": asdict(profile.rig.damping),
@@ -460,45 +472,47 @@ def _motion_text(excitation: Excitation) -> str:
     if excitation.kind != "chirp":
         return ""
     start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
-    direction = " down" if stop_hz < start_hz else ""
+    direction_text = " down" if stop_hz < start_hz else ""
     return_text = ""
     if excitation.parameters.get("there_and_back"):
         return_text = f" and back, {float(excitation.parameters['duration_s']):g} s each way"
-    return f"sweeps{direction} from {start_hz:g} to {stop_hz:g} Hz{return_text}"
+    return f"sweeps{direction_text} from {start_hz:g} to {stop_hz:g} Hz{return_text}"
 
 
 def _move_text(parameters: Mapping[str, float | int | str]) -> str:
     """Return text with target angle, duration and predicted residual vibration of a move."""
     (
-        by_rad,
-        angle_rad,
+        move_rad,
+        target_angle_rad,
         duration_s,
-        fraction,
+        residual_fraction,
         residual_nm,
-        floor_nm,
+        sensor_floor_nm,
         detuned_residual_nm,
         quintic_nm,
     ) = (
-        float(parameters[name])
-        for name in (
+        float(parameters[parameter_name])
+        for parameter_name in (
             *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
             *("residual_floor_nm", "frequency_residual_nm", "quintic_residual_nm"),
         )
     )
-    arrival = "more than 1 s after that"
+    arrival_text = "more than 1 s after that"
     if "arrival_s" in parameters:
-        arrival = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
+        arrival_text = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
     residual_text = f"{1e3 * residual_nm:.2g} mN·m"
-    if residual_nm < floor_nm:
-        residual_text = f"below what the sensor shows ({1e3 * floor_nm:.2g} mN·m)"
-    if detuned_residual_nm > max(residual_nm, floor_nm):
+    if residual_nm < sensor_floor_nm:
+        residual_text = f"below what the sensor shows ({1e3 * sensor_floor_nm:.2g} mN·m)"
+    if detuned_residual_nm > max(residual_nm, sensor_floor_nm):
         residual_text += (
             f", {1e3 * detuned_residual_nm:.2g} mN·m if the beam's frequencies are wrong by their "
             "uncertainty"
         )
     return (
-        f"moves by {by_rad:.4g} rad to {angle_rad:.4g} rad in {1e3 * duration_s:.0f} ms, the angle "
-        f"within 1 mrad {arrival} ({100 * fraction:.0f} % of the limits); vibration left "
+        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} "
+        "ms, the angle "
+        f"within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); "
+        "vibration left "
         f"{residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
         f"{parameters['file'] or 'profile'})"
     )
@@ -506,30 +520,33 @@ def _move_text(parameters: Mapping[str, float | int | str]) -> str:
 
 def _obstacle_search_text(parameters: Mapping[str, float | int | str]) -> str:
     """Return text with the target angle and speed of a search for an obstacle."""
-    passes = int(parameters["passes"])
+    pass_count = int(parameters["passes"])
     return (
         f"goes to {float(parameters['angle_rad']):.4g} rad at {parameters['speed_rad_s']:g} rad/s"
-        f"{f', {passes} times' if passes > 1 else ''}, brakes within "
+        f"{f', {pass_count} times' if pass_count > 1 else ''}, brakes within "
         f"{1e3 * float(parameters['braking_s']):.0f} ms of a touch (beam of "
         f"{parameters['file'] or 'profile'})"
     )
 
 
 def _precision_search_text(excitation: Excitation) -> str:
-    """Return text with the first scan and the precision targets of an excitation ``until``."""
+    """Return text with the first chirp and the requested precision of an excitation ``until``."""
     assert excitation.search is not None
-    start_hz, stop_hz, scan_s, amplitude_rad = (
-        float(excitation.parameters[name])
-        for name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
+    start_hz, stop_hz, scan_duration_s, amplitude_rad = (
+        float(excitation.parameters[parameter_name])
+        for parameter_name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
     )
-    targets = ", ".join(str(target) for target in excitation.search.targets)
+    targets_text = ", ".join(
+        str(precision_target) for precision_target in excitation.search.targets
+    )
     return (
-        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_s:g} s at up to {amplitude_rad:.3g} rad, "
-        f"then chooses the most informative excitation until {targets} (standard deviation)"
+        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_duration_s:g} s at up to "
+        f"{amplitude_rad:.3g} rad, "
+        f"then chooses the most informative excitation until {targets_text} (standard deviation)"
     )
 
 
-def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
+def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
     """Return the predicted peak magnitudes of a session.
 
     Parameters
@@ -544,35 +561,35 @@ def predict(loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
     ControlDesignError
         If the loop is unstable and the predicted response overflows.
     """
-    response = loop.simulate(excitation.reference_rad)
-    peaks = _peaks(excitation.reference_rad, response)
-    angle_rad = response.angle_rad.copy()
-    del response  # an hour of response takes 150 MB, and the tip motion needs as much again
-    model = loop.model
-    if model.beam is not None:
+    loop_response = closed_loop.simulate(excitation.reference_rad)
+    predicted_peaks = _peaks(excitation.reference_rad, loop_response)
+    angle_rad = loop_response.angle_rad.copy()
+    del loop_response  # an hour of response takes 150 MB, and the tip motion needs as much again
+    loop_model = closed_loop.model
+    if loop_model.beam is not None:
         tip = tip_motion(
-            model.beam,
-            model.damping,
+            loop_model.beam,
+            loop_model.damping,
             angle_rad,
-            model.rate_hz,
-            tip_mass_kg=model.tip_mass_kg,
-            root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
+            loop_model.rate_hz,
+            tip_mass_kg=loop_model.tip_mass_kg,
+            root_compliance_rad_per_nm=loop_model.root_compliance_rad_per_nm,
         )
-        peaks = replace(peaks, tip=tip)
+        predicted_peaks = replace(predicted_peaks, tip=tip)
     if excitation.kind not in KINDS_WITH_TARGET_ANGLE:
-        return peaks
+        return predicted_peaks
     start_rad = float(excitation.parameters["angle_rad"]) - float(excitation.parameters["by_rad"])
-    return replace(peaks, peak_angle_rad=_peak(start_rad + angle_rad))
+    return replace(predicted_peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
-def _peaks(reference_rad: Real, response: LoopResponse) -> SessionPrediction:
+def _peaks(reference_rad: Real, loop_response: LoopResponse) -> SessionPrediction:
     """Return the peak magnitudes of a simulated response to a reference angle (n,)."""
     return SessionPrediction(
-        peak_angle_rad=_peak(response.angle_rad),
-        peak_velocity_rad_s=_peak(response.velocity_rad_s),
-        peak_torque_nm=_peak(response.torque_nm),
-        peak_tracking_error_rad=_peak(reference_rad - response.angle_rad),
-        peak_coupling_torque_nm=_peak(response.coupling_torque_nm),
+        peak_angle_rad=_peak(loop_response.angle_rad),
+        peak_velocity_rad_s=_peak(loop_response.velocity_rad_s),
+        peak_torque_nm=_peak(loop_response.torque_nm),
+        peak_tracking_error_rad=_peak(reference_rad - loop_response.angle_rad),
+        peak_coupling_torque_nm=_peak(loop_response.coupling_torque_nm),
     )
 
 
@@ -596,14 +613,18 @@ def predicted_metadata(
     dict of str to str
         Keys ``predicted_peak_…`` and ``limit_…`` with their units → numbers as texts.
     """
-    always_limited, clippable = _limited_peaks(profile, predicted)
+    fixed_peaks, clippable_peaks = _limited_peaks(profile, predicted)
     metadata = {}
     tip_slope = _limited_tip_slope(profile, predicted)
     if tip_slope is not None and excitation.search is not None:
         tip_slope = replace(tip_slope, value=max(tip_slope.value, excitation.search.tip_slope_rad))
-    for peak in (*always_limited, *clippable, *(() if tip_slope is None else (tip_slope,))):
-        metadata[f"predicted_peak_{_METADATA_KEYS[peak.name]}"] = repr(peak.value)
-        metadata[f"limit_{_METADATA_KEYS[peak.name]}"] = repr(peak.limit)
+    for limited_peak in (
+        *fixed_peaks,
+        *clippable_peaks,
+        *(() if tip_slope is None else (tip_slope,)),
+    ):
+        metadata[f"predicted_peak_{_METADATA_KEYS[limited_peak.name]}"] = repr(limited_peak.value)
+        metadata[f"limit_{_METADATA_KEYS[limited_peak.name]}"] = repr(limited_peak.limit)
     return metadata
 
 
@@ -642,8 +663,8 @@ def _limited_peaks(
     profile: Profile, predicted: SessionPrediction
 ) -> tuple[tuple[_LimitedPeak, ...], tuple[_LimitedPeak, ...]]:
     """Return the peaks whose limits always apply, and the torque peaks that may be clipped."""
-    limits, motor = profile.limits, profile.rig.motor
-    always_limited = (
+    limits, motor_parameters = profile.limits, profile.rig.motor
+    fixed_peaks = (
         _LimitedPeak(
             "angle", predicted.peak_angle_rad, limits.angle_rad, "rad", "limits.angle_rad"
         ),
@@ -662,7 +683,7 @@ def _limited_peaks(
             "limits.tracking_error_rad",
         ),
     )
-    clippable = (
+    clippable_peaks = (
         _LimitedPeak(
             "coupling torque",
             predicted.peak_coupling_torque_nm,
@@ -671,10 +692,14 @@ def _limited_peaks(
             "sensor.range",
         ),
         _LimitedPeak(
-            "torque", predicted.peak_torque_nm, motor.peak_torque_nm, "N·m", "motor.peak_torque_nm"
+            "torque",
+            predicted.peak_torque_nm,
+            motor_parameters.peak_torque_nm,
+            "N·m",
+            "motor.peak_torque_nm",
         ),
     )
-    return always_limited, clippable
+    return fixed_peaks, clippable_peaks
 
 
 def _limited_tip_slope(profile: Profile, predicted: SessionPrediction) -> _LimitedPeak | None:
@@ -685,10 +710,10 @@ def _limited_tip_slope(profile: Profile, predicted: SessionPrediction) -> _Limit
     return _LimitedPeak("tip slope", predicted.tip.slope_rad, limit_rad, "rad", key)
 
 
-def _largest_fraction(peaks: tuple[_LimitedPeak, ...]) -> float:
+def _largest_fraction(limited_peaks: tuple[_LimitedPeak, ...]) -> float:
     """Return the largest ratio of a predicted peak to its limit, or NaN if a peak is NaN."""
-    fractions = [peak.value / peak.limit for peak in peaks]
-    return math.nan if any(map(math.isnan, fractions)) else max(fractions)
+    limit_fractions = [limited_peak.value / limited_peak.limit for limited_peak in limited_peaks]
+    return math.nan if any(map(math.isnan, limit_fractions)) else max(limit_fractions)
 
 
 def _sensor_limit_nm(profile: Profile) -> float:
@@ -697,15 +722,15 @@ def _sensor_limit_nm(profile: Profile) -> float:
     The wrench is assumed to be the smallest one whose projection is the coupling torque.
     """
     sensor = profile.rig.sensor
-    weight = sum(p * p for p in sensor.projection)
+    projection_norm_squared = sum(p * p for p in sensor.projection)
     usable_fraction = min(1.0, profile.limits.sensor_range_percent / 100)
     return min(
-        usable_fraction * limit * weight / abs(p)
-        for p, limit in zip(sensor.projection, sensor.range, strict=True)
+        usable_fraction * axis_limit * projection_norm_squared / abs(p)
+        for p, axis_limit in zip(sensor.projection, sensor.range, strict=True)
         if p != 0.0
     )
 
 
-def _peak(values: Real) -> float:
+def _peak(signal: Real) -> float:
     """Return the largest magnitude in an array."""
-    return float(np.max(np.abs(values)))
+    return float(np.max(np.abs(signal)))

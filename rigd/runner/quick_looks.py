@@ -47,7 +47,7 @@ class QuickLook:
     """Sentence that states why the quick look failed; empty if it did not."""
 
     @classmethod
-    def failed(cls, session: Path, error: str) -> "QuickLook":
+    def failed(cls, session_path: Path, error: str) -> "QuickLook":
         """Return a quick look that failed.
 
         Parameters
@@ -57,14 +57,17 @@ class QuickLook:
         error
             Sentence that states why the quick look failed.
         """
-        return cls(session, None, None, error)
+        return cls(session_path, None, None, error)
 
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return the quick look that an event of the daemon reports."""
-        session, content = Path(event["path"]), event["look"]
+        session_path, report_content = Path(event["path"]), event["look"]
         return cls(
-            session, None if content is None else quick_look_path(session), content, event["error"]
+            session_path,
+            None if report_content is None else quick_look_path(session_path),
+            report_content,
+            event["error"],
         )
 
     @property
@@ -72,13 +75,13 @@ class QuickLook:
         """Lines of text that report the quick look on a terminal."""
         if self.content is None:
             return [f"No quick look at {self.session.name}: {self.error}"]
-        return [printable(str(line)) for line in self.content["text"]]
+        return [printable(str(text_line)) for text_line in self.content["text"]]
 
     def note(self, results: list[RunResult]) -> None:
         """Add the path of the quick look to the result of its session in a list of results."""
-        for index, result in enumerate(results):
-            if result.path == self.session:
-                results[index] = replace(result, quick_look=self.path)
+        for result_index, run_result in enumerate(results):
+            if run_result.path == self.session:
+                results[result_index] = replace(run_result, quick_look=self.path)
 
     def as_dict(self) -> dict[str, Any]:
         """Return the content of the daemon's event that reports the quick look."""
@@ -117,22 +120,22 @@ class QuickLooks:
         """Run time of the present quick look in seconds, without waits for a processor."""
         return self._run_time_s
 
-    def begin(self, session: Path) -> None:
+    def begin(self, session_path: Path) -> None:
         """Add a session to the queue, and start its quick look if none is running."""
         with self._lock:
-            self._waiting_sessions.append(session)
+            self._waiting_sessions.append(session_path)
         self.poll()
 
     def poll(self) -> None:
         """Report ended quick looks and start the next one; call this often between sessions."""
         with self._lock:
-            ended = [*self._ended_quick_look(), *self._start_next()]
-        for each in ended:
-            self._on_result(each)
+            ended_reports = [*self._ended_quick_look(), *self._start_next()]
+        for quick_look in ended_reports:
+            self._on_result(quick_look)
 
     @contextlib.contextmanager
     def suspended(self) -> Iterator[None]:
-        """Suspend the running quick look while the context, a session, lasts."""
+        """Suspend the process of the running quick look within the context, during a session."""
         with self._lock:
             self._is_suspended = True
             self._send_signal(signal.SIGSTOP)
@@ -166,16 +169,18 @@ class QuickLooks:
                 # Its end is not awaited, because it may end late at low priority.
                 self._process.kill()
             return
-        errors = self._process.communicate()[1]
-        code, self._process = self._process.returncode, None
-        if is_too_slow and code == -signal.SIGKILL:
+        error_output = self._process.communicate()[1]
+        exit_code, self._process = self._process.returncode, None
+        if is_too_slow and exit_code == -signal.SIGKILL:
             yield QuickLook.failed(self._session, f"it took longer than {_MAX_RUN_TIME_S:g} s.")
-        elif code != 0:
+        elif exit_code != 0:
             error_text = (
-                errors.strip().rpartition("\n")[2].removeprefix("Error: ")[:_MAX_ERROR_CHARACTERS]
+                error_output.strip()
+                .rpartition("\n")[2]
+                .removeprefix("Error: ")[:_MAX_ERROR_CHARACTERS]
             )
             yield QuickLook.failed(
-                self._session, error_text or f"its program ended with exit code {code}."
+                self._session, error_text or f"its program ended with exit code {exit_code}."
             )
         else:
             yield self._read_result()
@@ -184,8 +189,8 @@ class QuickLooks:
         """Update the run time of the quick look with the given process id."""
         now_s = time.monotonic()
         elapsed_s, self._run_time_updated_s = now_s - self._run_time_updated_s, now_s
-        if (usage := processor_use(pid)) is not None:
-            is_waiting_for_processor, processor_s = usage
+        if (processor_usage := processor_use(pid)) is not None:
+            is_waiting_for_processor, processor_s = processor_usage
             used_processor_s, self._processor_s = processor_s - self._processor_s, processor_s
             if is_waiting_for_processor:
                 elapsed_s = min(elapsed_s, used_processor_s)
@@ -222,13 +227,13 @@ class QuickLooks:
 
     def _read_result(self) -> QuickLook:
         """Return the quick look that the program has written successfully."""
-        path = quick_look_path(self._session)
-        content = read_quick_look(path)
-        if content is None:
-            return QuickLook.failed(self._session, f"{path} cannot be read.")
-        return QuickLook(self._session, path, content, "")
+        report_path = quick_look_path(self._session)
+        report_content = read_quick_look(report_path)
+        if report_content is None:
+            return QuickLook.failed(self._session, f"{report_path} cannot be read.")
+        return QuickLook(self._session, report_path, report_content, "")
 
-    def _send_signal(self, number: signal.Signals) -> None:
+    def _send_signal(self, signal_number: signal.Signals) -> None:
         """Send a signal to the running quick look, if there is one."""
         if self._process is not None:
-            self._process.send_signal(number)
+            self._process.send_signal(signal_number)

@@ -79,14 +79,14 @@ class Order:
 
 
 def load_rig(
-    name: str,
+    profile_name: str,
     *,
     fast: bool = False,
     seed: int | None = None,
     hardware: bool = False,
     obstacles: Sequence[str] = (),
 ) -> tuple[Profile, ActuationTarget]:
-    """Return a profile, and whether a session with it moves the hardware or a simulated rig.
+    """Return a profile, and which rig its sessions move: the hardware or a simulated one.
 
     Parameters
     ----------
@@ -113,7 +113,7 @@ def load_rig(
         instead.
     """
     software_commit()  # called early, because it is slow and the motor is held during the header
-    profile = load_profile(name)
+    profile = load_profile(profile_name)
     check_selection(profile.rig.devices, profile.path)
     refusals = bus_conflicts(profile.rig)
     if refusals:
@@ -147,8 +147,8 @@ def load_rig(
                 f"--seed: {profile.path} has no section [simulation]; copy it from that of rigd "
                 "profiles show sim, or omit the option."
             )
-        simulation = replace(profile.rig.simulation, seed=seed)
-        profile = replace(profile, rig=replace(profile.rig, simulation=simulation))
+        simulation_settings = replace(profile.rig.simulation, seed=seed)
+        profile = replace(profile, rig=replace(profile.rig, simulation=simulation_settings))
     if obstacles:
         if target is not ActuationTarget.SIMULATED:
             raise RefusedError(
@@ -166,17 +166,21 @@ def load_rig(
 
 def _refuse_unreachable_simulators(profile: Profile) -> None:
     """Raise if a simulated rig of this profile is running that this command cannot reach."""
-    for path in unreachable_simulators(profile.rig.name):
-        remedy, owner = "run this command as its user to use it", "by another user"
+    for simulator_path in unreachable_simulators(profile.rig.name):
+        remedy, owner_name = "run this command as its user to use it", "by another user"
         with suppress(OSError, ValueError):
-            uid = path.stat().st_uid
-            owner = f"by user {uid}"
+            uid = simulator_path.stat().st_uid
+            owner_name = f"by user {uid}"
             if uid == os.getuid():
-                owner = "in another environment"
-                remedy = f"set XDG_RUNTIME_DIR={shlex.quote(str(path.parent.parent))} to use it"
-        shown_path = printable(str(path))  # another user may have chosen any name
+                owner_name = "in another environment"
+                remedy = (
+                    f"set XDG_RUNTIME_DIR={shlex.quote(str(simulator_path.parent.parent))} "
+                    "to use it"
+                )
+        shown_path = printable(str(simulator_path))  # another user may have chosen any name
         raise RefusedError(
-            f"A simulated rig of {profile.name} is run {owner} ({shown_path}), which this command "
+            f"A simulated rig of {profile.name} is run {owner_name} ({shown_path}), which this "
+            "command "
             f"does not reach, and the hardware would move instead. Either {remedy}, or end it, or "
             "give --hardware if the hardware is meant."
         )
@@ -197,25 +201,27 @@ def check_required(profile: Profile, notes: Mapping[str, str]) -> None:
     RefusedError
         If metadata are missing. The message states their names and options.
     """
-    missing = [
-        name
-        for name in profile.metadata.required
-        if not notes.get(name if name in NOTES else META_PREFIX + name)
+    missing_names = [
+        metadata_name
+        for metadata_name in profile.metadata.required
+        if not notes.get(metadata_name if metadata_name in NOTES else META_PREFIX + metadata_name)
     ]
-    if missing:
-        options = (
-            f"--{name} …" if name in NOTES else f"--meta {name}=…{_unit_in_parentheses(name)}"
-            for name in missing
+    if missing_names:
+        option_texts = (
+            f"--{metadata_name} …"
+            if metadata_name in NOTES
+            else f"--meta {metadata_name}=…{_unit_in_parentheses(metadata_name)}"
+            for metadata_name in missing_names
         )
         raise RefusedError(
-            f"{profile.path}: metadata.required asks each session for {', '.join(missing)}; add "
-            f"{' '.join(options)}."
+            f"{profile.path}: metadata.required asks each session for "
+            f"{', '.join(missing_names)}; add {' '.join(option_texts)}."
         )
 
 
-def _unit_in_parentheses(name: str) -> str:
+def _unit_in_parentheses(metadata_name: str) -> str:
     """Return the unit of a metadata name in parentheses, or "" if the name ends in no unit."""
-    return f" ({unit_of(name)})" if unit_of(name) else ""
+    return f" ({unit_of(metadata_name)})" if unit_of(metadata_name) else ""
 
 
 def make_folder(folder: Path) -> None:
@@ -257,18 +263,18 @@ def require_disk_space(folder: Path, excitation: Excitation, limits: Limits) -> 
     """
     make_folder(folder)
     try:
-        free = shutil.disk_usage(folder).free
+        free_bytes = shutil.disk_usage(folder).free
     except OSError as error:
         raise NoRoomError(
             f"{folder}: free disk space is unknown ({error.strerror}); check that the "
             "disk is mounted."
         ) from error
-    needed = excitation.reference_rad.size * _MAX_BYTES_PER_TICK + _MAX_BYTES_WITHOUT_TICKS
-    if free - needed < limits.disk_free_mb * 1e6:
+    needed_bytes = excitation.reference_rad.size * _MAX_BYTES_PER_TICK + _MAX_BYTES_WITHOUT_TICKS
+    if free_bytes - needed_bytes < limits.disk_free_mb * 1e6:
         raise NoRoomError(
-            f"{folder}: {free / 1e6:.1f} MB free, of which the session may need "
-            f"{needed / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB must "
-            "remain free; free up space or choose another folder (--output)."
+            f"{folder}: {free_bytes / 1e6:.1f} MB free, of which the session may need "
+            f"{needed_bytes / 1e6:.1f} MB, and limits.disk_free_mb = {limits.disk_free_mb:g} MB "
+            "must remain free; free up space or choose another folder (--output)."
         )
 
 
@@ -286,11 +292,11 @@ def choose_path(folder: Path, kind: str, number: int | None = None) -> Path:
     number
         Number of the session in its series, or None for a single session.
     """
-    stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
+    file_stem = f"{datetime.now(UTC):%Y%m%d-%H%M%S}-{kind}"
     if number is not None:
-        stem += f"-{number:02d}"
-    path = folder / f"{stem}.mcap"
-    return _unused_path(path)
+        file_stem += f"-{number:02d}"
+    session_path = folder / f"{file_stem}.mcap"
+    return _unused_path(session_path)
 
 
 def part_path(path: Path) -> Path:
@@ -298,22 +304,22 @@ def part_path(path: Path) -> Path:
     return path.with_name(path.name + PART_SUFFIX)
 
 
-def _unused_path(path: Path) -> Path:
+def _unused_path(session_path: Path) -> Path:
     """Return a path at which no session file exists, with a number appended if necessary."""
-    while path.exists() or part_path(path).exists():
-        path = another_path(path)
-    return path
+    while session_path.exists() or part_path(session_path).exists():
+        session_path = another_path(session_path)
+    return session_path
 
 
-def another_path(path: Path) -> Path:
+def another_path(session_path: Path) -> Path:
     """Return the next path for a session file if its path is used: X.mcap → X_2.mcap → X_3.mcap."""
-    stem, _, number = path.stem.rpartition("_")
-    if stem and number.isdecimal():
-        return path.with_name(f"{stem}_{int(number) + 1}{path.suffix}")
-    return path.with_name(f"{path.stem}_2{path.suffix}")
+    base_stem, _, number_text = session_path.stem.rpartition("_")
+    if base_stem and number_text.isdecimal():
+        return session_path.with_name(f"{base_stem}_{int(number_text) + 1}{session_path.suffix}")
+    return session_path.with_name(f"{session_path.stem}_2{session_path.suffix}")
 
 
-def remaining_file_text(path: Path | None) -> str:
+def remaining_file_text(session_path: Path | None) -> str:
     """Return a sentence that states what a failed session recorded, and how to recover it.
 
     Call this after the processes of the session have ended.
@@ -325,25 +331,34 @@ def remaining_file_text(path: Path | None) -> str:
     """
     from rigd.session import holds_samples
 
-    if path is None:
+    if session_path is None:
         return "It has no file."
-    part = part_path(path)
+    part_file_path = part_path(session_path)
     try:
-        part_exists, file_exists = part.exists(), path.exists()
+        part_exists, file_exists = part_file_path.exists(), session_path.exists()
     except OSError as error:
-        return f"Its folder {path.parent} cannot be read ({error.strerror})."
+        return f"Its folder {session_path.parent} cannot be read ({error.strerror})."
     if not part_exists:
         return (
-            f"Its file is {path}." if file_exists else f"There is no {path.name} in {path.parent}."
+            f"Its file is {session_path}."
+            if file_exists
+            else f"There is no {session_path.name} in {session_path.parent}."
         )
-    if not holds_samples(part):
-        return f"Nothing was recorded; {part} holds no sample and can be removed."
-    old, new = (shlex.quote(str(part_path(name))) for name in (path, _unused_path(path)))
+    if not holds_samples(part_file_path):
+        return f"Nothing was recorded; {part_file_path} holds no sample and can be removed."
+    old_path_text, new_path_text = (
+        shlex.quote(str(part_path(file_path)))
+        for file_path in (session_path, _unused_path(session_path))
+    )
     if not file_exists:
-        return f"What was recorded is in {part}; rigd recover {old} makes a clean file of it."
+        return (
+            f"What was recorded is in {part_file_path}; rigd recover {old_path_text} makes a "
+            "clean file of it."
+        )
     return (
-        f"What was recorded is in {part}, whose name without {PART_SUFFIX} is taken: after "
-        f"mv {old} {new} rigd recover {new} makes a clean file of it."
+        f"What was recorded is in {part_file_path}, whose name without {PART_SUFFIX} is taken: "
+        "after "
+        f"mv {old_path_text} {new_path_text} rigd recover {new_path_text} makes a clean file of it."
     )
 
 
@@ -382,7 +397,10 @@ def _session_metadata(
         "excitation": order.excitation.kind,
         "uniformity_percent": repr(order.profile.uncertainty.uniformity_percent),
         # The parameters of a session may override the uniformity.
-        **{name: _parameter_text(value) for name, value in order.excitation.parameters.items()},
+        **{
+            metadata_name: _parameter_text(metadata_value)
+            for metadata_name, metadata_value in order.excitation.parameters.items()
+        },
         "beam_length_m": repr(rig.beam.length_m),
         "beam_density_kg_per_m": repr(rig.beam.density_kg_per_m),
         "beam_bending_stiffness_n_m2": repr(rig.beam.bending_stiffness_n_m2),
@@ -399,20 +417,25 @@ def _session_metadata(
         "software": f"rigd {__version__}",
         **software_commit(),
         "host": platform.node(),
-        **{f"realtime_{name}": value for name, value in connection.realtime.items()},
+        **{
+            f"realtime_{metadata_name}": metadata_value
+            for metadata_name, metadata_value in connection.realtime.items()
+        },
         **connection.drive,
         **tare,
         **dict(order.predicted),
         **dict(order.notes),
     }
     if order.accepted:
-        metadata["accepted_checks"] = ", ".join(each.name for each in order.accepted)
+        metadata["accepted_checks"] = ", ".join(
+            accepted_check.name for accepted_check in order.accepted
+        )
     serial_number = connection.calibration.get("serial_number")
     if isinstance(serial_number, str):
         metadata["sensor_serial_number"] = serial_number
-    differences = simulated_differently(rig)
-    if differences:
-        metadata["simulated_differently"] = "; ".join(differences)
+    simulation_differences = simulated_differently(rig)
+    if simulation_differences:
+        metadata["simulated_differently"] = "; ".join(simulation_differences)
     if rig.acquisition is not None:
         metadata["acquisition_mode"] = rig.acquisition.mode
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
@@ -454,9 +477,11 @@ def software_commit() -> dict[str, str]:
     return {"software_commit": commit} if commit.isprintable() and commit else {}
 
 
-def _parameter_text(value: float | str) -> str:
+def _parameter_text(parameter_value: float | str) -> str:
     """Return the text of an excitation parameter for the metadata."""
     # A file name may contain invalid characters; the session file must be written nevertheless.
     return (
-        value.encode(errors="backslashreplace").decode() if isinstance(value, str) else repr(value)
+        parameter_value.encode(errors="backslashreplace").decode()
+        if isinstance(parameter_value, str)
+        else repr(parameter_value)
     )

@@ -85,15 +85,15 @@ class SessionFailedError(FailureError):
 
     def result(self) -> "RunResult":
         """Return the failed session's result; call this after its processes have ended."""
-        part, complete_path = self.saved_path, None
-        if part is None and self.path is not None:
+        partial_path, complete_path = self.saved_path, None
+        if partial_path is None and self.path is not None:
             try:
                 if part_path(self.path).exists():
-                    part = part_path(self.path)
+                    partial_path = part_path(self.path)
                 elif self.path.exists():
                     complete_path = self.path  # the recorder was only slow, and completed the file
             except OSError:
-                part = part_path(self.path)  # the folder cannot be read
+                partial_path = part_path(self.path)  # the folder cannot be read
         return RunResult(
             path=complete_path,
             outcome="fault",
@@ -101,7 +101,7 @@ class SessionFailedError(FailureError):
             recorded=None,
             lost=None,
             fault=True,
-            part=part,
+            part=partial_path,
             hardware=self.hardware,
             quick_look=None,
             touches=None,
@@ -274,10 +274,12 @@ class SessionRun:
             if self._is_control_busy:
                 self._shared_state[StateField.STOP] = Stop.NO_RECORDER
                 self._await_control()
-            failure = SessionFailedError(f"{self._recorder_failure} {self._final_drive_state}")
-            failure.path, failure.saved_path = self._opened_path, self._saved_path
-            failure.counts = self._counts()
-            raise failure from None
+            failure_error = SessionFailedError(
+                f"{self._recorder_failure} {self._final_drive_state}"
+            )
+            failure_error.path, failure_error.saved_path = self._opened_path, self._saved_path
+            failure_error.counts = self._counts()
+            raise failure_error from None
         finally:
             stop.on_request = _ignore_stop_request
 
@@ -287,56 +289,63 @@ class SessionRun:
 
     def _run(self) -> RunResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
-        group, search = self._group, self._order.excitation.search
+        process_group, precision_search = self._group, self._order.excitation.search
         try:
-            reference = write_reference(
-                group.channels.reference_fd,
+            reference_spec = write_reference(
+                process_group.channels.reference_fd,
                 self._order.excitation.reference_rad,
-                None if search is None else search.planned_ticks,
+                None if precision_search is None else precision_search.planned_ticks,
             )
         except OSError as error:
             raise SessionFailedError(
                 f"No shared memory for a session this long ({error.strerror}); check the "
                 "limits of open files (ulimit -n) and of shared memory (/dev/shm)."
             ) from None
-        order = self._order
-        profile = order.profile
-        realtime = None if self._is_virtual_clock else profile.realtime
-        if order.touch is not None:
-            self._touches = TouchEstimates(group, order.touch, profile.rig.rate_hz, realtime)
+        session_order = self._order
+        profile = session_order.profile
+        realtime_settings = None if self._is_virtual_clock else profile.realtime
+        if session_order.touch is not None:
+            self._touches = TouchEstimates(
+                process_group, session_order.touch, profile.rig.rate_hz, realtime_settings
+            )
             self._touches.await_ready(self._report_and_check_stop)
-        if search is not None or order.watch_fit:
-            self._fit = FitSupervisor(group, profile, reference, search, realtime)
-            failure = self._fit.await_ready(self._report_and_check_stop)
-            if failure and search is not None:
-                raise SessionFailedError(failure)
+        if precision_search is not None or session_order.watch_fit:
+            self._fit = FitSupervisor(
+                process_group, profile, reference_spec, precision_search, realtime_settings
+            )
+            failure_reason = self._fit.await_ready(self._report_and_check_stop)
+            if failure_reason and precision_search is not None:
+                raise SessionFailedError(failure_reason)
         self._open_file()
-        order = self._order
+        session_order = self._order
         self._is_control_busy = True
-        touch = None if order.touch is None else order.touch.order
+        touch_order = None if session_order.touch is None else session_order.touch.order
         job = SessionJob(
-            order.profile,
-            reference,
+            session_order.profile,
+            reference_spec,
             self._refused_realtime_settings(),
-            order.ending,
-            touch,
-            order.seed,
-            tuple(f"{each.name}: {each.text}" for each in order.accepted),
+            session_order.ending,
+            touch_order,
+            session_order.seed,
+            tuple(
+                f"{metadata_item.name}: {metadata_item.text}"
+                for metadata_item in session_order.accepted
+            ),
         )
-        group.control.send(job)
-        message = self._await_control()
-        if isinstance(message, Ready):
-            header = file_header(order, self._connection, message.tare)
-            group.recorder.send(header)
+        process_group.control.send(job)
+        control_message = self._await_control()
+        if isinstance(control_message, Ready):
+            file_header_data = file_header(session_order, self._connection, control_message.tare)
+            process_group.recorder.send(file_header_data)
             if self._fit is not None:
-                self._fit.begin(header)
+                self._fit.begin(file_header_data)
             self._await_recorder(Armed)
             self._shared_state[StateField.GO] = 1
-            message = self._await_control()
+            control_message = self._await_control()
         if self._recorder_failure is not None:
             raise SessionFailedError(self._recorder_failure)
-        assert isinstance(message, Finished)
-        return self._close(message)
+        assert isinstance(control_message, Finished)
+        return self._close(control_message)
 
     def _report_and_check_stop(self) -> bool:
         """Report progress before any motion; return whether no stop is requested so far."""
@@ -344,21 +353,22 @@ class SessionRun:
         return self._shared_state[StateField.STOP] == Stop.NO
 
     def _open_file(self) -> None:
-        """Start the recorder, which creates the file; use another name if the name is taken."""
-        group = self._group
-        realtime = None if self._is_virtual_clock else self._order.profile.realtime
+        """Start the recorder, which creates the session file; use another name if one exists."""
+        process_group = self._group
+        realtime_settings = None if self._is_virtual_clock else self._order.profile.realtime
         for _ in range(_MAX_FILE_NAMES):
-            job = RecorderJob(self._order.path, group.channels.specs, realtime)
-            group.idle_process(RECORDER).start(job)
+            job = RecorderJob(self._order.path, process_group.channels.specs, realtime_settings)
+            process_group.idle_process(RECORDER).start(job)
             try:
-                opened = self._await_recorder(Opened, _RECORDER_START_TIMEOUT_S)
+                opened_reply = self._await_recorder(Opened, _RECORDER_START_TIMEOUT_S)
             except _FileExistsError as error:
                 name_error = error
                 self._order = replace(self._order, path=another_path(self._order.path))
             else:
                 self._opened_path = self._order.path
                 recorder_settings = {
-                    f"recorder_{name}": text for name, text in opened.realtime.items()
+                    f"recorder_{setting_name}": setting_text
+                    for setting_name, setting_text in opened_reply.realtime.items()
                 }
                 previous_settings = self._connection.realtime
                 self._connection = replace(
@@ -373,9 +383,10 @@ class SessionRun:
         Only settings of the supervisor and of the recorder are included.
         """
         return {
-            name: text
-            for name, text in self._connection.realtime.items()
-            if name.startswith(("supervisor_", "recorder_")) and text.startswith(REFUSED)
+            setting_name: setting_text
+            for setting_name, setting_text in self._connection.realtime.items()
+            if setting_name.startswith(("supervisor_", "recorder_"))
+            and setting_text.startswith(REFUSED)
         }
 
     def _await_control(self) -> Ready | Finished:
@@ -383,12 +394,12 @@ class SessionRun:
 
         A hung control process is killed.
         """
-        deadline, phase = 0.0, -1
+        deadline_s, last_phase = 0.0, -1
         while True:
             # An estimate of a touch is more urgent than a message from the control process.
             has_waited = self._touches is not None and self._touches.process_messages(_POLL_S)
             try:
-                message = self._group.control.poll(0.0 if has_waited else _POLL_S)
+                control_message = self._group.control.poll(0.0 if has_waited else _POLL_S)
             except ChildError as error:
                 return self._control_died(str(error))
             self._report()
@@ -400,57 +411,57 @@ class SessionRun:
             )
             if (
                 self._shared_state[StateField.STOP] == Stop.NO
-                or self._shared_state[StateField.PHASE] != phase
+                or self._shared_state[StateField.PHASE] != last_phase
             ):
-                phase = self._shared_state[StateField.PHASE]
+                last_phase = self._shared_state[StateField.PHASE]
                 timeout_s = _REPLY_TIMEOUT_S if is_torque_on else _DRIVE_TIMEOUT_S
-                deadline = now_s + timeout_s
-            elif message is None and now_s > deadline:
+                deadline_s = now_s + timeout_s
+            elif control_message is None and now_s > deadline_s:
                 return self._kill_control(f"did not stop within {timeout_s:g} s")
             assert CONTROL.hung_after_s is not None
             hung_after_s = CONTROL.hung_after_s if is_torque_on else _DRIVE_TIMEOUT_S
             stalled_s = self._control_heartbeat.stalled_for(
                 self._shared_state[StateField.CONTROL_BEAT], now_s
             )
-            if message is None and stalled_s > hung_after_s:
+            if control_message is None and stalled_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
-            if message is not None:
-                return self._checked_control_message(message)
+            if control_message is not None:
+                return self._checked_control_message(control_message)
             if self._recorder_failure is None:
                 self._recorder_failure = self._recorder_failure_reason()
                 if self._recorder_failure is not None:
                     self._shared_state[StateField.STOP] = Stop.NO_RECORDER
 
-    def _checked_control_message(self, message: object) -> Ready | Finished:
+    def _checked_control_message(self, control_message: object) -> Ready | Finished:
         """Return the message of the control process as ``Ready`` or ``Finished``."""
-        match message:
+        match control_message:
             case Ended(reason):  # before the session began
-                finished = self._control_died(reason)
+                session_end = self._control_died(reason)
                 if reason:
-                    return finished
+                    return session_end
                 # A stop signal reached the control process between two sessions.
                 return replace(
-                    finished, outcome="stopped", reason="Stopped by the operator.", fault=False
+                    session_end, outcome="stopped", reason="Stopped by the operator.", fault=False
                 )
             case Finished():
                 self._is_control_busy = False
-                if message.device_failed:
+                if control_message.device_failed:
                     self.device_failed = True
-                    self._final_drive_state = message.reason
-                return message
+                    self._final_drive_state = control_message.reason
+                return control_message
             case Ready():
-                return message
-        raise SessionFailedError(f"The control process answers {message}.")
+                return control_message
+        raise SessionFailedError(f"The control process answers {control_message}.")
 
-    def _kill_control(self, predicate: str) -> Finished:
+    def _kill_control(self, failure_predicate: str) -> Finished:
         """Kill a hung control process, and return the session's end.
 
         The drive's watchdog then switches the torque off.
         """
         self._group.control.kill()
         return self._control_died(
-            f"The control process {predicate} and was killed: without its heartbeat the drive "
-            "switches itself off. Check that it is off."
+            f"The control process {failure_predicate} and was killed: without its heartbeat the "
+            "drive switches itself off. Check that it is off."
         )
 
     def _control_died(self, reason: str) -> Finished:
@@ -462,15 +473,15 @@ class SessionRun:
 
     def _finished_from_shared_state(self, reason: str) -> Finished:
         """Return the session's end for a dead control process, from counts in shared memory."""
-        counts = self._counts()
+        tick_counts = self._counts()
         is_complete = is_whole(
-            self._shared_state, counts["scheduled"], self._order.excitation.reference_rad.size
+            self._shared_state, tick_counts["scheduled"], self._order.excitation.reference_rad.size
         )
         return Finished(
             outcome="complete" if is_complete else "fault",
             reason=f"After the record: {reason}" if is_complete else reason,
             fault=True,
-            counts=counts,
+            counts=tick_counts,
         )
 
     def _counts(self) -> dict[str, int]:
@@ -478,128 +489,132 @@ class SessionRun:
         shared_state = self._shared_state
         # Before the record of this session the counters are those of the previous one.
         return {
-            name: shared_state[field] if shared_state[StateField.GO] else 0
-            for name, field in _COUNTER_FIELDS.items()
+            count_name: shared_state[state_field] if shared_state[StateField.GO] else 0
+            for count_name, state_field in _COUNTER_FIELDS.items()
         }
 
     def _recorder_failure_reason(self) -> str | None:
         """Return why the recorder failed, or None if it is running."""
         try:
-            message = self._group.recorder.poll(0.0)
+            recorder_message = self._group.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
-        if isinstance(message, Failed):
-            self._saved_path = message.saved_path
-            return message.reason
-        return None if message is None else str(message)
+        if isinstance(recorder_message, Failed):
+            self._saved_path = recorder_message.saved_path
+            return recorder_message.reason
+        return None if recorder_message is None else str(recorder_message)
 
     def _await_recorder(
-        self, expected: type[MessageType], timeout_s: float = _REPLY_TIMEOUT_S
+        self, reply_type: type[MessageType], timeout_s: float = _REPLY_TIMEOUT_S
     ) -> MessageType:
         """Wait for a message of a given type from the recorder, and return it.
 
         Progress is reported meanwhile, because the motor may be held. Raises SessionFailedError if
         the recorder fails or does not reply in time.
         """
-        deadline = time.monotonic() + timeout_s
-        message = None
-        while message is None and time.monotonic() < deadline:
-            message = self._group.recorder.poll(_POLL_S)
+        deadline_s = time.monotonic() + timeout_s
+        recorder_message = None
+        while recorder_message is None and time.monotonic() < deadline_s:
+            recorder_message = self._group.recorder.poll(_POLL_S)
             self._report()
-        if message is None:
+        if recorder_message is None:
             raise SessionFailedError(
                 f"The recorder process does not answer within {timeout_s:g} s. Check CPU load and "
                 "disk."
             )
-        if isinstance(message, Failed):
-            self._saved_path = message.saved_path
-            raise (_FileExistsError if message.taken else SessionFailedError)(message.reason)
-        if not isinstance(message, expected):
-            raise SessionFailedError(f"The recorder process answers {message}.")
-        return message
+        if isinstance(recorder_message, Failed):
+            self._saved_path = recorder_message.saved_path
+            raise (_FileExistsError if recorder_message.taken else SessionFailedError)(
+                recorder_message.reason
+            )
+        if not isinstance(recorder_message, reply_type):
+            raise SessionFailedError(f"The recorder process answers {recorder_message}.")
+        return recorder_message
 
     def _report(self) -> None:
         """Signal this process's heartbeat, and pass progress, events and fits to the watcher."""
         shared_state = self._shared_state
         if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-        events = read_events(self._events.take(16))
+        new_events = read_events(self._events.take(16))
         if self._live is not None:
-            events += self._live.poll()
+            new_events += self._live.poll()
         if self._touches is not None:
-            events += self._touches.poll()
+            new_events += self._touches.poll()
             if self._live is not None:
                 self._live.show_touches(self._touches.take_new_estimates())
-        fits: Sequence[Mapping[str, Any]] = ()
+        new_fits: Sequence[Mapping[str, Any]] = ()
         if self._fit is not None:
-            events += self._fit.poll()
-            fits = self._fit.take_new_estimates()
+            new_events += self._fit.poll()
+            new_fits = self._fit.take_new_estimates()
             if self._live is not None:
-                self._live.show_fits(fits)
+                self._live.show_fits(new_fits)
         self._watcher(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
                 shared_state[StateField.SCHEDULED],
                 shared_state[StateField.MISSED],
                 shared_state[StateField.LATE],
-                tuple(fits),
+                tuple(new_fits),
             ),
-            events,
+            new_events,
         )
 
     def _close(self, finished: Finished) -> RunResult:
         """Complete touches and fit, make the recorder close the file, and return the result."""
         self._report()
-        touches = None
-        outcome = {
+        touch_documents = None
+        outcome_record = {
             "outcome": finished.outcome,
             "reason": finished.reason,
-            **{name: str(count) for name, count in finished.counts.items()},
+            **{count_name: str(tick_count) for count_name, tick_count in finished.counts.items()},
             **finished.results,
         }
         if self._touches is not None:
-            touches = self._touches.finish(self._shared_state[StateField.TOUCHES], self._report)
-            outcome["touches"] = json.dumps(touches)
+            touch_documents = self._touches.finish(
+                self._shared_state[StateField.TOUCHES], self._report
+            )
+            outcome_record["touches"] = json.dumps(touch_documents)
             self._report()
         fit: dict[str, Any] | None = None
-        segments: Mapping[str, tuple[int, int]] = {}
+        segment_ticks: Mapping[str, tuple[int, int]] = {}
         if self._fit is not None:
             fit = self._fit.finish(finished.counts["scheduled"], self._report)
-            segments = self._fit.segments
+            segment_ticks = self._fit.segments
             self._report()
-            outcome["fit"] = json.dumps(fit)
+            outcome_record["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
-                outcome["reason"] = self._fit.unmet_reason
+                outcome_record["reason"] = self._fit.unmet_reason
             elif self._fit.failure:
                 # This failure ends the session, even if a stop was requested before.
-                outcome["reason"] = f"{self._fit.failure} {finished.reason}"
+                outcome_record["reason"] = f"{self._fit.failure} {finished.reason}"
         self._group.recorder.wake()
         packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
-        self._group.recorder.send(Close(outcome, packed_touches, segments))
+        self._group.recorder.send(Close(outcome_record, packed_touches, segment_ticks))
         # A disk may stall for as long at the end of a record as during the record.
         stall_s = self._order.profile.limits.recorder_lag_s
-        closed = self._await_recorder(Closed, stall_s + 2 * _REPLY_TIMEOUT_S)
+        closed_reply = self._await_recorder(Closed, stall_s + 2 * _REPLY_TIMEOUT_S)
         # The recorder's counts take precedence over those of the control process.
-        counts = {**_ZERO_COUNTS, **finished.counts, **closed.counts}
-        outcome_text, reason = finished.outcome, outcome["reason"]
-        if closed.path is not None:
-            outcome_text, reason = closed.outcome, closed.reason
+        tick_counts = {**_ZERO_COUNTS, **finished.counts, **closed_reply.counts}
+        outcome_text, end_reason = finished.outcome, outcome_record["reason"]
+        if closed_reply.path is not None:
+            outcome_text, end_reason = closed_reply.outcome, closed_reply.reason
         return RunResult(
-            path=closed.path,
+            path=closed_reply.path,
             outcome=outcome_text,
-            reason=reason,
-            scheduled=counts["scheduled"],
-            recorded=counts.get("recorded", 0),
-            missed=counts["missed"],
-            late=counts["late"],
-            lost=counts.get("lost", 0),
-            stale_angles=counts["stale_angles"],
-            stale_wrenches=counts["stale_wrenches"],
+            reason=end_reason,
+            scheduled=tick_counts["scheduled"],
+            recorded=tick_counts.get("recorded", 0),
+            missed=tick_counts["missed"],
+            late=tick_counts["late"],
+            lost=tick_counts.get("lost", 0),
+            stale_angles=tick_counts["stale_angles"],
+            stale_wrenches=tick_counts["stale_wrenches"],
             fault=finished.fault
             or outcome_text == "fault"
             or (self._fit is not None and bool(self._fit.failure)),
             live_dropped=self._shared_state[StateField.LIVE_DROPPED],
-            touches=None if touches is None else tuple(touches),
+            touches=None if touch_documents is None else tuple(touch_documents),
             fit=fit,
         )
 
@@ -612,9 +627,13 @@ def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
     results
         Results of the sessions.
     """
-    touch_lists = [result.touches for result in results if result.touches is not None]
-    touches = {"touches": [touch for each in touch_lists for touch in each]} if touch_lists else {}
-    return {"sessions": [result.as_dict() for result in results], **touches}
+    touch_lists = [run_result.touches for run_result in results if run_result.touches is not None]
+    touches_entry = (
+        {"touches": [touch for session_touches in touch_lists for touch in session_touches]}
+        if touch_lists
+        else {}
+    )
+    return {"sessions": [run_result.as_dict() for run_result in results], **touches_entry}
 
 
 def can_always_receive_stop() -> bool:

@@ -87,25 +87,25 @@ class SignalReader:
             Ring buffers and shared state of the rig's processes.
         """
         now_s = time.monotonic()
-        ring, shared_state = channels.samples, channels.shared_state
+        sample_ring, shared_state = channels.samples, channels.shared_state
         if (
             self._ring_and_observer is None
-            or self._ring_and_observer[0] is not ring
+            or self._ring_and_observer[0] is not sample_ring
             or now_s > self._last_call_s + _ABANDONED_AFTER_S
         ):
-            self._ring_and_observer = ring, Observer(ring)
+            self._ring_and_observer = sample_ring, Observer(sample_ring)
             self._last_tick = None
             self._samples_since_gauges = []
             self._gauges.forget_angle()
         self._last_call_s = now_s
-        blocks = list(self._read_blocks(self._ring_and_observer[1], ring.written))
+        signal_blocks = list(self._read_blocks(self._ring_and_observer[1], sample_ring.written))
         if now_s - self._last_gauges_s < _MIN_GAUGES_INTERVAL_S:
-            return blocks
+            return signal_blocks
         self._last_gauges_s = now_s
-        gauges = self._take_gauges()
-        if not blocks:
+        latest_gauges = self._take_gauges()
+        if not signal_blocks:
             is_session_active = shared_state[StateField.PHASE] != Phase.PREPARING
-            peaks = {
+            present_magnitudes = {
                 "angle": abs(shared_state[StateField.ANGLE_NRAD]) * 1e-9
                 if is_session_active
                 else None,
@@ -113,52 +113,55 @@ class SignalReader:
                 "i2t": self._cooled_torque_nm(0.0),
             }
             empty_signals = dict.fromkeys(_SIGNAL_FIELDS, np.empty(0, dtype=np.float32))
-            gauges = gauges or self._gauges.with_limits(peaks)
-            return [SignalBlock(0, 0, empty_signals, gauges)]
-        blocks[-1] = replace(blocks[-1], gauges=gauges)
-        return blocks
+            latest_gauges = latest_gauges or self._gauges.with_limits(present_magnitudes)
+            return [SignalBlock(0, 0, empty_signals, latest_gauges)]
+        signal_blocks[-1] = replace(signal_blocks[-1], gauges=latest_gauges)
+        return signal_blocks
 
     def _take_gauges(self) -> dict[str, Gauge] | None:
         """Return the gauges for the samples since their last update, or None without samples."""
         if not self._samples_since_gauges:
             return None
-        samples = np.concatenate(self._samples_since_gauges)
+        sample_array = np.concatenate(self._samples_since_gauges)
         self._samples_since_gauges = []
-        self._cooled_torque_nm(samples.size / self._rate_hz)
-        return self._gauges.take(samples)
+        self._cooled_torque_nm(sample_array.size / self._rate_hz)
+        return self._gauges.take(sample_array)
 
     def _read_blocks(self, observer: Observer, end: int) -> Iterator[SignalBlock]:
         """Yield the unread samples before position `end` of the ring buffer in blocks."""
         while observer.next < end:
-            block = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next))
+            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next))
             try:
-                samples = decode_samples(block)
+                sample_array = decode_samples(ring_bytes)
             except ValueError:
                 continue  # overwritten while it was copied
-            for part in np.split(samples, np.flatnonzero(samples["tick"] == 0)):
-                if part.size:
-                    yield self._signal_block(part)
+            for sample_run in np.split(sample_array, np.flatnonzero(sample_array["tick"] == 0)):
+                if sample_run.size:
+                    yield self._signal_block(sample_run)
 
-    def _signal_block(self, samples: npt.NDArray[Any]) -> SignalBlock:
+    def _signal_block(self, sample_array: npt.NDArray[Any]) -> SignalBlock:
         """Return the signals of samples as a block, with NaN at ticks missed before or between."""
-        ticks = samples["tick"].astype(np.int64)
-        first, last = int(ticks[0]), int(ticks[-1])
-        previous_tick, self._last_tick = self._last_tick, last
-        if previous_tick is None or previous_tick >= first:
+        ticks = sample_array["tick"].astype(np.int64)
+        first_tick, newest_tick = int(ticks[0]), int(ticks[-1])
+        previous_tick, self._last_tick = self._last_tick, newest_tick
+        if previous_tick is None or previous_tick >= first_tick:
             self._take_gauges()  # includes the end of the previous record in the thermal model
             self._gauges.forget_angle()
         # Ticks missed between two blocks belong to the second block.
-        elif first - previous_tick <= _MAX_BLOCK_TICKS:
-            first = previous_tick + 1
-        signals = {name: samples[name].astype(np.float32) for name in _SIGNAL_FIELDS}
-        if samples.size != last - first + 1:
-            for name in _SIGNAL_FIELDS:
-                with_gaps = np.full(last - first + 1, np.nan, dtype=np.float32)
-                with_gaps[ticks - first] = signals[name]
-                signals[name] = with_gaps
-        self._samples_since_gauges.append(samples)
-        t_ns = int(samples["t_ns"][0]) - round((int(ticks[0]) - first) * self._period_ns)
-        return SignalBlock(first, t_ns, signals)
+        elif first_tick - previous_tick <= _MAX_BLOCK_TICKS:
+            first_tick = previous_tick + 1
+        signals = {
+            signal_name: sample_array[signal_name].astype(np.float32)
+            for signal_name in _SIGNAL_FIELDS
+        }
+        if sample_array.size != newest_tick - first_tick + 1:
+            for signal_name in _SIGNAL_FIELDS:
+                with_gaps = np.full(newest_tick - first_tick + 1, np.nan, dtype=np.float32)
+                with_gaps[ticks - first_tick] = signals[signal_name]
+                signals[signal_name] = with_gaps
+        self._samples_since_gauges.append(sample_array)
+        t_ns = int(sample_array["t_ns"][0]) - round((int(ticks[0]) - first_tick) * self._period_ns)
+        return SignalBlock(first_tick, t_ns, signals)
 
     def _cooled_torque_nm(self, covered_s: float) -> float:
         """Return the motor's rms torque (i²t) after cooling for the time that no samples cover.

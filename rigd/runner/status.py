@@ -69,15 +69,15 @@ class SignalStatisticsReader:
         which is less often than this call.
         """
         if self._ring_and_observer is None or self._ring_and_observer[0] is not ring:
-            window_start = max(0, ring.written - round(_STATISTICS_WINDOW_S * self._rate_hz))
-            self._ring_and_observer = ring, Observer(ring, window_start)
-        while block := self._ring_and_observer[1].take(ring.capacity // 4):
+            window_position = max(0, ring.written - round(_STATISTICS_WINDOW_S * self._rate_hz))
+            self._ring_and_observer = ring, Observer(ring, window_position)
+        while ring_bytes := self._ring_and_observer[1].take(ring.capacity // 4):
             try:
-                samples = decode_samples(block)
+                sample_array = decode_samples(ring_bytes)
             except ValueError:
                 continue  # overwritten while it was copied
-            for part in np.split(samples, np.flatnonzero(samples["tick"] == 0)):
-                self._include_samples(part)
+            for sample_run in np.split(sample_array, np.flatnonzero(sample_array["tick"] == 0)):
+                self._include_samples(sample_run)
         if not self._recent_samples:
             return None
         return partial(_signal_statistics, self._rate_hz, tuple(self._recent_samples), self._peaks)
@@ -104,17 +104,17 @@ class SignalStatisticsReader:
 def _signal_statistics(
     rate_hz: float, sample_blocks: tuple[npt.NDArray[Any], ...], peaks: npt.NDArray[np.float64]
 ) -> SignalStatus:
-    """Return the statistics of the samples in the window, with the peaks of the record."""
-    samples = np.concatenate(sample_blocks)
-    last = samples[-1]
-    tick_span = int(last["tick"]) - int(samples["tick"][0]) + 1
-    latency_us = 1e-3 * np.percentile(samples["lateness_ns"], (50, 99))
+    """Return the statistics of the samples of the last second, with the peaks of the record."""
+    window_samples = np.concatenate(sample_blocks)
+    last_sample = window_samples[-1]
+    tick_span = int(last_sample["tick"]) - int(window_samples["tick"][0]) + 1
+    latency_us = 1e-3 * np.percentile(window_samples["lateness_ns"], (50, 99))
     return SignalStatus(
-        rate_hz=rate_hz * samples.size / tick_span,
+        rate_hz=rate_hz * window_samples.size / tick_span,
         lateness_p50_us=float(latency_us[0]),
         lateness_p99_us=float(latency_us[1]),
-        work_p99_us=float(1e-3 * np.percentile(samples["work_ns"], 99)),
-        tracking_error_rad=float(last["angle_reference_rad"] - last["angle_rad"]),
+        work_p99_us=float(1e-3 * np.percentile(window_samples["work_ns"], 99)),
+        tracking_error_rad=float(last_sample["angle_reference_rad"] - last_sample["angle_rad"]),
         peak_tracking_error_rad=float(peaks[0]),
         peak_coupling_torque_nm=float(peaks[1]),
         peak_torque_command_nm=float(peaks[2]),
@@ -234,13 +234,13 @@ class StatusReader:
 
     def _topic_statuses(self, group: ProcessGroup) -> Iterator[TopicStatus]:
         """Yield the status of each topic, with its message rate since the last call."""
-        rings, now_s = group.channels.rings, time.monotonic()
-        written = tuple(ring.written for ring in rings)
-        previous_s, previous_counts = self._last_time_and_counts or (now_s, written)
-        self._last_time_and_counts = now_s, written
+        topic_rings, now_s = group.channels.rings, time.monotonic()
+        written_counts = tuple(topic_ring.written for topic_ring in topic_rings)
+        previous_s, previous_counts = self._last_time_and_counts or (now_s, written_counts)
+        self._last_time_and_counts = now_s, written_counts
         elapsed_s = now_s - previous_s
-        for topic, ring, now, previous_count in zip(
-            TOPICS, rings, written, previous_counts, strict=True
+        for topic, topic_ring, now, previous_count in zip(
+            TOPICS, topic_rings, written_counts, previous_counts, strict=True
         ):
             # New processes have new rings, whose counts start at 0.
             rate_hz = (
@@ -249,25 +249,25 @@ class StatusReader:
                 else None
             )
             expected_hz = topic.expected_hz(self._rate_hz)
-            yield TopicStatus(topic.name, now, rate_hz, expected_hz, ring.waiting)
+            yield TopicStatus(topic.name, now, rate_hz, expected_hz, topic_ring.waiting)
 
     def _process_statuses(self, group: ProcessGroup) -> Iterator[ProcessStatus]:
         """Yield the status of each started process, with the time since its last heartbeat."""
         shared_state, now_s = group.channels.shared_state, time.monotonic()
         for process in PROCESSES:
-            still_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
+            silent_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
-                yield ProcessStatus(process.name, os.getpid(), "running", still_s)
+                yield ProcessStatus(process.name, os.getpid(), "running", silent_s)
                 continue
             if process not in group:
                 continue
             child_process = group[process]
             if not child_process.running:
-                state = "ended"
+                process_state = "ended"
             elif not group.has_job(process):
-                state = "waiting"
-            elif process.hung_after_s is not None and still_s > process.hung_after_s:
-                state = "hung"
+                process_state = "waiting"
+            elif process.hung_after_s is not None and silent_s > process.hung_after_s:
+                process_state = "hung"
             else:
-                state = "running"
-            yield ProcessStatus(process.name, child_process.pid, state, still_s)
+                process_state = "running"
+            yield ProcessStatus(process.name, child_process.pid, process_state, silent_s)

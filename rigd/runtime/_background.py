@@ -72,16 +72,16 @@ def processor_use(pid: int) -> tuple[bool, float] | None:
         if the process has ended, or the system is not Linux.
     """
     try:
-        stat = Path(f"/proc/{pid}/stat").read_text()
+        stat_text = Path(f"/proc/{pid}/stat").read_text()
         # The state and numbers follow the program's name, which may contain any character.
-        fields = stat.rpartition(")")[2].split()
-        ticks = int(fields[11]) + int(fields[12])
+        stat_fields = stat_text.rpartition(")")[2].split()
+        used_ticks = int(stat_fields[11]) + int(stat_fields[12])
     except (OSError, ValueError, IndexError):
         return None
-    return fields[0] == "R", ticks / os.sysconf("SC_CLK_TCK")
+    return stat_fields[0] == "R", used_ticks / os.sysconf("SC_CLK_TCK")
 
 
-def die_with_parent(parent: int) -> None:
+def die_with_parent(parent_pid: int) -> None:
     """Make the system end this process when its parent ends, for whatever reason.
 
     Parameters
@@ -90,7 +90,7 @@ def die_with_parent(parent: int) -> None:
         Process id of the parent. If it has already ended, this process ends at once.
     """
     signal_when_orphaned(signal.SIGKILL)
-    if os.getppid() != parent:
+    if os.getppid() != parent_pid:
         sys.exit(1)
 
 

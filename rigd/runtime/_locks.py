@@ -45,7 +45,7 @@ class LockFile:
         )
         self._fd: int | None = None
 
-    def acquire(self, holder: str, *, alone: bool = True) -> None:
+    def acquire(self, holder: str, *, exclusive: bool = True) -> None:
         """Acquire the lock, exclusively or together with other non-exclusive holders.
 
         Parameters
@@ -65,7 +65,7 @@ class LockFile:
         self.path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
         fd = self._open_file()
         try:
-            _lock_descriptor(fd, alone=alone)
+            _lock_descriptor(fd, exclusive=exclusive)
             os.ftruncate(fd, 0)
             os.pwrite(fd, f"{holder}, process {os.getpid()}".encode(), 0)
         except BaseException:
@@ -93,41 +93,43 @@ class LockFile:
         return fd
 
 
-def _lock_descriptor(fd: int, *, alone: bool) -> None:
+def _lock_descriptor(fd: int, *, exclusive: bool) -> None:
     """Lock an open file without waiting; raise HeldError if another program holds it."""
     try:
-        fcntl.flock(fd, (fcntl.LOCK_EX if alone else fcntl.LOCK_SH) | fcntl.LOCK_NB)
+        fcntl.flock(fd, (fcntl.LOCK_EX if exclusive else fcntl.LOCK_SH) | fcntl.LOCK_NB)
     except OSError:
-        holder = os.pread(fd, _MAX_HOLDER_BYTES, 0).decode(errors="replace").strip() or "unknown"
-        raise LockHeldError(holder + _unnamed_holder_text(fd, holder)) from None
+        holder_text = (
+            os.pread(fd, _MAX_HOLDER_BYTES, 0).decode(errors="replace").strip() or "unknown"
+        )
+        raise LockHeldError(holder_text + _unnamed_holder_text(fd, holder_text)) from None
 
 
-def _unnamed_holder_text(fd: int, holder: str) -> str:
+def _unnamed_holder_text(fd: int, stated_holder: str) -> str:
     """Return text on a process that holds the lock but is not named in the lock file, else "".
 
     Any user can write to the file, so its content may be wrong. The kernel's table is right.
     """
-    inode = os.fstat(fd).st_ino
+    lock_inode = os.fstat(fd).st_ino
     try:
-        holders = sorted(pid for pid, held_inode in _held_inodes() if held_inode == inode)
+        holder_pids = sorted(pid for pid, held_inode in _held_inodes() if held_inode == lock_inode)
     except OSError:
         return ""
-    text = ""
-    for pid in holders:
-        if re.search(rf"\bprocess {pid}\b", holder):
+    holder_text = ""
+    for pid in holder_pids:
+        if re.search(rf"\bprocess {pid}\b", stated_holder):
             return ""
         with suppress(OSError):
-            text = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
-    return text
+            holder_text = f"; held by process {pid} of user {Path('/proc', str(pid)).stat().st_uid}"
+    return holder_text
 
 
 def _held_inodes() -> set[tuple[int, int]]:
     """Return process id and inode of each file lock in the kernel's table."""
     # 1: FLOCK ADVISORY WRITE PID MAJOR:MINOR:INODE START END
-    rows = [line.split() for line in _LOCK_TABLE.read_text("ascii").splitlines()]
+    table_rows = [table_line.split() for table_line in _LOCK_TABLE.read_text("ascii").splitlines()]
     return {
         (int(row[4]), int(row[5].rpartition(":")[2]))
-        for row in rows
+        for row in table_rows
         if len(row) >= 6 and row[1] == "FLOCK"
     }
 
@@ -155,10 +157,10 @@ class RigLock:
         because each simulates a rig of its own.
     """
 
-    def __init__(self, rig: str, holder: str, *, hardware: bool, alone: bool = True) -> None:
+    def __init__(self, rig: str, holder: str, *, hardware: bool, exclusive: bool = True) -> None:
         self._rig = rig
         self._holder = holder
-        self._is_exclusive = alone
+        self._is_exclusive = exclusive
         self._file = LockFile(f"rig-{rig}", for_all_users=hardware)
 
     def acquire(self) -> None:
@@ -170,7 +172,7 @@ class RigLock:
             If another program holds the lock, or this cannot be determined.
         """
         try:
-            self._file.acquire(self._holder, alone=self._is_exclusive)
+            self._file.acquire(self._holder, exclusive=self._is_exclusive)
         except LockHeldError as holder:
             raise RigBusyError(
                 f"The rig {self._rig} is in use ({holder}). Wait until it is free; if a daemon has "
@@ -214,11 +216,15 @@ def holds_rig(pid: int, rig: str, folder: Path) -> bool:
     """
     held_inodes = _held_inodes()
     file_stem = f"rig-{file_name(rig)}"
-    files = [folder / f"{file_stem}.lock", _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"]
-    files += [path for name, path in _open_rig_locks(pid) if name == file_name(rig)]
-    for path in files:
+    lock_files = [folder / f"{file_stem}.lock", _COMMON_LOCK_FOLDER / f"rigd-{file_stem}.lock"]
+    lock_files += [
+        lock_path
+        for open_lock_name, lock_path in _open_rig_locks(pid)
+        if open_lock_name == file_name(rig)
+    ]
+    for lock_path in lock_files:
         with suppress(OSError):
-            if (pid, path.stat().st_ino) in held_inodes:
+            if (pid, lock_path.stat().st_ino) in held_inodes:
                 return True
     return False
 
@@ -237,16 +243,16 @@ def held_rig(pid: int) -> str | None:
         Name of the rig as in file names. None if the process has no such file open, or the system
         does not show the files of the process.
     """
-    return next((name for name, _ in _open_rig_locks(pid)), None)
+    return next((rig_name for rig_name, _ in _open_rig_locks(pid)), None)
 
 
 def _open_rig_locks(pid: int) -> list[tuple[str, Path]]:
     """Return the rig locks that a process has open: name of the rig, and path in /proc."""
     rig_locks = []
     with suppress(OSError):
-        for entry in Path("/proc", str(pid), "fd").iterdir():
+        for fd_entry in Path("/proc", str(pid), "fd").iterdir():
             with suppress(OSError):
-                match = _RIG_LOCK_PATTERN.search(str(entry.readlink()))
-                if match is not None:
-                    rig_locks.append((match[1], entry))
+                lock_match = _RIG_LOCK_PATTERN.search(str(fd_entry.readlink()))
+                if lock_match is not None:
+                    rig_locks.append((lock_match[1], fd_entry))
     return rig_locks

@@ -48,8 +48,8 @@ def read_plain_file(path: Path, max_bytes: int) -> bytes:
     OSError
         If the file cannot be read, is not a regular file, or is too large.
     """
-    with open(_open_regular_file(path, max_bytes), "rb") as file:
-        return file.read(max_bytes)
+    with open(_open_regular_file(path, max_bytes), "rb") as opened_file:
+        return opened_file.read(max_bytes)
 
 
 def _open_regular_file(path: Path, max_bytes: int) -> int:
@@ -57,8 +57,8 @@ def _open_regular_file(path: Path, max_bytes: int) -> int:
     if "\0" in str(path):
         raise OSError(errno.EINVAL, "its name contains a NUL character")
     fd = os.open(path, _OPEN_FLAGS)
-    status = os.fstat(fd)
-    if not stat.S_ISREG(status.st_mode) or status.st_size > max_bytes:
+    file_status = os.fstat(fd)
+    if not stat.S_ISREG(file_status.st_mode) or file_status.st_size > max_bytes:
         os.close(fd)
         raise OSError(errno.EINVAL, f"not a file of at most {max_bytes / 1e6:g} MB")
     return fd

@@ -34,24 +34,24 @@ def raise_on_signals(*numbers: int) -> None:
     """Make the given signals raise an :class:`Interruption` in the main thread."""
     if hasattr(signal, "SIGALRM"):  # not on Windows
         sys.unraisablehook = _repeat_dropped_signal
-    for number in numbers:
-        signal.signal(number, interrupt)
+    for signal_number in numbers:
+        signal.signal(signal_number, interrupt)
 
 
-def interrupt(number: int, _frame: FrameType | None) -> NoReturn:
+def interrupt(signal_number: int, _frame: FrameType | None) -> NoReturn:
     """Raise an :class:`Interruption`; installed as a signal handler."""
-    raise Interruption(number)
+    raise Interruption(signal_number)
 
 
 def ignore_handled_signals() -> None:
-    """Ignore all signals that have a handler, so that no further Ctrl-C interrupts the cleanup.
+    """Ignore all signals that have a handler, so that no Ctrl-C interrupts the final cleanup.
 
     Otherwise Python would restore the default action of these signals before its cleanup has ended,
     and a signal would end the process.
     """
-    for number in signal.valid_signals():
-        if callable(signal.getsignal(number)):
-            signal.signal(number, signal.SIG_IGN)
+    for signal_number in signal.valid_signals():
+        if callable(signal.getsignal(signal_number)):
+            signal.signal(signal_number, signal.SIG_IGN)
 
 
 def _repeat_dropped_signal(dropped: "sys.UnraisableHookArgs") -> None:
@@ -64,18 +64,18 @@ def _repeat_dropped_signal(dropped: "sys.UnraisableHookArgs") -> None:
     if not isinstance(interruption, Interruption):
         sys.__unraisablehook__(dropped)
         return
-    (number,) = interruption.args
-    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(number))
+    (signal_number,) = interruption.args
+    signal.signal(signal.SIGALRM, lambda *_: signal.raise_signal(signal_number))
     signal.setitimer(signal.ITIMER_REAL, _SIGNAL_REPEAT_DELAY_S)
 
 
-def signal_when_orphaned(number: int) -> None:
+def signal_when_orphaned(signal_number: int) -> None:
     """Make the system send a signal to this process when its parent ends (Linux only).
 
     A suspended process is also continued.
     """
     with contextlib.suppress(AttributeError):  # other systems have no such call
-        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, number)
+        ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal_number)
 
 
 # In the processes of a rig
@@ -110,8 +110,8 @@ def signals_blocked() -> Iterator[None]:
 
 def ignore() -> None:
     """Make this process ignore the signals that request an end, such as SIGINT and SIGTERM."""
-    for number in _END_SIGNALS:
-        signal.signal(number, signal.SIG_IGN)
+    for signal_number in _END_SIGNALS:
+        signal.signal(signal_number, signal.SIG_IGN)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, _END_SIGNALS)
 
 
@@ -132,9 +132,9 @@ class StopRequest:
 
     def catch(self) -> None:
         """Make the signals that request an end set this flag, except for ignored ones (nohup)."""
-        for number in _END_SIGNALS:
-            if signal.getsignal(number) != signal.SIG_IGN:
-                signal.signal(number, lambda *_: self.request())
+        for signal_number in _END_SIGNALS:
+            if signal.getsignal(signal_number) != signal.SIG_IGN:
+                signal.signal(signal_number, lambda *_: self.request())
         signal.pthread_sigmask(signal.SIG_UNBLOCK, _END_SIGNALS)
 
     def ignore_stop_signal(self) -> None:

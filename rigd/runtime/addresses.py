@@ -44,14 +44,14 @@ def runtime_folder() -> Path:
     UnsafeFolderError
         If other users can write to the folder.
     """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    if base and Path(base).is_dir():
-        folder = Path(base) / "rigd"
+    base_folder = os.environ.get("XDG_RUNTIME_DIR")
+    if base_folder and Path(base_folder).is_dir():
+        folder = Path(base_folder) / "rigd"
     else:
         folder = _own_fallback_folder(Path(tempfile.gettempdir()))
-    fault = folder_fault(folder)
-    if fault:
-        raise UnsafeFolderError(fault)
+    folder_fault_text = folder_fault(folder)
+    if folder_fault_text:
+        raise UnsafeFolderError(folder_fault_text)
     return folder
 
 
@@ -74,9 +74,9 @@ def folder_fault(folder: Path, *, shared: bool = False) -> str:
         if path == folder.parent and status.st_mode & stat.S_ISVTX:
             write_bits = 0  # in a sticky folder users can remove only their own files
         if write_bits:
-            writers = "every user" if write_bits & 0o002 else "its group"
+            writer_text = "every user" if write_bits & 0o002 else "its group"
             return (
-                f"The runtime folder {path} is writable by {writers} (mode "
+                f"The runtime folder {path} is writable by {writer_text} (mode "
                 f"{stat.S_IMODE(status.st_mode):04o}), who could replace the daemon's socket; run "
                 f"chmod go-w {path}, or set XDG_RUNTIME_DIR to a folder that only you can write to."
             )
@@ -103,15 +103,15 @@ def known_folders(uid: int | None) -> list[Path]:
         Runtime folder by this process's environment, by the login session, and fallback folders
         among temporary files. Some may not exist.
     """
-    base = os.environ.get("XDG_RUNTIME_DIR")
-    folders = [Path(base) / "rigd"] if base else []
+    base_folder = os.environ.get("XDG_RUNTIME_DIR")
+    folders = [Path(base_folder) / "rigd"] if base_folder else []
     if uid is None:
         with suppress(OSError):
-            folders += [each / "rigd" for each in _LOGIN_FOLDERS.iterdir()]
+            folders += [user_folder / "rigd" for user_folder in _LOGIN_FOLDERS.iterdir()]
     else:
         folders.append(_LOGIN_FOLDERS / str(uid) / "rigd")
-    for temporary in {Path(tempfile.gettempdir()), Path("/tmp")}:
-        folders += _fallback_folders(temporary, uid)
+    for temporary_folder in {Path(tempfile.gettempdir()), Path("/tmp")}:
+        folders += _fallback_folders(temporary_folder, uid)
     return sorted(set(folders))
 
 
@@ -124,14 +124,18 @@ def _fallback_folders(base: Path, uid: int | None) -> list[Path]:
     numbered_folders = []
     with suppress(OSError), os.scandir(base) as entries:
         for entry in entries:
-            match = _FALLBACK_FOLDER_NAME.fullmatch(entry.name)
-            if match is None or uid not in (None, int(match[1])):
+            name_match = _FALLBACK_FOLDER_NAME.fullmatch(entry.name)
+            if name_match is None or uid not in (None, int(name_match[1])):
                 continue
             with suppress(OSError):
-                status = entry.stat(follow_symlinks=False)
-                if stat.S_ISDIR(status.st_mode) and status.st_uid == int(match[1]):
-                    numbered_folders.append((int(match[1]), int(match[2] or 0), Path(entry.path)))
-    return [path for *_, path in sorted(numbered_folders)]
+                folder_status = entry.stat(follow_symlinks=False)
+                if stat.S_ISDIR(folder_status.st_mode) and folder_status.st_uid == int(
+                    name_match[1]
+                ):
+                    numbered_folders.append(
+                        (int(name_match[1]), int(name_match[2] or 0), Path(entry.path))
+                    )
+    return [folder_path for *_, folder_path in sorted(numbered_folders)]
 
 
 def _own_fallback_folder(base: Path) -> Path:
@@ -142,16 +146,16 @@ def _own_fallback_folder(base: Path) -> Path:
     """
     uid = os.getuid()
     own_folders = _fallback_folders(base, uid)
-    path = own_folders[0] if own_folders else base / f"rigd-{uid}"
+    folder_path = own_folders[0] if own_folders else base / f"rigd-{uid}"
     for number in itertools.count(1):
         with suppress(FileExistsError):
-            path.mkdir(mode=0o700)
-        status = path.lstat()
-        if stat.S_ISDIR(status.st_mode) and status.st_uid == uid:
-            if status.st_mode & 0o055 and not status.st_mode & 0o022:
-                path.chmod(0o700)
-            return path
-        path = base / f"rigd-{uid}-{number}"
+            folder_path.mkdir(mode=0o700)
+        folder_status = folder_path.lstat()
+        if stat.S_ISDIR(folder_status.st_mode) and folder_status.st_uid == uid:
+            if folder_status.st_mode & 0o055 and not folder_status.st_mode & 0o022:
+                folder_path.chmod(0o700)
+            return folder_path
+        folder_path = base / f"rigd-{uid}-{number}"
     raise AssertionError("never reached")
 
 
@@ -173,11 +177,11 @@ def address_files(pattern: str, *folders: Path) -> list[Path]:
     *folders
         Folders to search; by default the user's runtime folder. Unreadable folders are skipped.
     """
-    paths: list[Path] = []
+    file_paths: list[Path] = []
     for folder in folders or (runtime_folder(),):
         with suppress(OSError):
-            paths += folder.glob(pattern)
-    return sorted(paths)
+            file_paths += folder.glob(pattern)
+    return sorted(file_paths)
 
 
 def announce(path: Path, address: Mapping[str, object]) -> None:
@@ -198,11 +202,11 @@ def announce(path: Path, address: Mapping[str, object]) -> None:
         If the file cannot be written.
     """
     path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-    new_path = path.with_suffix(f".{os.getpid()}")
-    new_path.unlink(missing_ok=True)
-    new_path.touch(mode=0o600)
-    new_path.write_text(json.dumps(address), encoding="utf-8")
-    new_path.replace(path)
+    temporary_path = path.with_suffix(f".{os.getpid()}")
+    temporary_path.unlink(missing_ok=True)
+    temporary_path.touch(mode=0o600)
+    temporary_path.write_text(json.dumps(address), encoding="utf-8")
+    temporary_path.replace(path)
 
 
 def read_address(path: Path) -> dict[str, Any]:
@@ -211,18 +215,18 @@ def read_address(path: Path) -> dict[str, Any]:
         # The file may be of any kind, even one that blocks on opening.
         descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
         with os.fdopen(descriptor, "rb") as file:
-            address = json.loads(file.read(_MAX_ADDRESS_BYTES))
+            address_document = json.loads(file.read(_MAX_ADDRESS_BYTES))
     except (OSError, ValueError, RecursionError):
         return {}
-    return address if isinstance(address, dict) else {}
+    return address_document if isinstance(address_document, dict) else {}
 
 
 def answers(path: str | Path) -> bool:
     """Return whether a process listens on a Unix socket."""
-    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe:
-        probe.settimeout(_CONNECT_TIMEOUT_S)
+    with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as probe_socket:
+        probe_socket.settimeout(_CONNECT_TIMEOUT_S)
         try:
-            probe.connect(os.fspath(path))
+            probe_socket.connect(os.fspath(path))
         except (BlockingIOError, TimeoutError):
             return True  # its queue is full
         except (OSError, ValueError):  # ValueError if it is not a valid path
@@ -237,8 +241,10 @@ def started_at(pid: int) -> int | None:
     process is not running.
     """
     try:
-        text = Path(f"/proc/{pid}/stat").read_text("utf-8")
+        stat_text = Path(f"/proc/{pid}/stat").read_text("utf-8")
     except OSError:
         return None
-    state, *fields = text.rpartition(")")[2].split()  # the name before may contain any character
-    return None if state in "ZX" else int(fields[18])
+    state, *stat_fields = stat_text.rpartition(")")[
+        2
+    ].split()  # the name before may contain any character
+    return None if state in "ZX" else int(stat_fields[18])

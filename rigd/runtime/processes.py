@@ -48,17 +48,17 @@ class RunningProcess:
         """Start time in clock ticks since the computer was started, or None if it has ended."""
         return started_at(self.pid)
 
-    def handles(self, number: int) -> bool:
+    def handles(self, signal_number: int) -> bool:
         """Return whether the process has a handler for a signal."""
-        return bool(self.handled_signals >> (number - 1) & 1)
+        return bool(self.handled_signals >> (signal_number - 1) & 1)
 
-    def ignores(self, number: int) -> bool:
+    def ignores(self, signal_number: int) -> bool:
         """Return whether the process ignores a signal."""
-        return bool(self.ignored_signals >> (number - 1) & 1)
+        return bool(self.ignored_signals >> (signal_number - 1) & 1)
 
-    def has_pending(self, number: int) -> bool:
+    def has_pending(self, signal_number: int) -> bool:
         """Return whether a signal was sent to the process but not received yet."""
-        return bool(self.pending_signals >> (number - 1) & 1)
+        return bool(self.pending_signals >> (signal_number - 1) & 1)
 
 
 def read_processes() -> list[RunningProcess]:
@@ -87,35 +87,37 @@ def read_process(pid: int) -> RunningProcess | None:
         Process id.
     """
     try:
-        status = Path(_PROCESS_TABLE, str(pid), "status").read_text("utf-8", errors="replace")
-        command = Path(_PROCESS_TABLE, str(pid), "cmdline").read_bytes()
-        return _parsed_process(pid, status, command)
+        status_text = Path(_PROCESS_TABLE, str(pid), "status").read_text("utf-8", errors="replace")
+        command_bytes = Path(_PROCESS_TABLE, str(pid), "cmdline").read_bytes()
+        return _parsed_process(pid, status_text, command_bytes)
     except (OSError, KeyError, ValueError, IndexError):
         return None
 
 
 def _parsed_process(pid: int, status: str, command: bytes) -> RunningProcess | None:
     """Return a process from its files in /proc, or None if it has ended."""
-    rows = [line.partition(":\t") for line in status.split("\n")]
-    fields = {key: value for key, _, value in reversed(rows)}  # a name's first value is used
-    state = fields["State"][:1]
-    if state in "ZX":
+    status_rows = [status_line.partition(":\t") for status_line in status.split("\n")]
+    status_fields = {
+        key: field_value for key, _, field_value in reversed(status_rows)
+    }  # a name's first value is used
+    process_state = status_fields["State"][:1]
+    if process_state in "ZX":
         return None
-    users = {int(number) for number in fields["Uid"].split()}
+    user_ids = {int(id_text) for id_text in status_fields["Uid"].split()}
     return RunningProcess(
         pid=pid,
-        parent=int(fields["PPid"]),
-        uid=users.pop() if len(users) == 1 else -1,
-        name=fields["Name"],
+        parent=int(status_fields["PPid"]),
+        uid=user_ids.pop() if len(user_ids) == 1 else -1,
+        name=status_fields["Name"],
         command=tuple(os.fsdecode(command).split("\0")[:-1]),
-        handled_signals=int(fields["SigCgt"], 16),
-        ignored_signals=int(fields["SigIgn"], 16),
-        pending_signals=int(fields["SigPnd"], 16) | int(fields["ShdPnd"], 16),
-        suspended=state in "Tt",
+        handled_signals=int(status_fields["SigCgt"], 16),
+        ignored_signals=int(status_fields["SigIgn"], 16),
+        pending_signals=int(status_fields["SigPnd"], 16) | int(status_fields["ShdPnd"], 16),
+        suspended=process_state in "Tt",
     )
 
 
-def send_signal(process: RunningProcess, start_ticks: int, number: int) -> bool:
+def send_signal(process: RunningProcess, start_ticks: int, signal_number: int) -> bool:
     """Send a signal to a process unless it has ended, and return whether the signal was sent.
 
     Parameters
@@ -130,7 +132,7 @@ def send_signal(process: RunningProcess, start_ticks: int, number: int) -> bool:
     if process.start_ticks != start_ticks:
         return False
     with suppress(OSError):
-        os.kill(process.pid, number)
+        os.kill(process.pid, signal_number)
         return True
     return False
 
@@ -159,6 +161,12 @@ def listening_sockets() -> list[Path]:
         If the system has no table of sockets.
     """
     # Num RefCount Protocol Flags Type St Inode Path
-    lines = _SOCKET_TABLE.read_text("utf-8", errors="surrogateescape").split("\n")
-    matches = filter(None, map(_SOCKET_LINE_PATTERN.fullmatch, lines))
-    return sorted({Path(match[2]) for match in matches if int(match[1], 16) & _LISTENING_FLAG})
+    table_lines = _SOCKET_TABLE.read_text("utf-8", errors="surrogateescape").split("\n")
+    line_matches = filter(None, map(_SOCKET_LINE_PATTERN.fullmatch, table_lines))
+    return sorted(
+        {
+            Path(line_match[2])
+            for line_match in line_matches
+            if int(line_match[1], 16) & _LISTENING_FLAG
+        }
+    )

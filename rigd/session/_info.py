@@ -99,17 +99,20 @@ class SessionInfo:
             "duration_s": self.duration_s,
             "missing_ticks": self.missing_ticks,
             "status_counts": self.status_counts,
-            "segments": {name: list(ticks) for name, ticks in self.segments.items()},
+            "segments": {
+                segment_name: list(segment_ticks)
+                for segment_name, segment_ticks in self.segments.items()
+            },
             "metadata": self.metadata,
             "outcome": self.outcome,
             "events": [
                 {
-                    "t_ns": event.t_ns,
-                    "level": event.level,
-                    "name": event.name,
-                    "message": event.message,
+                    "t_ns": logged_event.t_ns,
+                    "level": logged_event.level,
+                    "name": logged_event.name,
+                    "message": logged_event.message,
                 }
-                for event in self.events
+                for logged_event in self.events
             ],
             "attachments": self.attachments,
             "left_out": self.omission_texts,
@@ -118,7 +121,7 @@ class SessionInfo:
 
     def lines(self) -> list[str]:
         """Return the summary as text lines, with rounded numbers, and times in UTC and locally."""
-        rows = [
+        title_rows = [
             ("file", f"{self.path} ({self.size_bytes / 1e6:.2f} MB)"),
             ("started", _time_text(datetime.fromisoformat(self.start_utc))),
             *_outcome_rows(self.outcome or {}, is_whole=not self.missing_samples_text),
@@ -144,13 +147,18 @@ class SessionInfo:
                 if key != _START_KEY
             ),
             *(
-                (f"{event.t_ns / 1e9:.3f} s", f"{event.level}: {event.message} [{event.name}]")
-                for event in self.events
+                (
+                    f"{logged_event.t_ns / 1e9:.3f} s",
+                    f"{logged_event.level}: {logged_event.message} [{logged_event.name}]",
+                )
+                for logged_event in self.events
             ),
             *(("not shown", sentence) for sentence in self.omission_texts),
         ]
-        width = min(max(len(key) for key, _ in rows), _MAX_KEY_COLUMN_WIDTH)
-        return [f"{printable(key):{width}}  {printable(value)}" for key, value in rows]
+        key_column_width = min(max(len(key) for key, _ in title_rows), _MAX_KEY_COLUMN_WIDTH)
+        return [
+            f"{printable(key):{key_column_width}}  {printable(value)}" for key, value in title_rows
+        ]
 
 
 def describe(path: str | PathLike[str]) -> SessionInfo:
@@ -179,13 +187,13 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
             "Hz. The writing program must correct it."
         )
     ticks = session.samples["tick"]
-    ticks_spanned = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
+    spanned_ticks = int(ticks[-1]) - int(ticks[0]) + 1 if len(ticks) else 0
     omission_texts: list[str] = []
     # Ticks missing at the end leave no gap; only the outcome states them.
     scheduled_text = (session.outcome or {}).get("scheduled", "")
     if scheduled_text.isascii() and scheduled_text.isdigit():
         if _is_count(scheduled_text):
-            ticks_spanned = max(ticks_spanned, int(scheduled_text))
+            spanned_ticks = max(spanned_ticks, int(scheduled_text))
         else:
             omission_texts.append(
                 f"scheduled of the outcome, a number of {len(scheduled_text)} digits"
@@ -196,9 +204,9 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
         start_utc=_iso_text(session.start_utc_ns),
         rate_hz=rate_hz,
         samples=len(ticks),
-        ticks=ticks_spanned,
-        duration_s=ticks_spanned / rate_hz,
-        missing_ticks=ticks_spanned - len(ticks),
+        ticks=spanned_ticks,
+        duration_s=spanned_ticks / rate_hz,
+        missing_ticks=spanned_ticks - len(ticks),
         status_counts=_status_counts(session),
         segments=_EntryLimiter("segments", 50_000, omission_texts).mapping(session.segments),
         metadata=_EntryLimiter("keys", _MAX_METADATA_CHARACTERS, omission_texts).texts(
@@ -211,7 +219,10 @@ def describe(path: str | PathLike[str]) -> SessionInfo:
             session.events, session.omitted_event_count
         ),
         attachments=_EntryLimiter("attachments", 50_000, omission_texts).mapping(
-            {name: len(data) for name, data in session.attachments.items()}
+            {
+                attachment_name: len(attachment_bytes)
+                for attachment_name, attachment_bytes in session.attachments.items()
+            }
         ),
         omission_texts=omission_texts,
         missing_samples_text=_missing_samples_sentence(session),
@@ -225,18 +236,19 @@ def _missing_samples_sentence(session: Session) -> str:
     """
     ticks = session.samples["tick"]
     stated_count = (session.outcome or {}).get("recorded", "")
-    recorded = int(stated_count) if _is_count(stated_count) else 0
+    recorded_count = int(stated_count) if _is_count(stated_count) else 0
     present_text = f"those of ticks {ticks[0]} to {ticks[-1]} are" if len(ticks) else "none is"
-    if recorded > len(ticks):
+    if recorded_count > len(ticks):
         return (
-            f"{grouped(recorded - len(ticks))} of the {grouped(recorded)} samples that were "
+            f"{grouped(recorded_count - len(ticks))} of the {grouped(recorded_count)} samples "
+            "that were "
             f"recorded are not in this file ({present_text}): it was trimmed. Take the original."
         )
-    first, end = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
+    first, end_of_samples = (int(ticks[0]), int(ticks[-1]) + 1) if len(ticks) else (0, 0)
     incomplete_segments = [
-        name
-        for name, (first_tick, end_tick) in session.segments.items()
-        if end_tick > first_tick and (first_tick < first or end_tick > end)
+        segment_name
+        for segment_name, (first_tick, end_tick) in session.segments.items()
+        if end_tick > first_tick and (first_tick < first or end_tick > end_of_samples)
     ]
     if incomplete_segments and (session.outcome or {}).get("outcome") == "complete":
         return (
@@ -251,75 +263,85 @@ def _is_count(text: str) -> bool:
     return text.isascii() and text.isdigit() and len(text) <= _MAX_COUNT_DIGITS
 
 
-def _shortened(text: str, max_characters: int) -> str:
+def _shortened(long_text: str, max_characters: int) -> str:
     """Return the first characters of a text, followed by the number of omitted characters."""
-    if len(text) <= max_characters:
-        return text
-    return f"{text[:max_characters]}… and {len(text) - max_characters} more characters"
+    if len(long_text) <= max_characters:
+        return long_text
+    return f"{long_text[:max_characters]}… and {len(long_text) - max_characters} more characters"
 
 
-def readable_texts(values: Mapping[str, str], what: str) -> tuple[dict[str, str], list[str]]:
+def readable_texts(
+    file_texts: Mapping[str, str], entries_noun: str
+) -> tuple[dict[str, str], list[str]]:
     """Cut texts of a file to a readable length, and escape control characters.
 
     Parameters
     ----------
-    values : key → text, of any number and length
-    what : plural noun for the texts, for the line on omitted ones
+    file_texts : key → text, of any number and length
+    entries_noun : plural noun for the texts, for the line on omitted ones
 
     Returns
     -------
     The first texts by their keys, and a list with a line on the omitted texts, if there are any.
     """
     omission_texts: list[str] = []
-    shown_texts = _EntryLimiter(what, _MAX_METADATA_CHARACTERS, omission_texts).texts(values)
-    return {printable(key): printable(value) for key, value in shown_texts.items()}, omission_texts
+    shown_texts = _EntryLimiter(entries_noun, _MAX_METADATA_CHARACTERS, omission_texts).texts(
+        file_texts
+    )
+    return {
+        printable(key): printable(shown_text) for key, shown_text in shown_texts.items()
+    }, omission_texts
 
 
 class _EntryLimiter:
     """Cuts one kind of a file's entries, such as its events, to a total number of characters.
 
-    `what` is a plural noun for the entries. `max_characters` is the maximum number of characters in
+    `entries_noun` is a plural noun for the entries. `max_characters` is the maximum number of
+    characters in
     text or JSON form. A line on omitted entries is appended to `omission_texts`.
     """
 
-    def __init__(self, what: str, max_characters: int, omission_texts: list[str]) -> None:
-        self._entries_noun = what
+    def __init__(self, entries_noun: str, max_characters: int, omission_texts: list[str]) -> None:
+        self._entries_noun = entries_noun
         self._omission_texts = omission_texts
         self._remaining_characters = max_characters
 
-    def mapping(self, values: Mapping[str, _Value]) -> dict[str, _Value]:
+    def mapping(self, entries: Mapping[str, _Value]) -> dict[str, _Value]:
         """Return the first entries of a mapping, up to the maximum, with long keys cut."""
         shown_entries: dict[str, _Value] = {}
-        for count, (key, value) in enumerate(values.items()):
+        for entry_count, (key, entry_value) in enumerate(entries.items()):
             short_key = _shortened(key, _MAX_KEY_CHARACTERS)
-            if not self._fits(short_key, str(value)):
-                self._report_omitted(len(values) - count)
+            if not self._fits(short_key, str(entry_value)):
+                self._report_omitted(len(entries) - entry_count)
                 break
-            shown_entries[short_key] = value
+            shown_entries[short_key] = entry_value
         return shown_entries
 
-    def texts(self, values: Mapping[str, str]) -> dict[str, str]:
+    def texts(self, text_entries: Mapping[str, str]) -> dict[str, str]:
         """Return the first entries of a mapping of texts, with long keys and long texts cut."""
         return self.mapping(
-            {key: _shortened(value, _MAX_TEXT_CHARACTERS) for key, value in values.items()}
+            {
+                key: _shortened(entry_text, _MAX_TEXT_CHARACTERS)
+                for key, entry_text in text_entries.items()
+            }
         )
 
-    def events(self, events: Sequence[LoggedEvent], unread: int) -> list[LoggedEvent]:
+    def events(self, events: Sequence[LoggedEvent], unread_count: int) -> list[LoggedEvent]:
         """Return the first events, up to the maximum, with long texts cut.
 
-        `unread` is the number of further events in the file.
+        `unread_count` is the number of further events in the file.
         """
         shown_events: list[LoggedEvent] = []
-        for event in events:
-            short = replace(
-                event,
-                name=_shortened(event.name, _MAX_KEY_CHARACTERS),
-                message=_shortened(event.message, _MAX_TEXT_CHARACTERS),
+        for logged_event in events:
+            shortened_event = replace(
+                logged_event,
+                name=_shortened(logged_event.name, _MAX_KEY_CHARACTERS),
+                message=_shortened(logged_event.message, _MAX_TEXT_CHARACTERS),
             )
-            if not self._fits(short.name, short.message):
+            if not self._fits(shortened_event.name, shortened_event.message):
                 break
-            shown_events.append(short)
-        self._report_omitted(len(events) - len(shown_events) + unread)
+            shown_events.append(shortened_event)
+        self._report_omitted(len(events) - len(shown_events) + unread_count)
         return shown_events
 
     def _fits(self, *texts: str) -> bool:
@@ -330,17 +352,25 @@ class _EntryLimiter:
         )
         return self._remaining_characters >= 0
 
-    def _report_omitted(self, count: int) -> None:
-        """Append a line on `count` omitted entries, unless there are none."""
-        if count:
-            self._omission_texts.append(f"… and {count} more {self._entries_noun} not shown")
+    def _report_omitted(self, omitted_count: int) -> None:
+        """Append a line on `omitted_count` omitted entries, unless there are none."""
+        if omitted_count:
+            self._omission_texts.append(
+                f"… and {omitted_count} more {self._entries_noun} not shown"
+            )
 
 
 def _status_counts(session: Session) -> dict[str, int]:
     """Return name of a status flag → number of samples with it, for flags that occur."""
-    status = session.samples["status"]
-    counts = {flag.name or "": int(np.count_nonzero(status & flag.value)) for flag in Status}
-    return {name.lower(): count for name, count in counts.items() if count}
+    status_flags = session.samples["status"]
+    flag_counts = {
+        flag.name or "": int(np.count_nonzero(status_flags & flag.value)) for flag in Status
+    }
+    return {
+        flag_name.lower(): sample_count
+        for flag_name, sample_count in flag_counts.items()
+        if sample_count
+    }
 
 
 def _iso_text(utc_ns: int) -> str:
@@ -357,43 +387,45 @@ def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[
     """Yield the rows (title, text) for the record ``outcome``, with its touches and its fit."""
     shown_keys = {"outcome", "reason", "touches", "fit"}
     shown_keys |= {_RECOVERY_KEY_PREFIX + key for key in _recovery_items(outcome)}
-    text = outcome.get("outcome", "unknown")
-    text = text.capitalize() if is_whole else f"Recorded as {text}"
+    outcome_text = outcome.get("outcome", "unknown")
+    outcome_text = outcome_text.capitalize() if is_whole else f"Recorded as {outcome_text}"
     with suppress(KeyError, ValueError):  # outcome of another program, or of a recovery
-        text += f": {counts_text(outcome)}"
+        outcome_text += f": {counts_text(outcome)}"
         shown_keys |= _COUNT_KEYS
-    reason = outcome.get("reason")
-    yield "outcome", f"{text}. {reason}" if reason else text
+    reason_text = outcome.get("reason")
+    yield "outcome", f"{outcome_text}. {reason_text}" if reason_text else outcome_text
     for touch in touches_of(outcome):
         yield "touch", touch_line(touch).removeprefix("Touch ")
     for mode in (fit_of(outcome) or {"modes": []})["modes"]:
         if mode["shown"]:
             yield "fit", mode_line(mode)
     yield from (
-        _rounded_row(key, value)
-        for key, value in outcome.items()
-        if key not in shown_keys and value
+        _rounded_row(key, outcome_value)
+        for key, outcome_value in outcome.items()
+        if key not in shown_keys and outcome_value
     )
 
 
-def _rounded_row(key: str, value: str) -> tuple[str, str]:
+def _rounded_row(key: str, metadata_value: str) -> tuple[str, str]:
     """Return a metadata key and its value for a row of text, with rounded numbers and units.
 
     A value that is not a number or a list of numbers is returned unchanged.
     """
-    if len(value) > _MAX_ROUNDED_CHARACTERS:
-        return key, value
+    if len(metadata_value) > _MAX_ROUNDED_CHARACTERS:
+        return key, metadata_value
     with suppress(ValueError, OverflowError):
         if key.endswith(_UTC_KEY_SUFFIX):
-            return key.removesuffix(_UTC_KEY_SUFFIX), _time_text(_utc_datetime(int(value)))
-        digits = _TARE_DIGITS if key.startswith("tare_") else _SIGNIFICANT_DIGITS
+            return key.removesuffix(_UTC_KEY_SUFFIX), _time_text(_utc_datetime(int(metadata_value)))
+        significant_digits = _TARE_DIGITS if key.startswith("tare_") else _SIGNIFICANT_DIGITS
         rounded_numbers = [
-            f"{float(each):.{digits}g}" if "." in each else f"{int(each)}"
-            for each in value.split(",")
+            f"{float(number_text):.{significant_digits}g}"
+            if "." in number_text
+            else f"{int(number_text)}"
+            for number_text in metadata_value.split(",")
         ]
-        name = key.removesuffix(suffix_of(key)).replace("_", " ")
-        return name, f"{', '.join(rounded_numbers)} {unit_of(key)}".rstrip()
-    return key.replace("_", " "), value
+        shown_key = key.removesuffix(suffix_of(key)).replace("_", " ")
+        return shown_key, f"{', '.join(rounded_numbers)} {unit_of(key)}".rstrip()
+    return key.replace("_", " "), metadata_value
 
 
 def _time_text(time_utc: datetime) -> str:
@@ -404,9 +436,9 @@ def _time_text(time_utc: datetime) -> str:
 
 
 def _recovery_items(outcome: dict[str, str]) -> dict[str, str]:
-    """Return the items of the record ``outcome`` on a recovery, without their keys' prefix."""
+    """Return the items of the record ``outcome`` that a recovery added, without the key prefix."""
     return {
-        key.removeprefix(_RECOVERY_KEY_PREFIX): value
-        for key, value in outcome.items()
+        key.removeprefix(_RECOVERY_KEY_PREFIX): outcome_value
+        for key, outcome_value in outcome.items()
         if key.startswith(_RECOVERY_KEY_PREFIX)
     }

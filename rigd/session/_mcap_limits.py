@@ -76,30 +76,30 @@ class ReadingBudget:
                 "its work"
             )
 
-    def count_unpacked(self, size: int, location_text: str) -> None:
+    def count_unpacked(self, chunk_bytes: int, location_text: str) -> None:
         """Count the stated size of a chunk in bytes before the chunk is decompressed.
 
         Raises McapDamageError if the chunk, or all chunks of the file together, are too long.
         """
-        self._unpacked_bytes += size
-        if size > limits.MAX_CHUNK_BYTES or self._unpacked_bytes > limits.MAX_TOTAL_BYTES:
+        self._unpacked_bytes += chunk_bytes
+        if chunk_bytes > limits.MAX_CHUNK_BYTES or self._unpacked_bytes > limits.MAX_TOTAL_BYTES:
             raise McapDamageError(
-                f"claims {size} bytes{location_text}, which is more than the "
+                f"claims {chunk_bytes} bytes{location_text}, which is more than the "
                 f"{limits.MAX_CHUNK_BYTES >> 20} MiB for a chunk or the "
                 f"{limits.MAX_TOTAL_BYTES >> 20} MiB for a file that are accepted"
             )
 
-    def count_declared(self, opcode: int, content: Buffer, location_text: str) -> None:
+    def count_declared(self, opcode: int, record_content: Buffer, location_text: str) -> None:
         """Count the memory of a schema, channel, metadata record or attachment before it is parsed.
 
         `location_text` ends the error message. Raises McapError if there are too many such records
         in the file, or if they are too long.
         """
-        self._declared_bytes += len(content) + _DECLARATION_MEMORY_BYTES
+        self._declared_bytes += len(record_content) + _DECLARATION_MEMORY_BYTES
         if opcode != Opcode.ATTACHMENT:
-            self._declared_text_bytes += len(content)
+            self._declared_text_bytes += len(record_content)
         if opcode in (Opcode.METADATA, Opcode.CHANNEL):
-            self._count_keys += _count_keys(content, opcode, limits.MAX_ENTRIES)
+            self._count_keys += _count_keys(record_content, opcode, limits.MAX_ENTRIES)
         for used_bytes, max_bytes, unit_text in (
             (
                 self._declared_bytes,
@@ -131,11 +131,11 @@ def zstd_decompressor() -> zstandard.ZstdDecompressor:
 def decompressed_chunk(
     zstd: zstandard.ZstdDecompressor,
     compression: bytes,
-    packed: memoryview,
-    size: int,
+    packed_bytes: memoryview,
+    unpacked_bytes: int,
     location_text: str,
 ) -> bytes:
-    """Return the decompressed content of a chunk, which must have exactly `size` bytes.
+    """Return the decompressed content of a chunk, which must have exactly `unpacked_bytes` bytes.
 
     Parameters
     ----------
@@ -157,54 +157,58 @@ def decompressed_chunk(
     """
     try:
         if compression == b"":
-            records = bytes(packed[: size + 1])
+            unpacked_records = bytes(packed_bytes[: unpacked_bytes + 1])
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, location_text)
-            records = zstd.decompress(packed, max_output_size=size)
+            _check_zstd_size(packed_bytes, unpacked_bytes, location_text)
+            unpacked_records = zstd.decompress(packed_bytes, max_output_size=unpacked_bytes)
         elif compression == b"lz4":
             # One byte more than allowed, so that a longer chunk is detected.
-            records = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size + 1)
+            unpacked_records = lz4.frame.LZ4FrameDecompressor().decompress(
+                packed_bytes, max_length=unpacked_bytes + 1
+            )
         else:
             raise McapDamageError(f"uses the unknown compression {compression!r}{location_text}")
     except (zstandard.ZstdError, RuntimeError, ValueError):
         raise McapDamageError(f"does not decompress{location_text}") from None
-    if len(records) != size:
+    if len(unpacked_records) != unpacked_bytes:
         raise McapDamageError(f"decompresses to a wrong size{location_text}")
-    return records
+    return unpacked_records
 
 
 def decompressed_parts(
     zstd: zstandard.ZstdDecompressor,
     compression: bytes,
-    packed: memoryview,
-    size: int,
+    packed_bytes: memoryview,
+    stated_bytes: int,
     location_text: str,
 ) -> Iterator[Buffer]:
     """Yield the decompressed content of a long chunk in parts.
 
-    The parts together may exceed `size` by one part. Parameters and errors are those of
+    The parts together may exceed `stated_bytes` by one part. Parameters and errors are those of
     :func:`decompressed_chunk`, but the caller compares the length.
     """
     unpacked_bytes = 0
     try:
         if compression == b"":
-            for start in range(0, len(packed), MAX_UNPACKED_BYTES):
-                yield packed[start : start + MAX_UNPACKED_BYTES]
+            for input_position in range(0, len(packed_bytes), MAX_UNPACKED_BYTES):
+                yield packed_bytes[input_position : input_position + MAX_UNPACKED_BYTES]
         elif compression == b"zstd":
-            _check_zstd_size(packed, size, location_text)
-            stream = zstd.stream_reader(packed)
-            while unpacked_bytes <= size and (part := stream.read(MAX_UNPACKED_BYTES)):
-                unpacked_bytes += len(part)
-                yield part
+            _check_zstd_size(packed_bytes, stated_bytes, location_text)
+            zstd_stream = zstd.stream_reader(packed_bytes)
+            while unpacked_bytes <= stated_bytes and (
+                unpacked_part := zstd_stream.read(MAX_UNPACKED_BYTES)
+            ):
+                unpacked_bytes += len(unpacked_part)
+                yield unpacked_part
         elif compression == b"lz4":
             lz4_stream = lz4.frame.LZ4FrameDecompressor()
-            for start in range(0, len(packed), _LZ4_INPUT_BYTES):
-                lz4_input: Buffer = packed[start : start + _LZ4_INPUT_BYTES]
-                while not lz4_stream.eof and unpacked_bytes <= size:
-                    part = lz4_stream.decompress(lz4_input, max_length=MAX_UNPACKED_BYTES)
-                    unpacked_bytes += len(part)
-                    if part:
-                        yield part
+            for input_position in range(0, len(packed_bytes), _LZ4_INPUT_BYTES):
+                lz4_input: Buffer = packed_bytes[input_position : input_position + _LZ4_INPUT_BYTES]
+                while not lz4_stream.eof and unpacked_bytes <= stated_bytes:
+                    unpacked_part = lz4_stream.decompress(lz4_input, max_length=MAX_UNPACKED_BYTES)
+                    unpacked_bytes += len(unpacked_part)
+                    if unpacked_part:
+                        yield unpacked_part
                     if lz4_stream.needs_input:
                         break
                     lz4_input = b""
@@ -214,47 +218,49 @@ def decompressed_parts(
         raise McapDamageError(f"does not decompress{location_text}") from None
 
 
-def _check_zstd_size(packed: memoryview, size: int, location_text: str) -> None:
+def _check_zstd_size(packed_bytes: memoryview, chunk_bytes: int, location_text: str) -> None:
     """Raise if the Zstandard frame states another size than the chunk.
 
     The decompressor would allocate the size that the frame states.
     """
-    stated_size = zstandard.get_frame_parameters(packed).content_size
-    if stated_size not in (size, zstandard.CONTENTSIZE_UNKNOWN):
+    stated_size = zstandard.get_frame_parameters(packed_bytes).content_size
+    if stated_size not in (chunk_bytes, zstandard.CONTENTSIZE_UNKNOWN):
         raise McapDamageError(f"states two different sizes{location_text}")
 
 
-def read_prefixed_bytes(content: memoryview, position: int, prefix: str) -> tuple[memoryview, int]:
+def read_prefixed_bytes(
+    record_content: memoryview, position: int, length_format: str
+) -> tuple[memoryview, int]:
     """Return the bytes that follow a length field at `position`, and the offset of their end.
 
-    `prefix` is the length field's format for the module ``struct``.
+    `length_format` is the length field's format for the module ``struct``.
     """
-    (length,) = struct.unpack_from(prefix, content, position)
-    start = position + struct.calcsize(prefix)
-    if length > len(content) - start:
+    (byte_count,) = struct.unpack_from(length_format, record_content, position)
+    bytes_start = position + struct.calcsize(length_format)
+    if byte_count > len(record_content) - bytes_start:
         raise struct.error
-    return content[start : start + length], start + length
+    return record_content[bytes_start : bytes_start + byte_count], bytes_start + byte_count
 
 
-def _count_keys(content: Buffer, opcode: int, max_count: int) -> int:
+def _count_keys(record_content: Buffer, opcode: int, max_count: int) -> int:
     """Return the number of keys in the map of a metadata or channel record, up to `max_count` + 1.
 
     Counting ends at a malformed entry, which raises an error when the record is parsed.
     """
-    view = memoryview(content)
-    count = 0
+    content_view = memoryview(record_content)
+    key_count = 0
     try:
         if opcode == Opcode.METADATA:
-            _, position = read_prefixed_bytes(view, 0, "<I")
+            _, position = read_prefixed_bytes(content_view, 0, "<I")
         else:
-            _, position = read_prefixed_bytes(view, 4, "<I")
-            _, position = read_prefixed_bytes(view, position, "<I")
-        entries, _ = read_prefixed_bytes(view, position, "<I")
+            _, position = read_prefixed_bytes(content_view, 4, "<I")
+            _, position = read_prefixed_bytes(content_view, position, "<I")
+        map_entries, _ = read_prefixed_bytes(content_view, position, "<I")
         position = 0
-        while position < len(entries) and count <= max_count:
-            _, position = read_prefixed_bytes(entries, position, "<I")
-            _, position = read_prefixed_bytes(entries, position, "<I")
-            count += 1
+        while position < len(map_entries) and key_count <= max_count:
+            _, position = read_prefixed_bytes(map_entries, position, "<I")
+            _, position = read_prefixed_bytes(map_entries, position, "<I")
+            key_count += 1
     except struct.error:
         pass
-    return count
+    return key_count

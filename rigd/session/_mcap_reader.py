@@ -120,8 +120,10 @@ class McapContents:
 
     def count(self, topic: str) -> int:
         """Return the number of messages of a topic that were read."""
-        channels = [channel.id for channel in self.channels.values() if channel.topic == topic]
-        return sum(self.message_counts[channel] for channel in channels)
+        topic_channels = [
+            channel.id for channel in self.channels.values() if channel.topic == topic
+        ]
+        return sum(self.message_counts[channel] for channel in topic_channels)
 
 
 def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
@@ -135,11 +137,14 @@ def message_starts(runs: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
     -------
     array (sum of the counts,) of offsets from the beginning of the first message
     """
-    _, sizes, counts = runs.T
-    lengths = sizes * counts
-    index_in_run = np.arange(counts.sum()) - np.repeat(np.cumsum(counts) - counts, counts)
+    _, message_sizes, run_message_counts = runs.T
+    run_bytes = message_sizes * run_message_counts
+    index_in_run = np.arange(run_message_counts.sum()) - np.repeat(
+        np.cumsum(run_message_counts) - run_message_counts, run_message_counts
+    )
     return np.asarray(
-        np.repeat(np.cumsum(lengths) - lengths, counts) + index_in_run * np.repeat(sizes, counts)
+        np.repeat(np.cumsum(run_bytes) - run_bytes, run_message_counts)
+        + index_in_run * np.repeat(message_sizes, run_message_counts)
     )
 
 
@@ -148,7 +153,7 @@ OnBlock = Callable[[McapContents, MessageBlock], None]
 
 
 def read_mcap(
-    data: memoryview,
+    file_data: memoryview,
     topics: Collection[str] | None,
     *,
     on_block: OnBlock | None = None,
@@ -159,7 +164,7 @@ def read_mcap(
 
     Parameters
     ----------
-    data : bytes of the file; pages of an ``mmap`` are released when they have been read
+    file_data : bytes of the file; pages of an ``mmap`` are released when they have been read
     topics : topics whose messages are wanted; None for all
     on_block
         Called with the wanted messages, block by block in the order of the file, before it is known
@@ -181,33 +186,33 @@ def read_mcap(
     McapTooLargeError
         If the file is too long, or contains too many records.
     """
-    if bytes(data[: len(MAGIC)]) != MAGIC:
+    if bytes(file_data[: len(MAGIC)]) != MAGIC:
         raise McapError("is not an MCAP file")
-    if len(data) > limits.MAX_FILE_BYTES:
+    if len(file_data) > limits.MAX_FILE_BYTES:
         raise McapTooLargeError(
-            f"has {len(data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB that are "
-            "read"
+            f"has {len(file_data) >> 20} MiB, more than the {limits.MAX_FILE_BYTES >> 20} MiB "
+            "that are read"
         )
-    reader = _ContainerReader(data, topics, on_block, salvage=salvage)
-    contents = reader.contents
-    contents.complete = _has_footer(data)
+    container_reader = _ContainerReader(file_data, topics, on_block, salvage=salvage)
+    mcap_contents = container_reader.contents
+    mcap_contents.complete = _has_footer(file_data)
     try:
-        reader.read(on_progress)
+        container_reader.read(on_progress)
     except McapDamageError as error:
-        contents.damage = str(error)
-        if salvage and contents.complete:
-            contents.stated_counts = reader.stated_counts()
+        mcap_contents.damage = str(error)
+        if salvage and mcap_contents.complete:
+            mcap_contents.stated_counts = container_reader.stated_counts()
     except MemoryError:
-        contents.damage = "does not fit into the memory of this machine"
-    return contents
+        mcap_contents.damage = "does not fit into the memory of this machine"
+    return mcap_contents
 
 
-def _has_footer(data: memoryview) -> bool:
+def _has_footer(file_data: memoryview) -> bool:
     """Return whether an MCAP file ends with a footer record and the magic bytes."""
-    start = len(data) - len(MAGIC) - FOOTER_FORMAT.size
-    if start < len(MAGIC) or bytes(data[-len(MAGIC) :]) != MAGIC:
+    footer_position = len(file_data) - len(MAGIC) - FOOTER_FORMAT.size
+    if footer_position < len(MAGIC) or bytes(file_data[-len(MAGIC) :]) != MAGIC:
         return False
-    return RECORD_HEAD_FORMAT.unpack_from(data, start) == (
+    return RECORD_HEAD_FORMAT.unpack_from(file_data, footer_position) == (
         Opcode.FOOTER,
         _FOOTER_CONTENT_SIZE,
     )
@@ -218,16 +223,16 @@ def _locate_record(data: Buffer, position: int, location_text: str) -> tuple[int
 
     `location_text` ends the error message for a truncated record.
     """
-    content = position + RECORD_HEAD_FORMAT.size
-    if content > len(data):
+    content_start = position + RECORD_HEAD_FORMAT.size
+    if content_start > len(data):
         raise _truncated_record_error(position, location_text)
-    opcode, length = RECORD_HEAD_FORMAT.unpack_from(data, position)
+    opcode, content_length = RECORD_HEAD_FORMAT.unpack_from(data, position)
     if opcode == 0:
         raise _missing_record_error(position, location_text)
-    end = content + length
-    if end > len(data):
+    content_end = content_start + content_length
+    if content_end > len(data):
         raise _truncated_record_error(position, location_text)
-    return opcode, content, end
+    return opcode, content_start, content_end
 
 
 def _truncated_record_error(position: int, location_text: str) -> McapDamageError:
@@ -302,14 +307,14 @@ class _ContainerReader:
                 self._release_up_to(end)
         raise McapDamageError("has no end of its data section")
 
-    def _add_skipped(self, damage: str) -> None:
+    def _add_skipped(self, damage_text: str) -> None:
         """Store the description of a skipped record; beyond `MAX_SKIPPED` store a count only."""
         self._skipped += 1
-        skipped = self.contents.skipped
+        skipped_texts = self.contents.skipped
         if self._skipped > MAX_SKIPPED:
-            del skipped[MAX_SKIPPED:]
-            damage = f"has {self._skipped - MAX_SKIPPED} more damaged records"
-        skipped.append(damage)
+            del skipped_texts[MAX_SKIPPED:]
+            damage_text = f"has {self._skipped - MAX_SKIPPED} more damaged records"
+        skipped_texts.append(damage_text)
 
     def _release_up_to(self, end: int) -> None:
         """Update the checksum of the data section up to `end`, and release the memory before it."""
@@ -344,100 +349,112 @@ class _ContainerReader:
             raise McapDamageError(f"has a message outside of a chunk{location_text}")
         if self._group_room == 0:
             self._group_position, self._group_room = start, _MAX_GROUP_MESSAGES
-        limit = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
-        end, count = self._read_messages(
-            self._data, start, limit, self._group_position, location_text, self._group_room
+        limit_position = min(len(self._data), max(first_end, start + MAX_UNPACKED_BYTES))
+        end, message_count = self._read_messages(
+            self._data, start, limit_position, self._group_position, location_text, self._group_room
         )
-        self._group_room -= count
+        self._group_room -= message_count
         return end
 
     def _is_stray_message(self, channel: int) -> bool:
         """Return whether a message outside of chunks belongs to a channel declared in chunks."""
         return self._salvage and channel in self.contents.declared_in_chunks
 
-    def _read_declaration(self, opcode: int, content: Buffer, location_text: str) -> None:
+    def _read_declaration(self, opcode: int, record_content: Buffer, location_text: str) -> None:
         """Store a schema, channel, metadata record or attachment; ignore other kinds of record."""
-        contents = self.contents
+        mcap_contents = self.contents
         if opcode not in _DECLARATION_OPCODES:
             return
         self._budget.count_steps(DECLARATION_STEPS)
         # Many writers repeat schemas and channels in every chunk; a repetition takes no memory.
-        number = (opcode, bytes(content[: _CHANNEL_NUMBER_FORMAT.size]))
-        if self._declarations.get(number) == content:
+        declaration_key = (opcode, bytes(record_content[: _CHANNEL_NUMBER_FORMAT.size]))
+        if self._declarations.get(declaration_key) == record_content:
             return
-        self._budget.count_declared(opcode, content, location_text)
+        self._budget.count_declared(opcode, record_content, location_text)
         if opcode == Opcode.SCHEMA:
-            schema = parse_record(Schema.read, content, location_text)
-            if contents.schemas.setdefault(schema.id, schema) != schema:
+            schema = parse_record(Schema.read, record_content, location_text)
+            if mcap_contents.schemas.setdefault(schema.id, schema) != schema:
                 raise McapDamageError(
                     f"declares schema {schema.id} twice, differently{location_text}"
                 )
-            self._declarations[number] = bytes(content)
+            self._declarations[declaration_key] = bytes(record_content)
         elif opcode == Opcode.CHANNEL:
-            channel = parse_record(Channel.read, content, location_text)
-            if contents.channels.setdefault(channel.id, channel) != channel:
+            channel = parse_record(Channel.read, record_content, location_text)
+            if mcap_contents.channels.setdefault(channel.id, channel) != channel:
                 raise McapDamageError(
                     f"declares channel {channel.id} twice, differently{location_text}"
                 )
             self._is_wanted[channel.id] = self._topics is None or channel.topic in self._topics
-            self._declarations[number] = bytes(content)
+            self._declarations[declaration_key] = bytes(record_content)
         elif opcode == Opcode.METADATA:
-            contents.metadata.append(parse_record(Metadata.read, content, location_text))
+            mcap_contents.metadata.append(
+                parse_record(Metadata.read, record_content, location_text)
+            )
         elif opcode == Opcode.ATTACHMENT:
-            if len(content) >= 4:
-                (crc,) = struct.unpack_from("<I", content, len(content) - 4)
-                if crc not in (0, zlib.crc32(content[:-4])):
+            if len(record_content) >= 4:
+                (crc,) = struct.unpack_from("<I", record_content, len(record_content) - 4)
+                if crc not in (0, zlib.crc32(record_content[:-4])):
                     raise McapDamageError(f"has an attachment with a wrong checksum{location_text}")
-            contents.attachments.append(parse_record(Attachment.read, content, location_text))
+            mcap_contents.attachments.append(
+                parse_record(Attachment.read, record_content, location_text)
+            )
 
-    def _read_chunk(self, content: memoryview, start: int) -> None:
+    def _read_chunk(self, chunk_content: memoryview, chunk_position: int) -> None:
         """Decompress a chunk, verify its checksum, and read the records in it."""
         self._budget.count_steps(CHUNK_STEPS)
-        location_text = f" in the chunk at byte {start}"
+        location_text = f" in the chunk at byte {chunk_position}"
         try:
-            *_, size, crc = _CHUNK_HEAD_FORMAT.unpack_from(content)
-            name, position = read_prefixed_bytes(content, _CHUNK_HEAD_FORMAT.size, "<I")
-            packed, _ = read_prefixed_bytes(content, position, "<Q")
+            *_, stated_size, stated_crc = _CHUNK_HEAD_FORMAT.unpack_from(chunk_content)
+            compression_name, packed_position = read_prefixed_bytes(
+                chunk_content, _CHUNK_HEAD_FORMAT.size, "<I"
+            )
+            packed_bytes, _ = read_prefixed_bytes(chunk_content, packed_position, "<Q")
         except struct.error:
             raise McapDamageError(f"has a malformed head{location_text}") from None
-        self._budget.count_unpacked(size, location_text)
-        compression = bytes(name[:20])
-        if size <= MAX_UNPACKED_BYTES:
-            records = decompressed_chunk(self._zstd, compression, packed, size, location_text)
-            if crc not in (0, zlib.crc32(records)):
+        self._budget.count_unpacked(stated_size, location_text)
+        compression = bytes(compression_name[:20])
+        if stated_size <= MAX_UNPACKED_BYTES:
+            unpacked_records = decompressed_chunk(
+                self._zstd, compression, packed_bytes, stated_size, location_text
+            )
+            if stated_crc not in (0, zlib.crc32(unpacked_records)):
                 raise McapDamageError(f"has a wrong checksum{location_text}")
-            end = self._read_records(records, 0, start, location_text)
-            if end < len(records):
+            end = self._read_records(unpacked_records, 0, chunk_position, location_text)
+            if end < len(unpacked_records):
                 raise _truncated_record_error(end, location_text)
             return
         # Too long for memory: decompressed once to verify the checksum, and again to be read.
         unpacked_bytes, unpacked_crc = 0, 0
-        for part in decompressed_parts(self._zstd, compression, packed, size, location_text):
-            unpacked_bytes += len(part)
-            unpacked_crc = zlib.crc32(part, unpacked_crc)
+        for unpacked_part in decompressed_parts(
+            self._zstd, compression, packed_bytes, stated_size, location_text
+        ):
+            unpacked_bytes += len(unpacked_part)
+            unpacked_crc = zlib.crc32(unpacked_part, unpacked_crc)
             self._release_pages()
-        if unpacked_bytes != size:
+        if unpacked_bytes != stated_size:
             raise McapDamageError(f"decompresses to a wrong size{location_text}")
-        if crc not in (0, unpacked_crc):
+        if stated_crc not in (0, unpacked_crc):
             raise McapDamageError(f"has a wrong checksum{location_text}")
         self._read_parts(
-            decompressed_parts(self._zstd, compression, packed, size, location_text),
-            start,
+            decompressed_parts(self._zstd, compression, packed_bytes, stated_size, location_text),
+            chunk_position,
             location_text,
         )
 
-    def _read_parts(self, parts: Iterator[Buffer], chunk_position: int, location_text: str) -> None:
+    def _read_parts(
+        self, record_parts: Iterator[Buffer], chunk_position: int, location_text: str
+    ) -> None:
         """Read the records of a chunk that arrives in parts; a record may span several parts."""
         remainder = b""  # beginning of a record whose end is in a later part
         remainder_offset = 0  # offset of `rest` in the chunk
         bytes_to_skip = 0  # remaining bytes of an unwanted record
-        for part in parts:
+        for record_part in record_parts:
             self._release_pages()
-            if bytes_to_skip >= len(part):
-                bytes_to_skip -= len(part)
-                remainder_offset += len(part)
+            if bytes_to_skip >= len(record_part):
+                bytes_to_skip -= len(record_part)
+                remainder_offset += len(record_part)
                 continue
-            remainder += part[bytes_to_skip:]
+            remainder += record_part[bytes_to_skip:]
             remainder_offset += bytes_to_skip
             bytes_to_skip = 0
             used_bytes = self._read_records(
@@ -469,20 +486,20 @@ class _ContainerReader:
             self.contents.message_counts[channel] += 1
         return int(length) + RECORD_HEAD_FORMAT.size
 
-    def _is_accepted_length(self, length: int, location_text: str) -> bool:
+    def _is_accepted_length(self, message_length: int, location_text: str) -> bool:
         """Return whether a message is within the maximum length; record a longer one as skipped.
 
         Raises McapDamageError for a longer message unless in salvage mode.
         """
-        if length <= limits.MAX_MESSAGE_BYTES:
+        if message_length <= limits.MAX_MESSAGE_BYTES:
             return True
-        damage = (
-            f"has a message of {length} bytes{location_text}, more than the "
+        damage_text = (
+            f"has a message of {message_length} bytes{location_text}, more than the "
             f"{limits.MAX_MESSAGE_BYTES >> 20} MiB that are accepted"
         )
         if not self._salvage:
-            raise McapDamageError(damage)
-        self._add_skipped(damage)
+            raise McapDamageError(damage_text)
+        self._add_skipped(damage_text)
         return False
 
     def _read_records(
@@ -494,27 +511,27 @@ class _ContainerReader:
         """
         end = 0
         while end < len(records):
-            start = end
-            end, count = self._read_messages(
-                records, start, len(records), chunk_position, location_text
+            content_start = end
+            end, message_count = self._read_messages(
+                records, content_start, len(records), chunk_position, location_text
             )
-            if count:
+            if message_count:
                 continue
-            if start + RECORD_HEAD_FORMAT.size > len(records):
-                return start
-            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, start)
+            if content_start + RECORD_HEAD_FORMAT.size > len(records):
+                return content_start
+            opcode, length = RECORD_HEAD_FORMAT.unpack_from(records, content_start)
             if opcode == 0:
-                raise _missing_record_error(buffer_offset + start, location_text)
-            content = start + RECORD_HEAD_FORMAT.size
-            end = content + length
+                raise _missing_record_error(buffer_offset + content_start, location_text)
+            record_content = content_start + RECORD_HEAD_FORMAT.size
+            end = record_content + length
             if end > len(records):
-                return start
+                return content_start
             self._budget.count_steps(1)
             if opcode == Opcode.MESSAGE:
                 raise McapDamageError(f"has a message that is too short{location_text}")
-            self._read_declaration(opcode, records[content:end], location_text)
+            self._read_declaration(opcode, records[record_content:end], location_text)
             if opcode == Opcode.CHANNEL:
-                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, content)
+                (channel,) = _CHANNEL_NUMBER_FORMAT.unpack_from(records, record_content)
                 self.contents.declared_in_chunks.add(channel)
         return end
 
@@ -522,30 +539,33 @@ class _ContainerReader:
         self,
         records: Buffer,
         start: int,
-        limit: int,
+        limit_position: int,
         chunk_position: int,
         location_text: str,
         max_messages: int | None = None,
     ) -> tuple[int, int]:
-        """Pass the messages from `start` to the callback, up to another record or `limit`.
+        """Pass the messages from `start` to the callback, up to another record or `limit_position`.
 
         `max_messages` limits the number of messages outside of chunks. Returns the offset after the
         last message, and the number of messages.
         """
         unpack_run_head = _RUN_HEAD_FORMAT.unpack_from
         wanted_by_channel, message_counts = self._is_wanted, self.contents.message_counts
-        runs: list[Run] = []
+        message_runs: list[Run] = []
         position = start
         message_count = run_count = 0  # number of messages, and number of runs of messages
         try:
-            while position + MESSAGE_HEAD_FORMAT.size <= limit and run_count < _MAX_BLOCK_RUNS:
+            while (
+                position + MESSAGE_HEAD_FORMAT.size <= limit_position
+                and run_count < _MAX_BLOCK_RUNS
+            ):
                 run_head = unpack_run_head(records, position)
                 opcode, length, channel = run_head
-                size = length + RECORD_HEAD_FORMAT.size
+                message_size = length + RECORD_HEAD_FORMAT.size
                 if (
                     opcode != Opcode.MESSAGE
-                    or size < MESSAGE_HEAD_FORMAT.size
-                    or position + size > limit
+                    or message_size < MESSAGE_HEAD_FORMAT.size
+                    or position + message_size > limit_position
                 ):
                     break
                 is_wanted = wanted_by_channel.get(channel)
@@ -557,25 +577,30 @@ class _ContainerReader:
                     message_count == max_messages or self._is_stray_message(channel)
                 ):
                     break
-                end = position + size
-                count = 1
-                while end + size <= limit and unpack_run_head(records, end) == run_head:
-                    end += size
-                    count += 1
-                    if count == _MAX_SINGLE_COMPARISONS:
-                        count = _run_length(records, position, size, limit)
+                end = position + message_size
+                run_message_count = 1
+                while (
+                    end + message_size <= limit_position
+                    and unpack_run_head(records, end) == run_head
+                ):
+                    end += message_size
+                    run_message_count += 1
+                    if run_message_count == _MAX_SINGLE_COMPARISONS:
+                        run_message_count = _run_length(
+                            records, position, message_size, limit_position
+                        )
                         break
                 if max_messages is not None:
-                    count = min(count, max_messages - message_count)
+                    run_message_count = min(run_message_count, max_messages - message_count)
                 if is_wanted and self._is_accepted_length(length, location_text):
-                    runs.append((channel, size, position, count))
-                message_counts[channel] += count
-                position += size * count
-                message_count += count
+                    message_runs.append((channel, message_size, position, run_message_count))
+                message_counts[channel] += run_message_count
+                position += message_size * run_message_count
+                message_count += run_message_count
                 run_count += 1
         finally:
-            if runs and self._on_block is not None:
-                self._on_block(self.contents, MessageBlock(records, runs, chunk_position))
+            if message_runs and self._on_block is not None:
+                self._on_block(self.contents, MessageBlock(records, message_runs, chunk_position))
         self._budget.count_steps(run_count)
         return position, message_count
 
@@ -595,37 +620,42 @@ class _ContainerReader:
             raise McapDamageError(
                 "ends in the middle of its summary, or something was appended to it"
             )
-        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
-        *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
-        if summary_start not in (0, start) or (summary_start == 0 and footer != start):
+        footer_position = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer_position)
+        if summary_start not in (0, start) or (summary_start == 0 and footer_position != start):
             raise McapDamageError(
-                f"has a footer that contradicts its data section at byte {footer}"
+                f"has a footer that contradicts its data section at byte {footer_position}"
             )
-        if crc not in (0, self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4)):
+        if crc not in (0, self._crc_of_range(start, footer_position + FOOTER_FORMAT.size - 4)):
             raise McapDamageError("has a wrong checksum over its summary")
-        for opcode, content in self._summary_records(start, footer):
+        for opcode, record_content in self._summary_records(start, footer_position):
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 # A channel without messages may be declared in the summary only.
-                self._read_declaration(opcode, content, " in the summary")
+                self._read_declaration(opcode, record_content, " in the summary")
             elif opcode == Opcode.STATISTICS:
-                statistics = parse_record(Statistics.read, content, " in the summary")
+                statistics = parse_record(Statistics.read, record_content, " in the summary")
                 read_counts = self.contents.message_counts
                 stated_counts = statistics.channel_message_counts
-                if any(read_counts[channel] != count for channel, count in stated_counts.items()):
+                if any(
+                    read_counts[channel] != channel_count
+                    for channel, channel_count in stated_counts.items()
+                ):
                     raise McapDamageError("does not contain the messages that its statistics count")
 
-    def _summary_records(self, start: int, footer: int) -> Iterator[tuple[int, memoryview]]:
-        """Yield opcode and content of each record between `start` and `footer`."""
-        data, end, released_end = self._data[:footer], start, start
-        while end < footer:
-            opcode, content, end = _locate_record(data, end, " of the summary")
+    def _summary_records(
+        self, start: int, footer_position: int
+    ) -> Iterator[tuple[int, memoryview]]:
+        """Yield opcode and content of each record between `start` and `footer_position`."""
+        data, end, released_end = self._data[:footer_position], start, start
+        while end < footer_position:
+            opcode, record_content, end = _locate_record(data, end, " of the summary")
             if end - released_end > _RELEASE_INTERVAL_BYTES:
                 released_end = end
                 self._release_pages()
             # Each channel in the statistics takes time.
             is_statistics = opcode == Opcode.STATISTICS
-            self._budget.count_steps(1 + (end - content) // 4 if is_statistics else 1)
-            yield opcode, data[content:end]
+            self._budget.count_steps(1 + (end - record_content) // 4 if is_statistics else 1)
+            yield opcode, data[record_content:end]
 
     def stated_counts(self) -> dict[int, int]:
         """Return the message count of each channel from the file's statistics.
@@ -633,16 +663,18 @@ class _ContainerReader:
         Returns an empty dictionary if the summary has no correct checksum.
         """
         data = self._data
-        footer = len(data) - len(MAGIC) - FOOTER_FORMAT.size
-        *_, start, _, crc = FOOTER_FORMAT.unpack_from(data, footer)
-        if not len(MAGIC) <= start <= footer:
+        footer_position = len(data) - len(MAGIC) - FOOTER_FORMAT.size
+        *_, summary_start, _, crc = FOOTER_FORMAT.unpack_from(data, footer_position)
+        if not len(MAGIC) <= summary_start <= footer_position:
             return {}
-        if crc == 0 or crc != self._crc_of_range(start, footer + FOOTER_FORMAT.size - 4):
+        if crc == 0 or crc != self._crc_of_range(
+            summary_start, footer_position + FOOTER_FORMAT.size - 4
+        ):
             return {}
         try:
-            for opcode, content in self._summary_records(start, footer):
+            for opcode, record_content in self._summary_records(summary_start, footer_position):
                 if opcode == Opcode.STATISTICS:
-                    statistics = parse_record(Statistics.read, content, "")
+                    statistics = parse_record(Statistics.read, record_content, "")
                     return dict(statistics.channel_message_counts)
         except McapDamageError:
             pass
@@ -650,35 +682,41 @@ class _ContainerReader:
 
 
 def parse_record(
-    read: Callable[[ReadDataStream], _Record], content: Buffer, location_text: str
+    read_record: Callable[[ReadDataStream], _Record], record_content: Buffer, location_text: str
 ) -> _Record:
     """Return a record parsed with the ``mcap`` package; raise McapDamageError if malformed."""
     try:
-        stream = ReadDataStream(BytesIO(content))
-        record = read(stream)
+        stream = ReadDataStream(BytesIO(record_content))
+        parsed_record = read_record(stream)
     except (EndOfFile, struct.error, UnicodeDecodeError, OverflowError):
         raise McapDamageError(f"has a malformed record{location_text}") from None
-    return record
+    return parsed_record
 
 
-def _run_length(records: Buffer, start: int, size: int, limit: int) -> int:
+def _run_length(records: Buffer, start: int, message_size: int, limit_position: int) -> int:
     """Return the number of consecutive records from `start` with the same opcode, length, channel.
 
-    Records end before `limit`. Ever more records are compared at once, so that short runs in long
-    chunks take little time.
+    All records end before the byte offset `limit_position`. The number of records that are
+    compared at once grows, so that short runs in long chunks take little time.
     """
-    (head, tail) = np.frombuffer(
+    (first_head, second_head) = np.frombuffer(
         records[start : start + _RUN_HEAD_DTYPE.itemsize], _RUN_HEAD_DTYPE
     )[0]
-    max_count = (limit - start) // size
+    max_count = (limit_position - start) // message_size
     equal_count, messages_to_compare = 1, _FIRST_COMPARISON_MESSAGES
     while equal_count < max_count:
-        count = min(messages_to_compare, max_count - equal_count)
-        run_heads = np.ndarray(count, _RUN_HEAD_DTYPE, records, start + equal_count * size, (size,))
-        is_equal = (run_heads["head"] == head) & (run_heads["tail"] == tail)
+        compared_count = min(messages_to_compare, max_count - equal_count)
+        run_heads = np.ndarray(
+            compared_count,
+            _RUN_HEAD_DTYPE,
+            records,
+            start + equal_count * message_size,
+            (message_size,),
+        )
+        is_equal = (run_heads["head"] == first_head) & (run_heads["tail"] == second_head)
         first_different = int(is_equal.argmin())
         if not is_equal[first_different]:
             return equal_count + first_different
-        equal_count += count
+        equal_count += compared_count
         messages_to_compare *= 8
     return equal_count

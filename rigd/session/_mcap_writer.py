@@ -87,24 +87,26 @@ class McapWriter:
         self._message_counts = {channel.id: 0 for channel in self._channels}
         self.add_chunk(b"".join(map(_record_bytes, [*self._schemas, *self._channels])), {})
 
-    def add_metadata(self, name: str, values: Mapping[str, str]) -> None:
+    def add_metadata(self, record_name: str, metadata_values: Mapping[str, str]) -> None:
         """Append a metadata record with the given name, keys and values."""
-        data = _record_bytes(Metadata(name=name, metadata=dict(values)))
-        position = self._write(data)
-        self._metadata_indexes.append(MetadataIndex(offset=position, length=len(data), name=name))
+        record_data = _record_bytes(Metadata(name=record_name, metadata=dict(metadata_values)))
+        record_position = self._write(record_data)
+        self._metadata_indexes.append(
+            MetadataIndex(offset=record_position, length=len(record_data), name=record_name)
+        )
 
     def add_attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         """Append an attachment; `time_ns` becomes its creation time and log time."""
-        record = _record_bytes(
+        attachment_record = _record_bytes(
             Attachment(
                 create_time=time_ns, log_time=time_ns, name=name, media_type=media_type, data=data
             )
         )
-        position = self._write(record)
+        record_position = self._write(attachment_record)
         self._attachment_indexes.append(
             AttachmentIndex(
-                offset=position,
-                length=len(record),
+                offset=record_position,
+                length=len(attachment_record),
                 log_time=time_ns,
                 create_time=time_ns,
                 data_size=len(data),
@@ -122,38 +124,42 @@ class McapWriter:
         indexes : channel number → array (n > 0,) of `INDEX_DTYPE`, in the order of the messages
         """
         first_log_time = min(
-            (int(index["log_time"].min()) for index in indexes.values()), default=0
+            (int(message_index["log_time"].min()) for message_index in indexes.values()), default=0
         )
-        last_log_time = max((int(index["log_time"].max()) for index in indexes.values()), default=0)
-        compressed = lz4.frame.compress(records)
-        name = COMPRESSION.encode()
-        head = _CHUNK_HEAD_FORMAT.pack(
+        last_log_time = max(
+            (int(message_index["log_time"].max()) for message_index in indexes.values()), default=0
+        )
+        compressed_records = lz4.frame.compress(records)
+        compression_name = COMPRESSION.encode()
+        chunk_head = _CHUNK_HEAD_FORMAT.pack(
             Opcode.CHUNK,
-            _CHUNK_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(compressed),
+            _CHUNK_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(compressed_records),
             first_log_time,
             last_log_time,
             len(records),
             zlib.crc32(records),
-            len(name),
-            name,
-            len(compressed),
+            len(compression_name),
+            compression_name,
+            len(compressed_records),
         )
-        chunk_length = len(head) + len(compressed)
-        chunk_and_indexes = [head, compressed]
+        chunk_length = len(chunk_head) + len(compressed_records)
+        chunk_and_indexes = [chunk_head, compressed_records]
         index_position = self._position + chunk_length
         index_offsets: dict[int, int] = {}
         index_length = 0
-        for channel, index in indexes.items():
+        for channel, message_index in indexes.items():
             index_offsets[channel] = index_position + index_length
-            entries = index.tobytes()
-            length = _INDEX_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(entries)
+            index_entries = message_index.tobytes()
+            index_record_length = _INDEX_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(index_entries)
             chunk_and_indexes += [
-                _INDEX_HEAD_FORMAT.pack(Opcode.MESSAGE_INDEX, length, channel, len(entries)),
-                entries,
+                _INDEX_HEAD_FORMAT.pack(
+                    Opcode.MESSAGE_INDEX, index_record_length, channel, len(index_entries)
+                ),
+                index_entries,
             ]
-            index_length += _INDEX_HEAD_FORMAT.size + len(entries)
-            self._message_counts[channel] += len(index)
-        position = self._write(b"".join(chunk_and_indexes))
+            index_length += _INDEX_HEAD_FORMAT.size + len(index_entries)
+            self._message_counts[channel] += len(message_index)
+        chunk_position = self._write(b"".join(chunk_and_indexes))
         if indexes:
             self._start_time = (
                 first_log_time
@@ -165,12 +171,12 @@ class McapWriter:
             ChunkIndex(
                 message_start_time=first_log_time,
                 message_end_time=last_log_time,
-                chunk_start_offset=position,
+                chunk_start_offset=chunk_position,
                 chunk_length=chunk_length,
                 message_index_offsets=index_offsets,
                 message_index_length=index_length,
                 compression=COMPRESSION,
-                compressed_size=len(compressed),
+                compressed_size=len(compressed_records),
                 uncompressed_size=len(records),
             )
         )
@@ -189,7 +195,7 @@ class McapWriter:
             message_end_time=self._end_time,
             channel_message_counts=self._message_counts,
         )
-        groups: dict[Opcode, list[McapRecord]] = {
+        record_groups: dict[Opcode, list[McapRecord]] = {
             Opcode.SCHEMA: [*self._schemas],
             Opcode.CHANNEL: [*self._channels],
             Opcode.STATISTICS: [statistics],
@@ -197,32 +203,32 @@ class McapWriter:
             Opcode.ATTACHMENT_INDEX: [*self._attachment_indexes],
             Opcode.METADATA_INDEX: [*self._metadata_indexes],
         }
-        summary = RecordBuilder()
-        offsets: list[SummaryOffset] = []
-        for opcode, records in groups.items():
-            start = summary.count
+        summary_builder = RecordBuilder()
+        summary_offsets: list[SummaryOffset] = []
+        for opcode, records in record_groups.items():
+            group_start = summary_builder.count
             for record in records:
-                record.write(summary)
+                record.write(summary_builder)
             if records:
-                offsets.append(
+                summary_offsets.append(
                     SummaryOffset(
                         group_opcode=opcode,
-                        group_start=self._position + start,
-                        group_length=summary.count - start,
+                        group_start=self._position + group_start,
+                        group_length=summary_builder.count - group_start,
                     )
                 )
-        offset_start = self._position + summary.count
-        for offset in offsets:
-            offset.write(summary)
-        data = _built_bytes(summary)
+        offset_start = self._position + summary_builder.count
+        for summary_offset in summary_offsets:
+            summary_offset.write(summary_builder)
+        summary_data = _built_bytes(summary_builder)
         # The summary's checksum covers the footer up to the checksum itself.
-        footer = Footer(
+        footer_record = Footer(
             summary_start=self._position, summary_offset_start=offset_start, summary_crc=0
         )
-        footer.summary_crc = zlib.crc32(
-            _record_bytes(footer)[: _FOOTER_HEAD_FORMAT.size], zlib.crc32(data)
+        footer_record.summary_crc = zlib.crc32(
+            _record_bytes(footer_record)[: _FOOTER_HEAD_FORMAT.size], zlib.crc32(summary_data)
         )
-        self._stream.write(data + _record_bytes(footer) + MAGIC)
+        self._stream.write(summary_data + _record_bytes(footer_record) + MAGIC)
 
 
 def _record_bytes(record: McapRecord) -> bytes:
@@ -234,5 +240,5 @@ def _record_bytes(record: McapRecord) -> bytes:
 
 def _built_bytes(builder: RecordBuilder) -> bytes:
     """Return the bytes that were written to a record builder."""
-    data: bytes = builder.end()  # type: ignore[no-untyped-call]
-    return data
+    record_data: bytes = builder.end()  # type: ignore[no-untyped-call]
+    return record_data

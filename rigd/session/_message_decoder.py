@@ -92,11 +92,13 @@ class MessageLayout:
     dtype: np.dtype[np.void]
     """Array type of a decoded message."""
 
-    def dtype_of(self, fields: Sequence[str] | None) -> np.dtype[np.void]:
+    def dtype_of(self, field_names: Sequence[str] | None) -> np.dtype[np.void]:
         """Return the array type of a decoded message with only the given fields, or all if None."""
-        if fields is None:
+        if field_names is None:
             return self.dtype
-        return np.dtype([(name, self.dtype[name]) for name in fields], align=True)
+        return np.dtype(
+            [(field_name, self.dtype[field_name]) for field_name in field_names], align=True
+        )
 
 
 def _record_dtype(wire_dtype: np.dtype[np.void]) -> np.dtype[np.void]:
@@ -219,18 +221,20 @@ class MessageDecoder:
             return
         self._contents = contents
         is_topic_channel = self._is_topic_channel
-        records = memoryview(block.records)
-        for channel, size, start, count in block.runs:
+        block_records = memoryview(block.records)
+        for channel, message_size, run_start, message_count in block.runs:
             is_of_topic = is_topic_channel.get(channel)
             if is_of_topic is None:
                 is_of_topic = self.is_of_topic(contents, channel)
             if not is_of_topic:
                 continue
-            part = records[start : start + size * count]
+            run_records = block_records[run_start : run_start + message_size * message_count]
             # A slice holds all of the records in memory, which is fine where it is most of them.
-            self._collected_records.append(part if 2 * len(part) > len(records) else bytes(part))
-            self._collected_runs.append((channel, size, count))
-            self._collected_bytes += len(part)
+            self._collected_records.append(
+                run_records if 2 * len(run_records) > len(block_records) else bytes(run_records)
+            )
+            self._collected_runs.append((channel, message_size, message_count))
+            self._collected_bytes += len(run_records)
             if (
                 self._collected_bytes >= _BLOCK_BYTES
                 or len(self._collected_runs) >= _MAX_BLOCK_RUNS
@@ -249,12 +253,12 @@ class MessageDecoder:
 
     def flush(self) -> None:
         """Decode the collected messages, and pass them to the sink."""
-        parts, runs = self._collected_records, self._collected_runs
+        record_parts, message_runs = self._collected_records, self._collected_runs
         self._collected_records, self._collected_runs, self._collected_bytes = [], [], 0
-        if not runs or self.error is not None:
+        if not message_runs or self.error is not None:
             return
         try:
-            self._decode(parts, np.array(runs, np.int64))
+            self._decode(record_parts, np.array(message_runs, np.int64))
         except SessionError as error:
             self.error = error
 
@@ -271,92 +275,111 @@ class MessageDecoder:
         else:
             raise self.error
 
-    def _decode(self, parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
-        """Decode the messages in `parts`.
+    def _decode(self, record_parts: list[Buffer], runs: npt.NDArray[np.int64]) -> None:
+        """Decode the messages in `record_parts`.
 
         `runs` (n, 3) are channel number, record length in bytes, and number of messages.
         """
-        channel, size, _ = runs[0].tolist()
+        channel, message_size, _ = runs[0].tolist()
         if (runs[:, :2] == runs[0, :2]).all():
-            block = b"".join(parts)
+            joined_records = b"".join(record_parts)
             # A block is a little longer than `_BLOCK_BYTES`; a much longer one is cut.
-            is_long = len(block) > 2 * _BLOCK_BYTES
-            part_bytes = max(_BLOCK_BYTES // size, 1) * size if is_long else len(block)
-            for first in range(0, len(block), part_bytes):
-                part = block[first : first + part_bytes]
-                out = self._sink.array_for(len(part) // size)
-                self._decode_group(channel, size, part, out)
+            is_long = len(joined_records) > 2 * _BLOCK_BYTES
+            part_bytes = (
+                max(_BLOCK_BYTES // message_size, 1) * message_size
+                if is_long
+                else len(joined_records)
+            )
+            for first_message in range(0, len(joined_records), part_bytes):
+                record_part = joined_records[first_message : first_message + part_bytes]
+                out = self._sink.array_for(len(record_part) // message_size)
+                self._decode_group(channel, message_size, record_part, out)
                 self._sink.store(out)
             return
-        records = np.frombuffer(b"".join(parts), np.uint8)
-        starts = message_starts(runs)
-        groups = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
-        out = self._sink.array_for(len(starts))
-        for group in np.unique(groups).tolist():
-            (indices,) = np.nonzero(groups == group)
-            size = group & ((1 << 40) - 1)
-            all_offsets = np.ndarray(len(records) - size + 1, f"V{size}", records, 0, (1,))
-            group_records = all_offsets[starts[indices]].tobytes()
-            decoded = np.empty(len(indices), self.dtype)
-            self._decode_group(group >> 40, size, group_records, decoded)
-            out[indices] = decoded
+        record_bytes = np.frombuffer(b"".join(record_parts), np.uint8)
+        message_offsets = message_starts(runs)
+        group_keys = np.repeat(runs[:, 0] << 40 | runs[:, 1], runs[:, 2])
+        out = self._sink.array_for(len(message_offsets))
+        for group_key in np.unique(group_keys).tolist():
+            (message_indices,) = np.nonzero(group_keys == group_key)
+            message_size = group_key & ((1 << 40) - 1)
+            all_offsets = np.ndarray(
+                len(record_bytes) - message_size + 1, f"V{message_size}", record_bytes, 0, (1,)
+            )
+            group_records = all_offsets[message_offsets[message_indices]].tobytes()
+            decoded_messages = np.empty(len(message_indices), self.dtype)
+            self._decode_group(group_key >> 40, message_size, group_records, decoded_messages)
+            out[message_indices] = decoded_messages
         self._sink.store(out)
 
     def _decode_group(
-        self, channel: int, size: int, records: bytes, out: npt.NDArray[np.void]
+        self, channel: int, record_size: int, records: bytes, out: npt.NDArray[np.void]
     ) -> None:
-        """Decode records of one channel and of `size` bytes each into the array `out`."""
-        contents, layout = self._contents, self._layout
+        """Decode records of one channel and of `record_size` bytes each into the array `out`."""
+        contents, fixed_layout = self._contents, self._layout
         assert contents is not None
-        if size > limits.MAX_DECODED_BYTES:
+        if record_size > limits.MAX_DECODED_BYTES:
             raise SessionError(
-                f"{self._path}: a message of {layout.topic} has {size} bytes, more than the "
+                f"{self._path}: a message of {fixed_layout.topic} has {record_size} bytes, more "
+                "than the "
                 f"{limits.MAX_DECODED_BYTES} that are read. The writing program must write one "
                 "sample per message."
             )
-        if self._has_fixed_schema(contents, channel) and size == layout.record_dtype.itemsize:
-            wire = np.frombuffer(records, layout.record_dtype)["wire"]
-            to_native(wire, out.dtype.names or (), out)
-            is_fixed = is_fixed_layout(wire, layout.types)
+        if (
+            self._has_fixed_schema(contents, channel)
+            and record_size == fixed_layout.record_dtype.itemsize
+        ):
+            wire_messages = np.frombuffer(records, fixed_layout.record_dtype)["wire"]
+            to_native(wire_messages, out.dtype.names or (), out)
+            is_fixed = is_fixed_layout(wire_messages, fixed_layout.types)
             if is_fixed.all():
                 return
             (indices,) = np.nonzero(~is_fixed)
         else:
             indices = np.arange(len(out))
-        data = np.frombuffer(records, np.uint8).reshape(len(out), size)[
+        message_bytes = np.frombuffer(records, np.uint8).reshape(len(out), record_size)[
             :, MESSAGE_HEAD_FORMAT.size :
         ]
-        self._decode_by_offsets(channel, data, indices, out)
+        self._decode_by_offsets(channel, message_bytes, indices, out)
 
     def _decode_by_offsets(
         self,
         channel: int,
-        data: npt.NDArray[np.uint8],
+        message_bytes: npt.NDArray[np.uint8],
         indices: npt.NDArray[np.int64],
         out: npt.NDArray[np.void],
     ) -> None:
-        """Decode the rows `indices` of `data` (n, bytes) into `out`, grouped by field layout."""
-        known_layouts = self._offsets.setdefault((channel, data.shape[1]), [])
+        """Decode the rows `indices` of `message_bytes` (n, bytes) into the same rows of `out`.
+
+        Messages whose fields have the same byte offsets are decoded together.
+        """
+        known_layouts = self._offsets.setdefault((channel, message_bytes.shape[1]), [])
         layout_index = 0
         while (
             len(indices) >= _MIN_GROUP_MESSAGES
             and self._layout_comparisons < _MAX_LAYOUT_COMPARISONS
         ):
-            rows = data if len(indices) == len(data) else data[indices]
+            matching_rows = (
+                message_bytes if len(indices) == len(message_bytes) else message_bytes[indices]
+            )
             if layout_index == len(known_layouts):
-                new_layout = self._find_offsets(channel, rows[0].tobytes())
+                new_layout = self._find_offsets(channel, matching_rows[0].tobytes())
                 if new_layout is None or layout_index == _MAX_LAYOUTS:
                     break
                 known_layouts.append(new_layout)
-            layout = known_layouts[layout_index]
-            has_layout = ((rows & layout.mask) == layout.pattern).all(axis=1)
+            field_layout = known_layouts[layout_index]
+            has_layout = ((matching_rows & field_layout.mask) == field_layout.pattern).all(axis=1)
             self._layout_comparisons += 1
             layout_index += 1
             if has_layout.any():
-                _decode_at_offsets(layout, rows[has_layout], indices[has_layout], out)
+                _decode_at_offsets(
+                    field_layout, matching_rows[has_layout], indices[has_layout], out
+                )
                 indices = indices[~has_layout]
         if len(indices):
-            self._decode_one_by_one(channel, [data[i].tobytes() for i in indices], indices, out)
+            self._decode_one_by_one(
+                channel, [message_bytes[i].tobytes() for i in indices], indices, out
+            )
 
     def _find_offsets(self, channel: int, message: bytes) -> _FieldOffsets | None:
         """Return the offsets of the fields in a message.
@@ -364,58 +387,64 @@ class MessageDecoder:
         Returns None if such messages must be decoded one by one with the protobuf package.
         """
         cls = self._message_class(channel)
-        empty_message, descriptor = cls(), cls.DESCRIPTOR
+        empty_message, message_descriptor = cls(), cls.DESCRIPTOR
         if not empty_message.IsInitialized() or any(
-            len(group.fields) > 1 for group in descriptor.oneofs
+            len(end_group.fields) > 1 for end_group in message_descriptor.oneofs
         ):
             return None
-        mask, fields = np.zeros(len(message), np.uint8), {}
+        tag_mask, found_fields = np.zeros(len(message), np.uint8), {}
         position = 0
         while position < len(message):
             start = position
             tag, position = _read_varint(message, start)
-            number, wire_type = tag >> 3, tag & 7
+            field_number, wire_type = tag >> 3, tag & 7
             value_start = position
             if wire_type == _VARINT_WIRE_TYPE:
                 _, position = _read_varint(message, value_start)
-                mask[value_start:position] = 0x80
+                tag_mask[value_start:position] = 0x80
             elif wire_type in (_FIXED64_WIRE_TYPE, _FIXED32_WIRE_TYPE):
                 position += 8 if wire_type == _FIXED64_WIRE_TYPE else 4
             elif wire_type == _BYTES_WIRE_TYPE:
-                length, position = _read_varint(message, value_start)
-                mask[value_start:position] = 0xFF
-                position += length
+                field_length, position = _read_varint(message, value_start)
+                tag_mask[value_start:position] = 0xFF
+                position += field_length
             else:
                 return None
             if (
-                not 1 <= number <= _MAX_FIELD_NUMBER
+                not 1 <= field_number <= _MAX_FIELD_NUMBER
                 or position > len(message)
                 or value_start - start > _MAX_TAG_BYTES
                 or (wire_type == _VARINT_WIRE_TYPE and position - value_start > _MAX_VARINT_BYTES)
             ):
                 return None
-            mask[start:value_start] = 0xFF
-            field_descriptor = descriptor.fields_by_number.get(number)
+            tag_mask[start:value_start] = 0xFF
+            field_descriptor = message_descriptor.fields_by_number.get(field_number)
             if field_descriptor is not None:
-                conversion = self._array_conversion(field_descriptor, wire_type)
-                if conversion is None:
+                array_conversion = self._array_conversion(field_descriptor, wire_type)
+                if array_conversion is None:
                     return None
-                fields[field_descriptor.name] = (
+                found_fields[field_descriptor.name] = (
                     field_descriptor.name,
                     value_start,
                     position - value_start,
-                    conversion,
+                    array_conversion,
                 )
         names = self.dtype.names or ()
         absent_fields = {
-            name: getattr(empty_message, name, 0) for name in names if name not in fields
+            field_name: getattr(empty_message, field_name, 0)
+            for field_name in names
+            if field_name not in found_fields
         }
         if any(absent_fields.values()):  # not zero by default, and possibly out of range
             return None
         return _FieldOffsets(
-            mask,
-            np.frombuffer(message, np.uint8) & mask,
-            tuple(entry for name, entry in fields.items() if name in names),
+            tag_mask,
+            np.frombuffer(message, np.uint8) & tag_mask,
+            tuple(
+                found_field
+                for field_name, found_field in found_fields.items()
+                if field_name in names
+            ),
             tuple(absent_fields),
         )
 
@@ -427,11 +456,11 @@ class MessageDecoder:
         Returns None if the field must be decoded message by message. `wire_type` is the number of
         the protobuf wire type.
         """
-        conversions = _LOSSLESS_CONVERSIONS.get(
+        lossless_conversions = _LOSSLESS_CONVERSIONS.get(
             self._layout.types.get(field_descriptor.name, ""), {}
         )
-        for name, conversion in conversions.items():
-            if field_descriptor.type == getattr(field_descriptor, name):
+        for field_name, array_type in lossless_conversions.items():
+            if field_descriptor.type == getattr(field_descriptor, field_name):
                 required_wire_types = {
                     "<f8": _FIXED64_WIRE_TYPE,
                     "<i8": _FIXED64_WIRE_TYPE,
@@ -439,8 +468,8 @@ class MessageDecoder:
                     "<u4": _FIXED32_WIRE_TYPE,
                 }
                 return (
-                    conversion
-                    if wire_type == required_wire_types.get(conversion, _VARINT_WIRE_TYPE)
+                    array_type
+                    if wire_type == required_wire_types.get(array_type, _VARINT_WIRE_TYPE)
                     else None
                 )
         return None
@@ -461,12 +490,17 @@ class MessageDecoder:
                 "decoded one by one, which would take too long. The writing program must write all "
                 "fields of every message, in one order."
             )
-        decode = self._message_class(channel).FromString
-        decoded = [decoded_message(self._path, self._layout.topic, decode, m) for m in messages]
-        names = self.dtype.names or ()
+        decode_message = self._message_class(channel).FromString
+        decoded_messages = [
+            decoded_message(self._path, self._layout.topic, decode_message, m) for m in messages
+        ]
+        field_names = self.dtype.names or ()
         try:
             out[indices] = np.array(
-                [tuple([getattr(each, name, 0) for name in names]) for each in decoded],
+                [
+                    tuple([getattr(each, field_name, 0) for field_name in field_names])
+                    for each in decoded_messages
+                ],
                 self.dtype,
             )
         except OverflowError as error:
@@ -498,46 +532,49 @@ class MessageDecoder:
 
         Raises SessionError if its messages cannot be decoded to the layout's fields at all.
         """
-        layout, path = self._layout, self._path
+        fixed_layout, path = self._layout, self._path
         channel = contents.channels[channel_id]
         schema = contents.schemas.get(channel.schema_id)
         if len(self._is_fixed_schema) >= limits.MAX_CHANNELS:
             raise SessionError(
-                f"{path} has more than {limits.MAX_CHANNELS} channels {layout.topic}. The writing "
-                "program must put all such messages into one."
+                f"{path} has more than {limits.MAX_CHANNELS} channels {fixed_layout.topic}. The "
+                "writing program must put all such messages into one."
             )
         if (
             channel.message_encoding == "protobuf"
             and schema is not None
-            and (schema.name, schema.encoding) == (layout.schema_name, "protobuf")
-            and schema.data == schema_data(layout.schema_name)
+            and (schema.name, schema.encoding) == (fixed_layout.schema_name, "protobuf")
+            and schema.data == schema_data(fixed_layout.schema_name)
         ):
             return True
         decoding_class = self._message_class(channel_id)
         empty_message = decoding_class()
         is_fixed = True
-        for number, (name, protobuf_type) in enumerate(layout.types.items(), start=1):
-            field_descriptor = decoding_class.DESCRIPTOR.fields_by_name.get(name)
+        for field_number, (field_name, protobuf_type) in enumerate(
+            fixed_layout.types.items(), start=1
+        ):
+            field_descriptor = decoding_class.DESCRIPTOR.fields_by_name.get(field_name)
             if field_descriptor is None:
-                if name in layout.required:
+                if field_name in fixed_layout.required:
                     raise SessionError(
-                        f"{path}: the schema of {layout.topic} has no field {name}, which is "
-                        f"required there, of type {protobuf_type}."
+                        f"{path}: the schema of {fixed_layout.topic} has no field {field_name}, "
+                        f"which is required there, of type {protobuf_type}."
                     )
                 is_fixed = False
                 continue
             # The default value distinguishes singular numbers from everything else.
             if not isinstance(
-                getattr(empty_message, name), float | int if protobuf_type == "double" else int
+                getattr(empty_message, field_name),
+                float | int if protobuf_type == "double" else int,
             ):
                 raise SessionError(
-                    f"{path}: the field {name} of {layout.topic} is not of a type that can be read "
-                    f"as {protobuf_type}, which it should be."
+                    f"{path}: the field {field_name} of {fixed_layout.topic} is not of a type "
+                    f"that can be read as {protobuf_type}, which it should be."
                 )
             expected_type = getattr(field_descriptor, f"TYPE_{protobuf_type.upper()}")
             is_fixed = (
                 is_fixed
-                and field_descriptor.number == number
+                and field_descriptor.number == field_number
                 and field_descriptor.type == expected_type
             )
         return is_fixed
@@ -566,16 +603,16 @@ def class_of_channel(path: Path, contents: McapContents, channel_id: int) -> "ty
 
 
 def decoded_message(
-    path: Path, topic: str, decode: "Callable[[bytes], Message]", data: bytes
+    path: Path, topic: str, decode_message: "Callable[[bytes], Message]", message_bytes: bytes
 ) -> "Message":
-    """Return the protobuf message that `decode` makes from its bytes.
+    """Return the protobuf message that `decode_message` makes from its bytes.
 
     Raises SessionError if the bytes contradict the message's schema.
     """
     from google.protobuf.message import DecodeError
 
     try:
-        return decode(data)
+        return decode_message(message_bytes)
     except DecodeError:
         raise SessionError(
             f"{path}: a message of {topic} is not what its schema says. The file is damaged or was "
@@ -583,32 +620,36 @@ def decoded_message(
         ) from None
 
 
-def quoted_excerpt(text: str) -> str:
+def quoted_excerpt(file_text: str) -> str:
     """Return a text from a file in quotes, with escaped characters, and cut to 40 characters."""
-    return repr(text if len(text) <= 40 else text[:40] + "…")
+    return repr(file_text if len(file_text) <= 40 else file_text[:40] + "…")
 
 
 def _decode_at_offsets(
     layout: _FieldOffsets,
-    rows: npt.NDArray[np.uint8],
+    message_rows: npt.NDArray[np.uint8],
     indices: npt.NDArray[np.int64],
     out: npt.NDArray[np.void],
 ) -> None:
-    """Decode messages `rows` (n, bytes) of one field layout into elements `indices` of `out`."""
-    rows = np.ascontiguousarray(rows)
-    count, size = rows.shape
-    for name, first, length, conversion in layout.fields:
-        if conversion.startswith("varint"):
-            value = np.zeros(count, np.uint64)
-            for i in range(length):
-                value |= (rows[:, first + i] & 0x7F).astype(np.uint64) << np.uint64(7 * i)
-            if conversion == "varint32":
-                value &= np.uint64(0xFFFFFFFF)
-            out[name][indices] = value.astype(out.dtype[name])
+    """Decode messages (n, bytes) of one field layout into the elements `indices` of `out`."""
+    message_rows = np.ascontiguousarray(message_rows)
+    message_count, message_size = message_rows.shape
+    for field_name, first_byte, field_length, array_conversion in layout.fields:
+        if array_conversion.startswith("varint"):
+            absent_value = np.zeros(message_count, np.uint64)
+            for i in range(field_length):
+                absent_value |= (message_rows[:, first_byte + i] & 0x7F).astype(
+                    np.uint64
+                ) << np.uint64(7 * i)
+            if array_conversion == "varint32":
+                absent_value &= np.uint64(0xFFFFFFFF)
+            out[field_name][indices] = absent_value.astype(out.dtype[field_name])
         else:
-            out[name][indices] = np.ndarray(count, conversion, rows, first, (size,))
-    for name in layout.absent_fields:
-        out[name][indices] = 0
+            out[field_name][indices] = np.ndarray(
+                message_count, array_conversion, message_rows, first_byte, (message_size,)
+            )
+    for field_name in layout.absent_fields:
+        out[field_name][indices] = 0
 
 
 def _read_varint(data: bytes, position: int) -> tuple[int, int]:

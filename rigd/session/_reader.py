@@ -105,25 +105,28 @@ class Session:
         SessionError
             If the key is required and missing, or its value is not a finite number.
         """
-        text = self.metadata.get(key)
-        unit = f" in {unit_of(key)}" if unit_of(key) else ""
-        if text is None:
+        number_text = self.metadata.get(key)
+        unit_text = f" in {unit_of(key)}" if unit_of(key) else ""
+        if number_text is None:
             if default is not None:
                 return default
             raise SessionError(
                 f"{self.path}: the metadata 'session' has no {key}. The writing program must "
-                f"state it as a number{unit}."
+                f"state it as a number{unit_text}."
             )
         try:
-            value = float(text) if len(text) <= _MAX_NUMBER_CHARACTERS else float("nan")
-        except ValueError:
-            value = float("nan")
-        if not isfinite(value):
-            raise SessionError(
-                f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(text)}, which is "
-                f"not a finite number. The writing program must state it as a number{unit}."
+            number = (
+                float(number_text) if len(number_text) <= _MAX_NUMBER_CHARACTERS else float("nan")
             )
-        return value
+        except ValueError:
+            number = float("nan")
+        if not isfinite(number):
+            raise SessionError(
+                f"{self.path}: {key} in the metadata 'session' is {quoted_excerpt(number_text)}, "
+                "which is "
+                f"not a finite number. The writing program must state it as a number{unit_text}."
+            )
+        return number
 
 
 def read_session(
@@ -158,34 +161,34 @@ def read_session(
     21500 0.98
     """
     path = Path(path)
-    log = _UndecodedLog()
-    samples = TopicBuffer(path, SAMPLES, fields, max_samples, on_samples)
+    undecoded_log = _UndecodedLog()
+    sample_buffer = TopicBuffer(path, SAMPLES, fields, max_samples, on_samples)
 
-    def add_block(contents: McapContents, block: MessageBlock) -> None:
-        samples.decoder.add_block(contents, block)
-        log.add_block(contents, block)
+    def add_block(mcap_contents: McapContents, block: MessageBlock) -> None:
+        sample_buffer.decoder.add_block(mcap_contents, block)
+        undecoded_log.add_block(mcap_contents, block)
 
-    contents = _load_sound_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
-    metadata = merged_metadata(contents, "session") or {}
-    version = metadata.get("format_version", FORMAT_VERSION)
-    if version != FORMAT_VERSION:
+    mcap_contents = _load_sound_contents(path, (SAMPLE_TOPIC, EVENT_TOPIC), add_block)
+    metadata = merged_metadata(mcap_contents, "session") or {}
+    format_version = metadata.get("format_version", FORMAT_VERSION)
+    if format_version != FORMAT_VERSION:
         raise SessionError(
-            f"{path} is of session format version {quoted_excerpt(version)}, and this program "
-            f"reads version {FORMAT_VERSION}. Use a newer version of it."
+            f"{path} is of session format version {quoted_excerpt(format_version)}, and this "
+            f"program reads version {FORMAT_VERSION}. Use a newer version of it."
         )
-    array = samples.finish(contents)
-    _check_ticks(path, array)
-    start_utc_ns = _start_utc_ns(path, metadata, log.first_log_time, array)
+    sample_array = sample_buffer.finish(mcap_contents)
+    _check_ticks(path, sample_array)
+    start_utc_ns = _start_utc_ns(path, metadata, undecoded_log.first_log_time, sample_array)
     return Session(
         path=path,
-        samples=array,
+        samples=sample_array,
         start_utc_ns=start_utc_ns,
         metadata=metadata,
-        segments=_parsed_segments(path, merged_metadata(contents, "segments") or {}),
-        outcome=merged_metadata(contents, "outcome"),
-        events=log.events(path, contents, start_utc_ns),
-        attachments={attachment.name: attachment.data for attachment in contents.attachments},
-        omitted_event_count=log.omitted_count,
+        segments=_parsed_segments(path, merged_metadata(mcap_contents, "segments") or {}),
+        outcome=merged_metadata(mcap_contents, "outcome"),
+        events=undecoded_log.events(path, mcap_contents, start_utc_ns),
+        attachments={attachment.name: attachment.data for attachment in mcap_contents.attachments},
+        omitted_event_count=undecoded_log.omitted_count,
     )
 
 
@@ -236,8 +239,10 @@ def read_touches(path: str | PathLike[str]) -> npt.NDArray[np.void]:
 
 def _read_topic(path: Path, layout: MessageLayout) -> npt.NDArray[np.void]:
     """Return all messages of one topic of a session file as an array (n,)."""
-    buffer = TopicBuffer(path, layout, None, limits.MAX_SAMPLES)
-    return buffer.finish(_load_sound_contents(path, (layout.topic,), buffer.decoder.add_block))
+    topic_buffer = TopicBuffer(path, layout, None, limits.MAX_SAMPLES)
+    return topic_buffer.finish(
+        _load_sound_contents(path, (layout.topic,), topic_buffer.decoder.add_block)
+    )
 
 
 class TopicBuffer:
@@ -332,49 +337,63 @@ class _UndecodedLog:
     def add_block(self, contents: McapContents, block: MessageBlock) -> None:
         """Store the log messages of a block, and the log time of the first sample."""
         records = block.records
-        for channel, size, start, count in block.runs:
+        for channel, message_size, run_start, message_count in block.runs:
             topic = contents.channels[channel].topic
             if topic == SAMPLE_TOPIC:
                 if self.first_log_time is None:
-                    self.first_log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, start)[4])
+                    self.first_log_time = int(
+                        MESSAGE_HEAD_FORMAT.unpack_from(records, run_start)[4]
+                    )
                 continue
-            remaining = MAX_EVENTS - len(self._stored_messages)
-            for first in range(start, start + size * min(count, remaining), size):
-                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, first)[4])
-                length = size - MESSAGE_HEAD_FORMAT.size
-                if length > MAX_EVENT_BYTES:
-                    self._stored_messages.append((channel, log_time, length))
-                elif self._stored_bytes + length > MAX_LOG_BYTES:
+            remaining_count = MAX_EVENTS - len(self._stored_messages)
+            for first_sample in range(
+                run_start,
+                run_start + message_size * min(message_count, remaining_count),
+                message_size,
+            ):
+                log_time = int(MESSAGE_HEAD_FORMAT.unpack_from(records, first_sample)[4])
+                data_length = message_size - MESSAGE_HEAD_FORMAT.size
+                if data_length > MAX_EVENT_BYTES:
+                    self._stored_messages.append((channel, log_time, data_length))
+                elif self._stored_bytes + data_length > MAX_LOG_BYTES:
                     self.omitted_count += 1
                 else:
-                    self._stored_bytes += length
-                    data = bytes(records[first + MESSAGE_HEAD_FORMAT.size : first + size])
-                    self._stored_messages.append((channel, log_time, data))
-            self.omitted_count += max(count - remaining, 0)
+                    self._stored_bytes += data_length
+                    message_data = bytes(
+                        records[
+                            first_sample + MESSAGE_HEAD_FORMAT.size : first_sample + message_size
+                        ]
+                    )
+                    self._stored_messages.append((channel, log_time, message_data))
+            self.omitted_count += max(message_count - remaining_count, 0)
 
     def events(self, path: Path, contents: McapContents, start_utc_ns: int) -> list[LoggedEvent]:
         """Return the decoded log messages; a log whose encoding is not protobuf is left out."""
-        events: list[LoggedEvent] = []
-        decoders: dict[int, Callable[[bytes], Message]] = {}
-        for channel, log_time, data in self._stored_messages:
+        logged_events: list[LoggedEvent] = []
+        decoder_by_channel: dict[int, Callable[[bytes], Message]] = {}
+        for channel, log_time, message_data in self._stored_messages:
             if contents.channels[channel].message_encoding != "protobuf":
                 continue
             t_ns = log_time - start_utc_ns
-            if isinstance(data, int):
-                events.append(
-                    LoggedEvent(t_ns, "unknown", "", f"(a message of {data} bytes, not read)")
+            if isinstance(message_data, int):
+                logged_events.append(
+                    LoggedEvent(
+                        t_ns, "unknown", "", f"(a message of {message_data} bytes, not read)"
+                    )
                 )
                 continue
-            if channel not in decoders:
-                if len(decoders) == limits.MAX_CHANNELS:
+            if channel not in decoder_by_channel:
+                if len(decoder_by_channel) == limits.MAX_CHANNELS:
                     raise SessionError(
                         f"{path} has more than {limits.MAX_CHANNELS} channels {EVENT_TOPIC}. The "
                         "writing program must put all such messages into one."
                     )
-                decoders[channel] = class_of_channel(path, contents, channel).FromString
-            message = decoded_message(path, EVENT_TOPIC, decoders[channel], data)
-            events.append(_decoded_event(message, t_ns))
-        return events
+                decoder_by_channel[channel] = class_of_channel(path, contents, channel).FromString
+            log_message = decoded_message(
+                path, EVENT_TOPIC, decoder_by_channel[channel], message_data
+            )
+            logged_events.append(_decoded_event(log_message, t_ns))
+        return logged_events
 
 
 def _load_sound_contents(path: Path, topics: Sequence[str], on_block: OnBlock) -> McapContents:
@@ -409,9 +428,13 @@ def load_contents(
     file is missing, empty, too large or not an MCAP file.
     """
     with open_mcap_file(path) as file:
-        mapped = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         return read_mcap(
-            memoryview(mapped), topics, on_block=on_block, salvage=salvage, on_progress=on_progress
+            memoryview(mapped_file),
+            topics,
+            on_block=on_block,
+            salvage=salvage,
+            on_progress=on_progress,
         )
 
 
@@ -444,10 +467,10 @@ def open_mcap_file(path: Path) -> Iterator[BinaryIO]:
 
 def _require_nonempty_file(path: Path) -> None:
     """Raise if the path is not that of a regular file, or if the file is empty."""
-    status = path.stat()
-    if not stat.S_ISREG(status.st_mode):
+    file_status = path.stat()
+    if not stat.S_ISREG(file_status.st_mode):
         raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
-    if status.st_size == 0:
+    if file_status.st_size == 0:
         raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
 
 
@@ -479,13 +502,23 @@ def _damage_message(path: Path, contents: McapContents) -> str:
     return f"{path} is incomplete: it {contents.damage}{recovery_advice(path, was_whole=False)}"
 
 
-def merged_metadata(contents: McapContents, name: str) -> dict[str, str] | None:
+def merged_metadata(contents: McapContents, record_name: str) -> dict[str, str] | None:
     """Return the metadata records of one name as one dictionary, or None if there are none.
 
     A later record replaces the values of an earlier one.
     """
-    records = [record.metadata for record in contents.metadata if record.name == name]
-    return {key: value for record in records for key, value in record.items()} if records else None
+    record_contents = [
+        record.metadata for record in contents.metadata if record.name == record_name
+    ]
+    return (
+        {
+            key: metadata_value
+            for record in record_contents
+            for key, metadata_value in record.items()
+        }
+        if record_contents
+        else None
+    )
 
 
 def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
@@ -493,9 +526,10 @@ def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
     ticks = samples["tick"]
     backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
     if len(backward_indices):
-        first = int(backward_indices[0])
+        first_backward_index = int(backward_indices[0])
         raise SessionError(
-            f"{path}: tick {ticks[first + 1]} follows tick {ticks[first]} in {SAMPLE_TOPIC}, but "
+            f"{path}: tick {ticks[first_backward_index + 1]} follows tick "
+            f"{ticks[first_backward_index]} in {SAMPLE_TOPIC}, but "
             "ticks must increase from sample to sample. Those that do are saved with `rigd recover "
             f"{shlex.quote(str(path))}`."
         )
@@ -508,12 +542,13 @@ def _start_utc_ns(
 
     It is taken from the metadata, or from `log_time`, the log time of the first sample.
     """
-    text = metadata.get("start_utc_ns")
-    if text is not None:
-        if text.isascii() and text.isdigit() and len(text) < 20:
-            return int(text)
+    start_time_text = metadata.get("start_utc_ns")
+    if start_time_text is not None:
+        if start_time_text.isascii() and start_time_text.isdigit() and len(start_time_text) < 20:
+            return int(start_time_text)
         raise SessionError(
-            f"{path}: start_utc_ns in the metadata 'session' is {quoted_excerpt(text)}. The "
+            f"{path}: start_utc_ns in the metadata 'session' is "
+            f"{quoted_excerpt(start_time_text)}. The "
             "writing program must state it as a whole number of ns since 1970, or leave it out."
         )
     if log_time is not None and len(samples):
@@ -521,36 +556,37 @@ def _start_utc_ns(
     return 0
 
 
-def _parsed_segments(path: Path, texts: dict[str, str]) -> dict[str, tuple[int, int]]:
+def _parsed_segments(path: Path, segment_texts: dict[str, str]) -> dict[str, tuple[int, int]]:
     """Return the segments (name → first tick, end tick) from the texts of the record."""
     segments = {}
-    for name, text in texts.items():
-        numbers = text.split(",")
+    for segment_name, ticks_text in segment_texts.items():
+        tick_texts = ticks_text.split(",")
         if (
-            not (len(numbers) == 2 and all(n.isascii() and n.isdigit() for n in numbers))
-            or len(text) > 40
+            not (len(tick_texts) == 2 and all(n.isascii() and n.isdigit() for n in tick_texts))
+            or len(ticks_text) > 40
         ):
             raise SessionError(
-                f"{path}: the segment {quoted_excerpt(name)} is {quoted_excerpt(text)}. The "
+                f"{path}: the segment {quoted_excerpt(segment_name)} is "
+                f"{quoted_excerpt(ticks_text)}. The "
                 "writing program must state it as 'first,end', two whole numbers of ticks."
             )
-        first, end = (int(n) for n in numbers)
+        first, end = (int(n) for n in tick_texts)
         if end < first:
             raise SessionError(
-                f"{path}: the segment {quoted_excerpt(name)} ends at tick {end}, before its first, "
-                f"{first}. The writing program must correct it."
+                f"{path}: the segment {quoted_excerpt(segment_name)} ends at tick {end}, before "
+                f"its first, {first}. The writing program must correct it."
             )
-        segments[name] = (first, end)
+        segments[segment_name] = (first, end)
     return segments
 
 
-def _decoded_event(message: "Message", t_ns: int) -> LoggedEvent:
+def _decoded_event(log_message: "Message", t_ns: int) -> LoggedEvent:
     """Return the event of a decoded log message."""
-    level = getattr(message, "level", 0)
-    is_known = isinstance(level, int) and 0 <= level < len(EVENT_LEVELS)
+    level_number = getattr(log_message, "level", 0)
+    is_level_known = isinstance(level_number, int) and 0 <= level_number < len(EVENT_LEVELS)
     return LoggedEvent(
         t_ns=t_ns,
-        level=EVENT_LEVELS[level if is_known else 0],
-        name=str(getattr(message, "name", "")),
-        message=str(getattr(message, "message", "")),
+        level=EVENT_LEVELS[level_number if is_level_known else 0],
+        name=str(getattr(log_message, "name", "")),
+        message=str(getattr(log_message, "message", "")),
     )

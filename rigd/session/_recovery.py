@@ -167,49 +167,60 @@ def recover(
     path = Path(path)
     if path.exists() and not path.is_file():  # reading a pipe would block
         raise SessionError(f"{path} is not a file. Give the path of a session file.")
-    target = recovered_path(path)
+    recovered_file = recovered_path(path)
     if is_being_written(path):
         raise SessionError(f"{path} is still being recorded. Wait for the end of the session.")
-    selection = _SampleSelection(path)
-    contents = load_contents(
-        path, None, on_block=selection.add_block, salvage=True,
+    sample_selection = _SampleSelection(path)
+    mcap_contents = load_contents(
+        path, None, on_block=sample_selection.add_block, salvage=True,
         on_progress=_scaled_progress(on_progress, 0.0, _FIRST_READING_FRACTION),
     )  # fmt: skip
-    selection.finish(contents)
-    if contents.damage is None and not contents.skipped and selection.order_error is None:
-        return _copy_sound_file(path, target)
-    damages = [contents.damage, *contents.skipped, selection.order_error]
-    damage, *other_damage = [each for each in damages if each is not None]
-    if not selection.is_copied.any():
+    sample_selection.finish(mcap_contents)
+    if (
+        mcap_contents.damage is None
+        and not mcap_contents.skipped
+        and sample_selection.order_error is None
+    ):
+        return _copy_sound_file(path, recovered_file)
+    damage_texts = [mcap_contents.damage, *mcap_contents.skipped, sample_selection.order_error]
+    first_damage, *further_damages = [
+        damage_text for damage_text in damage_texts if damage_text is not None
+    ]
+    if not sample_selection.is_copied.any():
         raise SessionError(
-            f"{path} {damage}; no sample is intact before that, so there is nothing to recover."
+            f"{path} {first_damage}; no sample is intact before that, so there is nothing to "
+            "recover."
         )
-    recovery = _planned_recovery(path, target, contents, selection, damage, other_damage)
-    _require_target_absent(path, target)
-    with _temporary_target(path, target) as temporary:
+    recovery = _planned_recovery(
+        path, recovered_file, mcap_contents, sample_selection, first_damage, further_damages
+    )
+    _require_target_absent(path, recovered_file)
+    with _temporary_target(path, recovered_file) as temporary_path:
         written_digest = _write_recovered_file(
-            temporary,
+            temporary_path,
             path,
-            contents,
-            selection,
+            mcap_contents,
+            sample_selection,
             recovery,
             _scaled_progress(on_progress, _FIRST_READING_FRACTION, 1.0),
         )
         read_back_digest = SampleDigest()
         try:
             read_session(
-                temporary,
+                temporary_path,
                 fields=ORDER_AND_FLAG_FIELDS,
                 max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
                 on_samples=read_back_digest.add,
             )
         except SessionError as error:
-            reason = str(error).replace(str(temporary), str(path))
-            raise SessionError(f"{path} cannot be recovered to a session. {reason}") from None
+            failure_reason = str(error).replace(str(temporary_path), str(path))
+            raise SessionError(
+                f"{path} cannot be recovered to a session. {failure_reason}"
+            ) from None
         if read_back_digest.digest() != written_digest.digest():
             raise SessionError(
-                f"{target} was not made: what was written for it does not read back as it is in "
-                f"{path}. Check the disk."
+                f"{recovered_file} was not made: what was written for it does not read back as "
+                f"it is in {path}. Check the disk."
             )
     return recovery
 
@@ -218,16 +229,16 @@ class SampleDigest:
     """Checksum of all bits of all fields of samples that arrive in blocks of any size."""
 
     def __init__(self) -> None:
-        self._sums = {name: hashlib.blake2b() for name in SAMPLE_FIELDS}
+        self._sums = {field_name: hashlib.blake2b() for field_name in SAMPLE_FIELDS}
 
     def add(self, samples: npt.NDArray[np.void]) -> None:
         """Include further samples, an array of ``SAMPLE_DTYPE``, in the checksum."""
-        for name, checksum in self._sums.items():
-            checksum.update(samples[name].tobytes())
+        for field_name, field_checksum in self._sums.items():
+            field_checksum.update(samples[field_name].tobytes())
 
     def digest(self) -> bytes:
         """Return the checksum of all samples added so far."""
-        return b"".join(checksum.digest() for checksum in self._sums.values())
+        return b"".join(field_checksum.digest() for field_checksum in self._sums.values())
 
 
 class _SampleSelection:
@@ -253,9 +264,9 @@ class _SampleSelection:
         """Decode the samples of a block of messages, and count them for each chunk."""
         self._samples.decoder.add_block(contents, block)
         is_sample = self._samples.decoder.is_of_topic
-        count = sum(run[3] for run in block.runs if is_sample(contents, run[0]))
+        sample_count = sum(run[3] for run in block.runs if is_sample(contents, run[0]))
         self._samples_per_chunk[block.chunk_position] = (
-            self._samples_per_chunk.get(block.chunk_position, 0) + count
+            self._samples_per_chunk.get(block.chunk_position, 0) + sample_count
         )
 
     def finish(self, contents: McapContents) -> None:
@@ -263,26 +274,28 @@ class _SampleSelection:
         samples = self._samples.finish(contents)
         ticks = samples["tick"]
         self.is_copied = _increasing_ticks_mask(ticks)
-        (excluded,) = np.nonzero(~self.is_copied)
-        if len(excluded):
+        (excluded_indices,) = np.nonzero(~self.is_copied)
+        if len(excluded_indices):
             self.order_error = (
-                f"has {len(excluded)} samples that repeat or precede others, the first of them "
-                f"with tick {ticks[excluded[0]]}"
+                f"has {len(excluded_indices)} samples that repeat or precede others, the first "
+                f"of them with tick {ticks[excluded_indices[0]]}"
             )
             samples = samples[self.is_copied]
         self.samples = samples
 
     def duplicate_chunks(self) -> set[int]:
         """Return the file positions of chunks that contain samples, but none that is copied."""
-        counts = np.array(list(self._samples_per_chunk.values()), np.int64)
+        chunk_sample_counts = np.array(list(self._samples_per_chunk.values()), np.int64)
         # Number of copied samples up to each end of a chunk, and from it the number in each chunk.
         copied_before = np.append(0, np.cumsum(self.is_copied))
-        ends = np.cumsum(counts)
-        copied_in_chunk = copied_before[ends] - copied_before[ends - counts]
-        is_duplicate = (counts > 0) & (copied_in_chunk == 0)
+        chunk_ends = np.cumsum(chunk_sample_counts)
+        copied_in_chunk = (
+            copied_before[chunk_ends] - copied_before[chunk_ends - chunk_sample_counts]
+        )
+        is_duplicate = (chunk_sample_counts > 0) & (copied_in_chunk == 0)
         return {
-            position
-            for position, is_chunk_duplicate in zip(
+            chunk_position
+            for chunk_position, is_chunk_duplicate in zip(
                 self._samples_per_chunk, is_duplicate, strict=True
             )
             if is_chunk_duplicate
@@ -302,10 +315,10 @@ def holds_samples(path: Path) -> bool:
     except OSError:
         return True
     try:
-        contents = read_mcap(memoryview(beginning), (), salvage=True)
+        mcap_contents = read_mcap(memoryview(beginning), (), salvage=True)
     except McapError:
         return False
-    return is_longer or contents.count(SAMPLE_TOPIC) > 0
+    return is_longer or mcap_contents.count(SAMPLE_TOPIC) > 0
 
 
 def recovery_advice(path: Path, *, was_whole: bool) -> str:
@@ -315,25 +328,25 @@ def recovery_advice(path: Path, *, was_whole: bool) -> str:
     `was_whole` states whether the file was complete once, so that an intact copy may exist.
     """
     try:
-        count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
+        sample_count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
     except SessionError:
-        count = 0
-    copy_again = ". Copy it again from where it was recorded"
-    readable_samples = f"; {count} complete samples are readable before that"
-    if not count:
-        no_samples = ", so there is nothing to recover"
+        sample_count = 0
+    copy_advice = ". Copy it again from where it was recorded"
+    readable_samples = f"; {sample_count} complete samples are readable before that"
+    if not sample_count:
+        no_samples_text = ", so there is nothing to recover"
         if was_whole:
-            return f"{readable_samples}{no_samples}{copy_again}."
+            return f"{readable_samples}{no_samples_text}{copy_advice}."
         return (
-            f"{readable_samples}{no_samples}. Copy it again if there is a complete one, or record "
-            "it again."
+            f"{readable_samples}{no_samples_text}. Copy it again if there is a complete one, or "
+            "record it again."
         )
-    target = recovered_path(path)
+    recovered_file = recovered_path(path)
     recover_command = f"`rigd recover {shlex.quote(str(path))}`"
-    if os.path.lexists(target):
-        recover_command += f", once {target}, which may hold it already, is moved away"
+    if os.path.lexists(recovered_file):
+        recover_command += f", once {recovered_file}, which may hold it already, is moved away"
     if was_whole:
-        return f"{copy_again}, or save what is intact with {recover_command}."
+        return f"{copy_advice}, or save what is intact with {recover_command}."
     return f"{readable_samples}. Save them with {recover_command}."
 
 
@@ -360,19 +373,19 @@ def _scaled_progress(
     return lambda fraction: on_progress(start_fraction + (end_fraction - start_fraction) * fraction)
 
 
-def _copy_sound_file(path: Path, target: Path) -> Recovery:
+def _copy_sound_file(path: Path, final_path: Path) -> Recovery:
     """Copy a complete ``.part`` file to its final name; leave any other complete file alone."""
     session = read_session(
         path, fields=ORDER_AND_FLAG_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
     is_part = path.name.endswith(PART_SUFFIX)
     if is_part:
-        _require_target_absent(path, target)
-        with _temporary_target(path, target, copied_file=path):
+        _require_target_absent(path, final_path)
+        with _temporary_target(path, final_path, copied_file=path):
             pass
     return Recovery(
         source=path,
-        path=target if is_part else None,
+        path=final_path if is_part else None,
         samples=len(session.samples),
         outcome=session.outcome or {},
         damage=None,
@@ -382,11 +395,11 @@ def _copy_sound_file(path: Path, target: Path) -> Recovery:
     )
 
 
-def _require_target_absent(path: Path, target: Path) -> None:
+def _require_target_absent(path: Path, recovered_file: Path) -> None:
     """Raise if a file with the name of the new file exists."""
-    if os.path.lexists(target):
+    if os.path.lexists(recovered_file):
         raise SessionExistsError(
-            f"{target} exists and is not overwritten. Move it away to recover {path} again."
+            f"{recovered_file} exists and is not overwritten. Move it away to recover {path} again."
         )
 
 
@@ -396,13 +409,13 @@ def _temporary_target(path: Path, target: Path, copied_file: Path | None = None)
 
     The temporary file starts as a copy of the file `copied_file`, if one is given.
     """
-    temporary = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
+    temporary_path = target.with_name(f".{target.name}.{secrets.token_hex(4)}")
     try:
         if copied_file is not None:
             with copied_file.open("rb") as source:
-                copy_new(source.fileno(), temporary)
-        yield temporary
-        rename_new(temporary, target)
+                copy_new(source.fileno(), temporary_path)
+        yield temporary_path
+        rename_new(temporary_path, target)
         fsync_directory(target.parent)
     except FileExistsError:
         _require_target_absent(path, target)  # the target may have been created meanwhile
@@ -413,7 +426,7 @@ def _temporary_target(path: Path, target: Path, copied_file: Path | None = None)
             f"writable and has space left, or copy {path} to one that is."
         ) from error
     finally:
-        temporary.unlink(missing_ok=True)
+        temporary_path.unlink(missing_ok=True)
 
 
 def _planned_recovery(
@@ -425,43 +438,47 @@ def _planned_recovery(
     skipped: list[str],
 ) -> Recovery:
     """Return the result of a recovery whose new file is still to be written."""
-    samples = selection.samples
+    copied_samples = selection.samples
     bytes_lost = path.stat().st_size - contents.sound_bytes
     # The recorded outcome describes all samples: it is used only if none is missing.
     is_outcome_valid = contents.verified and selection.order_error is None
-    recovery = Recovery(
+    planned_recovery = Recovery(
         source=path,
         path=target,
-        samples=len(samples),
+        samples=len(copied_samples),
         outcome={},
         damage=damage,
         bytes_lost=bytes_lost,
         skipped=tuple(skipped),
         protected=contents.verified or bool(_metadata_from_chunk(contents)),
     )
-    outcome: dict[str, str] = {}
+    recovered_outcome: dict[str, str] = {}
     if is_outcome_valid:
-        outcome |= merged_metadata(contents, "outcome") or {}
+        recovered_outcome |= merged_metadata(contents, "outcome") or {}
     else:
-        outcome["outcome"] = "fault"
-        outcome["reason"] = f"Recovered from {path.name}, which {damage}{_loss_text(bytes_lost)}."
-        stated_samples = _sample_count(contents.stated_counts, contents)
-        outcome |= _tick_counts(samples, max(stated_samples - len(samples), 0))
-    outcome |= {
+        recovered_outcome["outcome"] = "fault"
+        recovered_outcome["reason"] = (
+            f"Recovered from {path.name}, which {damage}{_loss_text(bytes_lost)}."
+        )
+        stated_sample_count = _sample_count(contents.stated_counts, contents)
+        recovered_outcome |= _tick_counts(
+            copied_samples, max(stated_sample_count - len(copied_samples), 0)
+        )
+    recovered_outcome |= {
         RECOVERED_FROM: path.name,
         "recovered_by": f"rigd {rigd.__version__}",
         "recovered_damage": damage,
         "recovered_bytes_lost": str(bytes_lost),
-        "recovered_protected": str(recovery.protected).lower(),
+        "recovered_protected": str(planned_recovery.protected).lower(),
     }
-    if recovery.skipped:
-        outcome["recovered_left_out"] = "; ".join(recovery.skipped)
-    return replace(recovery, outcome=outcome)
+    if planned_recovery.skipped:
+        recovered_outcome["recovered_left_out"] = "; ".join(planned_recovery.skipped)
+    return replace(planned_recovery, outcome=recovered_outcome)
 
 
-def _loss_text(count: int) -> str:
-    """Return the words that report the number of lost bytes, or "" for 0."""
-    return f"; {count} bytes from there on were lost" if count else ""
+def _loss_text(lost_bytes: int) -> str:
+    """Return words for an error message with the number of lost bytes, or "" for 0."""
+    return f"; {lost_bytes} bytes from there on were lost" if lost_bytes else ""
 
 
 def _sample_count(counts: Mapping[int, int], contents: McapContents) -> int:
@@ -480,21 +497,21 @@ def _tick_counts(samples: npt.NDArray[np.void], unrecovered_samples: int) -> dic
     otherwise. `unrecovered_samples` is the number of samples that the damaged file contained once
     and that were not recovered.
     """
-    status = samples["status"]
+    status_flags = samples["status"]
     missing_before = np.diff(samples["tick"].astype(np.int64), prepend=-1) - 1
-    was_lost = (status & Status.AFTER_LOST) != 0
-    was_missed = ~was_lost & ((status & Status.AFTER_MISSED) != 0)
+    was_lost = (status_flags & Status.AFTER_LOST) != 0
+    was_missed = ~was_lost & ((status_flags & Status.AFTER_MISSED) != 0)
     missed_ticks = int(missing_before[was_missed].sum())
-    unexplained = int(missing_before[~was_lost & ~was_missed].sum())
-    lost_ticks = int(missing_before[was_lost].sum()) + max(unexplained, unrecovered_samples)
+    unexplained_ticks = int(missing_before[~was_lost & ~was_missed].sum())
+    lost_ticks = int(missing_before[was_lost].sum()) + max(unexplained_ticks, unrecovered_samples)
     return {
         "scheduled": str(len(samples) + missed_ticks + lost_ticks),
         "recorded": str(len(samples)),
         "missed": str(missed_ticks),
         "lost": str(lost_ticks),
-        "late": str(int(np.count_nonzero(status & Status.LATE))),
-        "stale_angles": str(int(np.count_nonzero(status & Status.ANGLE_STALE))),
-        "stale_wrenches": str(int(np.count_nonzero(status & Status.WRENCH_STALE))),
+        "late": str(int(np.count_nonzero(status_flags & Status.LATE))),
+        "stale_angles": str(int(np.count_nonzero(status_flags & Status.ANGLE_STALE))),
+        "stale_wrenches": str(int(np.count_nonzero(status_flags & Status.WRENCH_STALE))),
     }
 
 
@@ -505,19 +522,25 @@ def _metadata_from_chunk(contents: McapContents) -> dict[str, dict[str, str]]:
     """
     for channel in contents.channels.values():
         if channel.topic == SAMPLE_TOPIC and channel.id in contents.declared_in_chunks:
-            records = metadata_from_channel(channel.metadata)
-            if "session" in records:
-                return records
+            metadata_records = metadata_from_channel(channel.metadata)
+            if "session" in metadata_records:
+                return metadata_records
     return {}
 
 
 def _metadata_records(contents: McapContents) -> dict[str, dict[str, str]]:
     """Return the metadata records to copy, except ``outcome``: name → keys and values."""
-    protected = _metadata_from_chunk(contents)
-    if protected and not contents.verified:
-        return protected
-    names = dict.fromkeys(record.name for record in contents.metadata if record.name != "outcome")
-    return {name: merged_metadata(contents, name) or {} for name in names}
+    protected_records = _metadata_from_chunk(contents)
+    if protected_records and not contents.verified:
+        return protected_records
+    record_names = dict.fromkeys(
+        metadata_record.name
+        for metadata_record in contents.metadata
+        if metadata_record.name != "outcome"
+    )
+    return {
+        record_name: merged_metadata(contents, record_name) or {} for record_name in record_names
+    }
 
 
 def _write_recovered_file(
@@ -529,33 +552,36 @@ def _write_recovered_file(
     on_progress: Callable[[float], None] | None,
 ) -> SampleDigest:
     """Write the recovered file to `path`, and return the checksum of its samples."""
-    records = _metadata_records(contents)
-    channels = _channels_to_copy(contents, records)
-    schema_ids = {channel.schema_id for channel in channels}
-    with path.open("xb") as stream:
-        mcap = McapWriter(stream, library=f"rigd {rigd.__version__}")
-        for name, values in records.items():
-            mcap.add_metadata(name, values)
+    metadata_records = _metadata_records(contents)
+    copied_channels = _channels_to_copy(contents, metadata_records)
+    schema_ids = {channel.schema_id for channel in copied_channels}
+    with path.open("xb") as output_stream:
+        mcap_writer = McapWriter(output_stream, library=f"rigd {rigd.__version__}")
+        for record_name, metadata_values in metadata_records.items():
+            mcap_writer.add_metadata(record_name, metadata_values)
         for attachment in contents.attachments:
-            mcap.add_attachment(
+            mcap_writer.add_attachment(
                 attachment.name, attachment.media_type, attachment.data, attachment.log_time
             )
-        mcap.declare(
-            [schema for schema in contents.schemas.values() if schema.id in schema_ids], channels
+        mcap_writer.declare(
+            [schema for schema in contents.schemas.values() if schema.id in schema_ids],
+            copied_channels,
         )
-        copy = _MessageCopier(source, mcap, selection, {channel.id for channel in channels})
+        message_copier = _MessageCopier(
+            source, mcap_writer, selection, {channel.id for channel in copied_channels}
+        )
         # Second reading, up to the same damage as the first one, which selected the samples.
         contents_read_again = load_contents(
-            source, None, on_block=copy.add_block, salvage=True, on_progress=on_progress
+            source, None, on_block=message_copier.add_block, salvage=True, on_progress=on_progress
         )
-        digest = copy.finish(contents_read_again)
+        sample_digest = message_copier.finish(contents_read_again)
         if on_progress is not None:
             on_progress(1.0)  # the damaged end is not read
-        mcap.add_metadata("outcome", recovery.outcome)
-        mcap.finish()
-        stream.flush()
-        os.fsync(stream.fileno())
-    return digest
+        mcap_writer.add_metadata("outcome", recovery.outcome)
+        mcap_writer.finish()
+        output_stream.flush()
+        os.fsync(output_stream.fileno())
+    return sample_digest
 
 
 class _MessageCopier:
@@ -565,10 +591,10 @@ class _MessageCopier:
     """
 
     def __init__(
-        self, source: Path, mcap: McapWriter, selection: _SampleSelection, channels: set[int]
+        self, source: Path, mcap_writer: McapWriter, selection: _SampleSelection, channels: set[int]
     ) -> None:
         self._source = source
-        self._mcap = mcap
+        self._mcap = mcap_writer
         self._is_copied = selection.is_copied
         self._duplicate_chunks = selection.duplicate_chunks()
         self._declared_channels = channels
@@ -588,10 +614,10 @@ class _MessageCopier:
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
         """Add those decoded samples that are copied to the checksum."""
-        end = self._samples_decoded + len(messages)
-        is_copied = self._is_copied[self._samples_decoded : end]
+        decoded_end = self._samples_decoded + len(messages)
+        is_copied = self._is_copied[self._samples_decoded : decoded_end]
         self._digest.add(messages if is_copied.all() else messages[: len(is_copied)][is_copied])
-        self._samples_decoded = end
+        self._samples_decoded = decoded_end
 
     def add_block(self, contents: McapContents, block: MessageBlock) -> None:
         """Collect the messages to copy from a block; write a chunk when enough are collected."""
@@ -606,24 +632,29 @@ class _MessageCopier:
         self._decoder.add_block(contents, block)
         is_duplicate = block.chunk_position in self._duplicate_chunks
         records = memoryview(block.records)
-        for channel, size, start, count in block.runs:
-            copied_ranges = [(start, count)]
+        for channel, message_size, start, message_count in block.runs:
+            copied_ranges = [(start, message_count)]
             if self._decoder.is_of_topic(contents, channel):
-                is_copied = self._is_copied[self._samples_read : self._samples_read + count]
-                self._samples_read += count
-                if count == 1:  # frequent where channels alternate: avoid a function call each
+                is_copied = self._is_copied[self._samples_read : self._samples_read + message_count]
+                self._samples_read += message_count
+                if (
+                    message_count == 1
+                ):  # frequent where channels alternate: avoid a function call each
                     if not is_copied[0]:
                         continue
                 elif not is_copied.all():
                     copied_ranges = [
-                        (start + size * first, n) for first, n in _true_blocks(is_copied)
+                        (start + message_size * first_sample, n)
+                        for first_sample, n in _true_blocks(is_copied)
                     ]
             if is_duplicate or channel not in self._declared_channels:
                 continue
-            for first, number in copied_ranges:
-                self._collected_records.append(bytes(records[first : first + size * number]))
-                self._collected_runs.append((channel, size, number))
-                self._collected_bytes += size * number
+            for first_sample, range_length in copied_ranges:
+                self._collected_records.append(
+                    bytes(records[first_sample : first_sample + message_size * range_length])
+                )
+                self._collected_runs.append((channel, message_size, range_length))
+                self._collected_bytes += message_size * range_length
 
     def finish(self, contents: McapContents) -> SampleDigest:
         """Write the remaining messages, and return the checksum of the copied samples.
@@ -642,21 +673,23 @@ class _MessageCopier:
         """Write the collected messages as a chunk with a new message index."""
         if not self._collected_runs:
             return
-        data = b"".join(self._collected_records)
-        runs = np.array(self._collected_runs, np.int64)
-        self._written_bytes += len(data)
+        chunk_records = b"".join(self._collected_records)
+        message_runs = np.array(self._collected_runs, np.int64)
+        self._written_bytes += len(chunk_records)
         self._collected_records, self._collected_runs, self._collected_bytes = [], [], 0
-        starts = message_starts(runs)
-        index = np.empty(len(starts), INDEX_DTYPE)
-        log_times = np.ndarray(len(data) - 7, "<u8", data, 0, (1,))
-        index["log_time"] = log_times[starts + LOG_TIME_OFFSET]
-        index["offset"] = starts
-        channels = np.repeat(runs[:, 0], runs[:, 2])
-        order = np.argsort(channels, kind="stable")
-        channel_numbers, first_entries = np.unique(channels[order], return_index=True)
-        channel_indexes = np.split(index[order], first_entries[1:])
+        message_offsets = message_starts(message_runs)
+        message_index = np.empty(len(message_offsets), INDEX_DTYPE)
+        log_times = np.ndarray(len(chunk_records) - 7, "<u8", chunk_records, 0, (1,))
+        message_index["log_time"] = log_times[message_offsets + LOG_TIME_OFFSET]
+        message_index["offset"] = message_offsets
+        message_channels = np.repeat(message_runs[:, 0], message_runs[:, 2])
+        channel_order = np.argsort(message_channels, kind="stable")
+        channel_numbers, first_entries = np.unique(
+            message_channels[channel_order], return_index=True
+        )
+        channel_indexes = np.split(message_index[channel_order], first_entries[1:])
         self._mcap.add_chunk(
-            data, dict(zip(channel_numbers.tolist(), channel_indexes, strict=True))
+            chunk_records, dict(zip(channel_numbers.tolist(), channel_indexes, strict=True))
         )
 
 
@@ -670,17 +703,17 @@ def _channels_to_copy(
     contents: McapContents, records: Mapping[str, Mapping[str, str]]
 ) -> list[Channel]:
     """Return the channels to copy; the channel of the samples repeats the session's metadata."""
-    only_protected = bool(_metadata_from_chunk(contents)) and not contents.verified
-    metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
-    candidates = [
+    only_chunk_channels = bool(_metadata_from_chunk(contents)) and not contents.verified
+    channel_metadata = metadata_for_channel(records.get("session", {}), records.get("segments", {}))
+    usable_channels = [
         channel
         for channel in contents.channels.values()
-        if channel.id in contents.declared_in_chunks or not only_protected
+        if channel.id in contents.declared_in_chunks or not only_chunk_channels
     ]
-    own_channels = [channel for channel in candidates if channel.topic in OWN_TOPICS]
-    other_channels = [channel for channel in candidates if channel.topic not in OWN_TOPICS]
+    own_channels = [channel for channel in usable_channels if channel.topic in OWN_TOPICS]
+    other_channels = [channel for channel in usable_channels if channel.topic not in OWN_TOPICS]
     return [
-        replace(channel, metadata={**channel.metadata, **metadata})
+        replace(channel, metadata={**channel.metadata, **channel_metadata})
         if channel.topic == SAMPLE_TOPIC
         else channel
         for channel in (

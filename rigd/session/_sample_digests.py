@@ -47,18 +47,20 @@ def sample_digests(
     >>> whole & sample_digests(noise[0], noise[2])
     frozenset()
     """
-    angle, torque = (np.ascontiguousarray(each) + 0.0 for each in (angle_rad, torque_nm))
-    count = torque.size - _WINDOW_SAMPLES + 1
-    if count <= 0:
+    angle, torque = (np.ascontiguousarray(signal) + 0.0 for signal in (angle_rad, torque_nm))
+    window_count = torque.size - _WINDOW_SAMPLES + 1
+    if window_count <= 0:
         return frozenset()
     torque_bits = torque.view(np.uint64)
-    anchor_hashes = np.zeros(count, dtype=np.uint64)
-    for offset in range(_ANCHOR_SAMPLES):
-        anchor_hashes = (anchor_hashes + torque_bits[offset : offset + count]) * _HASH_MULTIPLIER
+    anchor_hashes = np.zeros(window_count, dtype=np.uint64)
+    for anchor_offset in range(_ANCHOR_SAMPLES):
+        anchor_hashes = (
+            anchor_hashes + torque_bits[anchor_offset : anchor_offset + window_count]
+        ) * _HASH_MULTIPLIER
         anchor_hashes ^= anchor_hashes >> np.uint64(29)
     change_counts = np.concatenate([[0], np.cumsum(np.diff(torque) != 0.0)])
     has_enough_changes = (
-        change_counts[_WINDOW_SAMPLES - 1 :] - change_counts[:count] >= _MIN_TORQUE_CHANGES
+        change_counts[_WINDOW_SAMPLES - 1 :] - change_counts[:window_count] >= _MIN_TORQUE_CHANGES
     )
     return frozenset(
         hashlib.blake2b(

@@ -39,19 +39,19 @@ EVENT_LEVELS: Final = ("unknown", "debug", "info", "warning", "error", "fatal")
 """Names of the severity levels 0…5 of ``foxglove.Log.Level``."""
 
 
-def _fixed_layout_file(schema_name: str, types: dict[str, str]) -> "FileDescriptorProto":
+def _fixed_layout_file(schema_name: str, field_types: dict[str, str]) -> "FileDescriptorProto":
     """Return the protobuf file descriptor of a message with the given field names and types."""
     from google.protobuf.descriptor_pb2 import FieldDescriptorProto, FileDescriptorProto
 
-    package, name = schema_name.split(".")
+    package_name, field_name = schema_name.split(".")
     file_descriptor = FileDescriptorProto(
-        name=f"{package}/{name.lower()}.proto", package=package, syntax="proto3"
+        name=f"{package_name}/{field_name.lower()}.proto", package=package_name, syntax="proto3"
     )
-    message = file_descriptor.message_type.add(name=name)
-    for number, (field, protobuf_type) in enumerate(types.items(), start=1):
-        message.field.add(
+    message_descriptor = file_descriptor.message_type.add(name=field_name)
+    for field_number, (field, protobuf_type) in enumerate(field_types.items(), start=1):
+        message_descriptor.field.add(
             name=field,
-            number=number,
+            number=field_number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
             type=FieldDescriptorProto.Type.Value(f"TYPE_{protobuf_type.upper()}"),
         )
@@ -71,11 +71,11 @@ def _event_file() -> "FileDescriptorProto":
         syntax="proto3",
         dependency=["google/protobuf/timestamp.proto"],
     )
-    message = file_descriptor.message_type.add(name="Log")
-    level = message.enum_type.add(name="Level")
-    for value, name in enumerate(EVENT_LEVELS):
-        level.value.add(name=name.upper(), number=value)
-    fields = (
+    log_descriptor = file_descriptor.message_type.add(name="Log")
+    level_enum = log_descriptor.enum_type.add(name="Level")
+    for level_number, field_name in enumerate(EVENT_LEVELS):
+        level_enum.value.add(name=field_name.upper(), number=level_number)
+    log_fields = (
         ("timestamp", FieldDescriptorProto.TYPE_MESSAGE, ".google.protobuf.Timestamp"),
         ("level", FieldDescriptorProto.TYPE_ENUM, ".foxglove.Log.Level"),
         ("message", FieldDescriptorProto.TYPE_STRING, None),
@@ -83,10 +83,10 @@ def _event_file() -> "FileDescriptorProto":
         ("file", FieldDescriptorProto.TYPE_STRING, None),
         ("line", FieldDescriptorProto.TYPE_FIXED32, None),
     )
-    for number, (name, protobuf_type, type_name) in enumerate(fields, start=1):
-        message.field.add(
-            name=name,
-            number=number,
+    for field_number, (field_name, protobuf_type, type_name) in enumerate(log_fields, start=1):
+        log_descriptor.field.add(
+            name=field_name,
+            number=field_number,
             label=FieldDescriptorProto.LABEL_OPTIONAL,
             type=protobuf_type,
             type_name=type_name,
@@ -101,18 +101,18 @@ def schema_data(schema_name: str) -> bytes:
     from google.protobuf.descriptor_pb2 import FileDescriptorProto, FileDescriptorSet
 
     if schema_name == EVENT_SCHEMA:
-        timestamp = FileDescriptorProto()
-        timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp)
-        files = [timestamp, _event_file()]
+        timestamp_file = FileDescriptorProto()
+        timestamp_pb2.DESCRIPTOR.CopyToProto(timestamp_file)
+        file_descriptors = [timestamp_file, _event_file()]
     else:
-        types = {
+        field_types = {
             SAMPLE_SCHEMA: SAMPLE_TYPES,
             CONTROL_SCHEMA: CONTROL_TYPES,
             TIMING_SCHEMA: TIMING_TYPES,
             TOUCH_SCHEMA: TOUCH_TYPES,
         }[schema_name]
-        files = [_fixed_layout_file(schema_name, types)]
-    return FileDescriptorSet(file=files).SerializeToString(deterministic=True)
+        file_descriptors = [_fixed_layout_file(schema_name, field_types)]
+    return FileDescriptorSet(file=file_descriptors).SerializeToString(deterministic=True)
 
 
 @lru_cache(maxsize=16)
@@ -142,23 +142,26 @@ def message_class(schema_name: str, data: bytes) -> "type[Message]":
             "that are read"
         )
     try:
-        files_to_add = {file.name: file for file in FileDescriptorSet.FromString(data).file}
-        pool = descriptor_pool.DescriptorPool()
+        files_to_add = {
+            file_descriptor.name: file_descriptor
+            for file_descriptor in FileDescriptorSet.FromString(data).file
+        }
+        protobuf_pool = descriptor_pool.DescriptorPool()
 
         def add(name: str) -> None:
             # A file must be added to the pool after the files that it imports.
-            file = files_to_add.pop(name, None)
-            if file is not None:
-                for dependency in file.dependency:
+            file_descriptor = files_to_add.pop(name, None)
+            if file_descriptor is not None:
+                for dependency in file_descriptor.dependency:
                     add(dependency)
-                pool.Add(file)
+                protobuf_pool.Add(file_descriptor)
 
         while files_to_add:
             add(next(iter(files_to_add)))
-        descriptor = pool.FindMessageTypeByName(schema_name)
+        message_descriptor = protobuf_pool.FindMessageTypeByName(schema_name)
     except (DecodeError, TypeError, KeyError, RecursionError) as error:
         raise ValueError(f"schema {shown_name} is not a usable protobuf schema") from error
-    return message_factory.GetMessageClass(descriptor)
+    return message_factory.GetMessageClass(message_descriptor)
 
 
 def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]) -> dict[str, str]:
@@ -168,8 +171,8 @@ def metadata_for_channel(session: Mapping[str, str], segments: Mapping[str, str]
     the whole file is at its end.
     """
     return {
-        **{f"session.{key}": value for key, value in session.items()},
-        **{f"segments.{key}": value for key, value in segments.items()},
+        **{f"session.{key}": metadata_value for key, metadata_value in session.items()},
+        **{f"segments.{key}": metadata_value for key, metadata_value in segments.items()},
     }
 
 
@@ -179,10 +182,10 @@ def metadata_from_channel(channel: Mapping[str, str]) -> dict[str, dict[str, str
     This is the inverse of `metadata_for_channel`. The result lacks a record without any key.
     """
     records: dict[str, dict[str, str]] = {}
-    for key, value in channel.items():
-        record, separator, name = key.partition(".")
+    for key, metadata_value in channel.items():
+        record, separator, key_name = key.partition(".")
         if separator and record in ("session", "segments"):
-            records.setdefault(record, {})[name] = value
+            records.setdefault(record, {})[key_name] = metadata_value
     return records
 
 

@@ -16,7 +16,9 @@ def segments_until(segments: Mapping[str, tuple[int, int]], end: int) -> dict[st
         First tick that no longer belongs to the record.
     """
     return {
-        name: (first, min(last, end)) for name, (first, last) in segments.items() if first < end
+        segment_name: (first_tick, min(end_tick, end))
+        for segment_name, (first_tick, end_tick) in segments.items()
+        if first_tick < end
     }
 
 
@@ -44,10 +46,10 @@ def sweep_frequency_hz(
     """
     start_hz, stop_hz = ends_hz
     first_half = segments.get("there", segments["sweep"])
-    for (first, end), begin_hz, end_hz in (
+    for (first_tick, end), begin_hz, end_hz in (
         (first_half, start_hz, stop_hz),
         (segments.get("back", (0, 0)), stop_hz, start_hz),
     ):
-        if first <= tick < end:
-            return begin_hz + (end_hz - begin_hz) * (tick - first) / (end - first)
+        if first_tick <= tick < end:
+            return begin_hz + (end_hz - begin_hz) * (tick - first_tick) / (end - first_tick)
     return None

@@ -76,31 +76,35 @@ def read_summary(path: str | PathLike[str]) -> SessionSummary:
     """
     path = Path(path)
     with open_mcap_file(path) as file:
-        contents = _read_by_summary(file, path.stat().st_size)
-        if contents is None:
+        mcap_contents = _read_by_summary(file, path.stat().st_size)
+        if mcap_contents is None:
             file.seek(0)
             beginning = read_mcap(memoryview(file.read(_INCOMPLETE_FILE_BYTES)), ())
             is_complete = _has_final_magic(file)
-    problem, recording = "", False
+    problem_text, is_recording = "", False
     remedy = f"save what is intact with rigd recover {shlex.quote(str(path))}"
-    if contents is None and is_complete:
-        contents = load_contents(path, ())
-        if contents.damage is not None:
-            problem = f"The file is damaged: it {contents.damage}; {remedy}."
-    elif contents is None:
-        contents, recording = beginning, is_being_written(path)
-        problem = (
-            "The session is being recorded." if recording else f"The file is incomplete; {remedy}."
+    if mcap_contents is None and is_complete:
+        mcap_contents = load_contents(path, ())
+        if mcap_contents.damage is not None:
+            problem_text = f"The file is damaged: it {mcap_contents.damage}; {remedy}."
+    elif mcap_contents is None:
+        mcap_contents, is_recording = beginning, is_being_written(path)
+        problem_text = (
+            "The session is being recorded."
+            if is_recording
+            else f"The file is incomplete; {remedy}."
         )
-    has_samples_channel = SAMPLE_TOPIC in {channel.topic for channel in contents.channels.values()}
-    if not has_samples_channel and not problem:
+    has_samples_channel = SAMPLE_TOPIC in {
+        channel.topic for channel in mcap_contents.channels.values()
+    }
+    if not has_samples_channel and not problem_text:
         raise no_samples_error(path)
     return SessionSummary(
-        metadata=merged_metadata(contents, "session") or {},
-        outcome=merged_metadata(contents, "outcome"),
-        samples=None if problem else contents.count(SAMPLE_TOPIC),
-        problem=problem,
-        recording=recording,
+        metadata=merged_metadata(mcap_contents, "session") or {},
+        outcome=merged_metadata(mcap_contents, "outcome"),
+        samples=None if problem_text else mcap_contents.count(SAMPLE_TOPIC),
+        problem=problem_text,
+        recording=is_recording,
     )
 
 
@@ -110,12 +114,13 @@ def _has_final_magic(file: BinaryIO) -> bool:
     return file.read() == MAGIC
 
 
-def _read_by_summary(file: BinaryIO, size: int) -> McapContents | None:
-    """Return channels, message counts and metadata that the summary section leads to.
+def _read_by_summary(file: BinaryIO, file_size: int) -> McapContents | None:
+    """Return channels, message counts and metadata of a file, located by its summary section.
 
-    Returns None if the file of `size` bytes has no usable summary section with a correct checksum.
+    Returns None if the file of `file_size` bytes has no usable summary section with a correct
+    checksum.
     """
-    footer_start = size - len(MAGIC) - FOOTER_FORMAT.size
+    footer_start = file_size - len(MAGIC) - FOOTER_FORMAT.size
     if footer_start < len(MAGIC) or file.read(len(MAGIC)) != MAGIC:
         return None
     file.seek(footer_start)
@@ -124,57 +129,59 @@ def _read_by_summary(file: BinaryIO, size: int) -> McapContents | None:
         MAGIC
     ):
         return None
-    opcode, length, summary_start, _, crc = FOOTER_FORMAT.unpack_from(footer_and_magic)
-    if (opcode, length) != (Opcode.FOOTER, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
+    opcode, record_length, summary_start, _, crc = FOOTER_FORMAT.unpack_from(footer_and_magic)
+    if (opcode, record_length) != (Opcode.FOOTER, FOOTER_FORMAT.size - RECORD_HEAD_FORMAT.size):
         return None
     if not len(MAGIC) < summary_start <= footer_start <= summary_start + _MAX_SUMMARY_BYTES:
         return None
     file.seek(summary_start)
-    summary = file.read(footer_start - summary_start)
+    summary_bytes = file.read(footer_start - summary_start)
     checked_length = FOOTER_FORMAT.size - _CHECKSUM_SIZE
-    if crc == 0 or zlib.crc32(footer_and_magic[:checked_length], zlib.crc32(summary)) != crc:
+    if crc == 0 or zlib.crc32(footer_and_magic[:checked_length], zlib.crc32(summary_bytes)) != crc:
         return None
     try:
-        return _contents_from_summary(file, summary)
+        return _contents_from_summary(file, summary_bytes)
     except (McapDamageError, struct.error):
         return None
 
 
-def _contents_from_summary(file: BinaryIO, summary: bytes) -> McapContents | None:
-    """Return the contents that a summary section leads to.
+def _contents_from_summary(file: BinaryIO, summary_bytes: bytes) -> McapContents | None:
+    """Return channels, message counts and metadata of a file from its summary section.
 
     Returns None if the section is incomplete, or the metadata are too long.
     """
-    contents = McapContents()
-    indexes: list[MetadataIndex] = []
+    mcap_contents = McapContents()
+    metadata_indexes: list[MetadataIndex] = []
     statistics: Statistics | None = None
-    position = 0
-    while position < len(summary):
-        opcode, length = RECORD_HEAD_FORMAT.unpack_from(summary, position)
-        content = position + RECORD_HEAD_FORMAT.size
-        position = content + length
-        record = summary[content:position]
+    record_position = 0
+    while record_position < len(summary_bytes):
+        opcode, record_length = RECORD_HEAD_FORMAT.unpack_from(summary_bytes, record_position)
+        record_content = record_position + RECORD_HEAD_FORMAT.size
+        record_position = record_content + record_length
+        record = summary_bytes[record_content:record_position]
         if opcode == Opcode.CHANNEL:
             channel = parse_record(Channel.read, record, "")
-            contents.channels[channel.id] = channel
+            mcap_contents.channels[channel.id] = channel
         elif opcode == Opcode.STATISTICS:
             statistics = parse_record(Statistics.read, record, "")
         elif opcode == Opcode.METADATA_INDEX:
-            indexes.append(parse_record(MetadataIndex.read, record, ""))
-            if len(indexes) > _MAX_METADATA_RECORDS:
+            metadata_indexes.append(parse_record(MetadataIndex.read, record, ""))
+            if len(metadata_indexes) > _MAX_METADATA_RECORDS:
                 return None
-    if statistics is None or len(indexes) != statistics.metadata_count:
+    if statistics is None or len(metadata_indexes) != statistics.metadata_count:
         return None
-    contents.message_counts |= statistics.channel_message_counts
-    for index in indexes:
-        if not RECORD_HEAD_FORMAT.size <= index.length <= _MAX_METADATA_BYTES:
+    mcap_contents.message_counts |= statistics.channel_message_counts
+    for metadata_index in metadata_indexes:
+        if not RECORD_HEAD_FORMAT.size <= metadata_index.length <= _MAX_METADATA_BYTES:
             return None
-        file.seek(index.offset)
-        record = file.read(index.length)
+        file.seek(metadata_index.offset)
+        record = file.read(metadata_index.length)
         if RECORD_HEAD_FORMAT.unpack_from(record) != (
             Opcode.METADATA,
-            index.length - RECORD_HEAD_FORMAT.size,
+            metadata_index.length - RECORD_HEAD_FORMAT.size,
         ):
             return None
-        contents.metadata.append(parse_record(Metadata.read, record[RECORD_HEAD_FORMAT.size :], ""))
-    return contents
+        mcap_contents.metadata.append(
+            parse_record(Metadata.read, record[RECORD_HEAD_FORMAT.size :], "")
+        )
+    return mcap_contents

@@ -55,10 +55,10 @@ class BeamUniformity:
         """
         if not isinstance(document, Mapping) or document.get("status") not in _UNIFORM_BY_STATUS:
             return None
-        status, p_value = str(document["status"]), finite_number(document.get("p_value"))
-        if status == _NOT_TESTED:
-            return cls(status)
-        return None if p_value is None or not 0.0 <= p_value <= 1.0 else cls(status, p_value)
+        test_status, p_value = str(document["status"]), finite_number(document.get("p_value"))
+        if test_status == _NOT_TESTED:
+            return cls(test_status)
+        return None if p_value is None or not 0.0 <= p_value <= 1.0 else cls(test_status, p_value)
 
     @property
     def sentence(self) -> str:
@@ -129,32 +129,35 @@ class Validity:
         """
         if not isinstance(document, Mapping):
             return cls()
-        uniform_beam = BeamUniformity.of_document(document.get("uniform_beam"))
+        beam_uniformity = BeamUniformity.of_document(document.get("uniform_beam"))
         slope_rad = finite_number(document.get("predicted_peak_tip_slope_rad"))
-        error = finite_number(document.get("linear_model_error"))
-        if slope_rad is None or error is None or slope_rad < 0.0 or error < 0.0:
-            slope_rad = error = None
-        return cls(slope_rad, error, uniform_beam)
+        model_error = finite_number(document.get("linear_model_error"))
+        if slope_rad is None or model_error is None or slope_rad < 0.0 or model_error < 0.0:
+            slope_rad = model_error = None
+        return cls(slope_rad, model_error, beam_uniformity)
 
     @property
     def sentence(self) -> str:
-        """Sentence that states the peak tip slope and the error of the linear model."""
+        """Sentence that states the beam's peak tip slope and the error of the linear beam model."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "The slope of the tip, and with it the error of the linear model, is unknown."
-        slope = f"Tip slopes up to {self.predicted_peak_tip_slope_rad:.2g} rad"
+        slope_text = f"Tip slopes up to {self.predicted_peak_tip_slope_rad:.2g} rad"
         if self.linear_model_error >= 1.0:
-            return f"{slope}: the linear model does not hold there (error above 100 %)."
-        return f"{slope}; error of the linear model {self._error_bound_text('at most ', 'below ')}."
+            return f"{slope_text}: the linear model does not hold there (error above 100 %)."
+        return (
+            f"{slope_text}; error of the linear model "
+            f"{self._error_bound_text('at most ', 'below ')}."
+        )
 
     @property
     def short(self) -> str:
         """Peak tip slope and error of the linear model as text for a cell of a table."""
         if self.predicted_peak_tip_slope_rad is None or self.linear_model_error is None:
             return "unknown"
-        slope = f"{self.predicted_peak_tip_slope_rad:.2g} rad"
+        slope_text = f"{self.predicted_peak_tip_slope_rad:.2g} rad"
         if self.linear_model_error >= 1.0:
-            return f"{slope}, error > 100 %"
-        return f"{slope}, error {self._error_bound_text('≤ ', '< ')}"
+            return f"{slope_text}, error > 100 %"
+        return f"{slope_text}, error {self._error_bound_text('≤ ', '< ')}"
 
     def _error_bound_text(self, upper_bound_words: str, below_words: str) -> str:
         """Return the linear model's error in percent after the words for its upper bound.
@@ -162,10 +165,10 @@ class Validity:
         These are `below_words` for an error below the smallest value that is shown, and
         `upper_bound_words` for any other error.
         """
-        error = self.linear_model_error or 0.0
-        if error < _MIN_SHOWN_ERROR:
+        model_error = self.linear_model_error or 0.0
+        if model_error < _MIN_SHOWN_ERROR:
             return f"{below_words}{100.0 * _MIN_SHOWN_ERROR:g} %"
-        return f"{upper_bound_words}{100.0 * error:.2g} %"
+        return f"{upper_bound_words}{100.0 * model_error:.2g} %"
 
     def as_json(self) -> dict[str, Any]:
         """Return the validity as a dictionary for JSON, with sentences."""

@@ -100,9 +100,9 @@ class _CountedFile(io.FileIO):
 
     def write(self, data: Any, /) -> int:  # noqa: ANN401 - any bytes-like object
         """Write bytes, and add their number to `written`."""
-        count = super().write(data)
-        self.written += count
-        return count
+        byte_count = super().write(data)
+        self.written += byte_count
+        return byte_count
 
 
 class SessionWriter:
@@ -142,17 +142,17 @@ class SessionWriter:
         with self._io_errors_explained():
             try:
                 # Append mode, so that the end detects bytes that another program has removed.
-                flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_APPEND
-                descriptor = os.open(self.part, flags, 0o666)
+                open_flags = os.O_CREAT | os.O_EXCL | os.O_RDWR | os.O_APPEND
+                file_descriptor = os.open(self.part, open_flags, 0o666)
             except FileExistsError:
                 raise SessionExistsError(
                     f"{self.part} exists: another session is being recorded to it or was "
                     "interrupted. Choose another name or move that file away; nothing is "
                     "overwritten."
                 ) from None
-            self._counted_file = _CountedFile(descriptor, "wb")
+            self._counted_file = _CountedFile(file_descriptor, "wb")
             self._stream = io.BufferedWriter(self._counted_file)
-            mark_as_written(descriptor)
+            mark_as_written(file_descriptor)
             # Checked only now, to detect a writer that finishes in between.
             if os.path.lexists(path):
                 self._stream.close()
@@ -195,34 +195,40 @@ class SessionWriter:
         self._start_utc_ns = start_utc_ns
         self._chunk_samples = _chunk_samples(metadata)
         with self._io_errors_explained():
-            mcap = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
-            session = {
+            mcap_writer = McapWriter(self._stream, library=f"rigd {rigd.__version__}")
+            session_record = {
                 **metadata,
                 "format_version": FORMAT_VERSION,
                 "start_utc_ns": str(start_utc_ns),
             }
             segments_record = _segments_record(segments)
-            mcap.add_metadata("session", session)
-            mcap.add_metadata("segments", segments_record)
-            for name, data in attachments.items():
-                media_type = _MEDIA_TYPES.get(Path(name).suffix, "application/octet-stream")
-                mcap.add_attachment(name, media_type, data, start_utc_ns)
-            mcap.declare(*_session_channels(metadata_for_channel(session, segments_record)))
-            self._mcap = mcap
+            mcap_writer.add_metadata("session", session_record)
+            mcap_writer.add_metadata("segments", segments_record)
+            for attachment_name, attachment_bytes in attachments.items():
+                media_type = _MEDIA_TYPES.get(
+                    Path(attachment_name).suffix, "application/octet-stream"
+                )
+                mcap_writer.add_attachment(
+                    attachment_name, media_type, attachment_bytes, start_utc_ns
+                )
+            mcap_writer.declare(
+                *_session_channels(metadata_for_channel(session_record, segments_record))
+            )
+            self._mcap = mcap_writer
             self._sync()
             fsync_directory(self.part.parent)
 
     def write_samples(self, block: Buffer) -> None:
         """Append packed samples: a multiple of ``SAMPLE_SIZE`` bytes, possibly 0."""
-        remaining = self._checked_view(block, SAMPLE_SIZE)
-        chunk_size = self._chunk_samples * SAMPLE_SIZE
+        remaining_bytes = self._checked_view(block, SAMPLE_SIZE)
+        chunk_bytes = self._chunk_samples * SAMPLE_SIZE
         with self._io_errors_explained():
-            while remaining:
-                room = chunk_size - len(self._samples)
-                self._samples += remaining[:room]
-                remaining = remaining[room:]
-                if len(self._samples) == chunk_size:
-                    self._write_chunk(everything=False)
+            while remaining_bytes:
+                chunk_room_bytes = chunk_bytes - len(self._samples)
+                self._samples += remaining_bytes[:chunk_room_bytes]
+                remaining_bytes = remaining_bytes[chunk_room_bytes:]
+                if len(self._samples) == chunk_bytes:
+                    self._write_chunk(include_later_messages=False)
             self._sync_when_due()
 
     def write_controls(self, block: Buffer) -> None:
@@ -264,17 +270,17 @@ class SessionWriter:
         """
         self._require_writer()
         log_time = self._start_utc_ns + t_ns
-        seconds, nanos = divmod(log_time, 10**9)
-        event = event_class()(
-            timestamp={"seconds": seconds, "nanos": nanos},
+        seconds, nanoseconds = divmod(log_time, 10**9)
+        event_message = event_class()(
+            timestamp={"seconds": seconds, "nanos": nanoseconds},
             level=EVENT_LEVELS.index(level),
             message=message,
             name=name,
         )
-        self._events.append((log_time, event.SerializeToString()))
+        self._events.append((log_time, event_message.SerializeToString()))
         if level in _URGENT_LEVELS:
             with self._io_errors_explained():
-                self._write_chunk(everything=True)
+                self._write_chunk(include_later_messages=True)
 
     def close(
         self,
@@ -298,13 +304,13 @@ class SessionWriter:
             If another file with the final path was created during the session. The complete session
             then remains in the ``.part`` file.
         """
-        mcap = self._require_writer()
+        mcap_writer = self._require_writer()
         with self._io_errors_explained():
-            self._write_chunk(everything=True)
+            self._write_chunk(include_later_messages=True)
             if segments:
-                mcap.add_metadata("segments", _segments_record(segments))
-            mcap.add_metadata("outcome", outcome)
-            mcap.finish()
+                mcap_writer.add_metadata("segments", _segments_record(segments))
+            mcap_writer.add_metadata("outcome", outcome)
+            mcap_writer.finish()
             self._sync()
             self._check_part_file()
             self._stream.close()
@@ -339,7 +345,7 @@ class SessionWriter:
             if not self._failed:
                 with self._io_errors_explained():
                     if self._mcap is not None:
-                        self._write_chunk(everything=True)
+                        self._write_chunk(include_later_messages=True)
                     self._stream.flush()
                     os.fsync(self._stream.fileno())
         finally:
@@ -384,18 +390,18 @@ class SessionWriter:
 
         Returns None if they could not be saved.
         """
-        descriptor = self._stream.fileno()
+        file_descriptor = self._stream.fileno()
         if self._is_part_in_place():
             return self.part
-        if os.fstat(descriptor).st_nlink:
+        if os.fstat(file_descriptor).st_nlink:
             with contextlib.suppress(OSError):
-                return Path(f"/proc/self/fd/{descriptor}").readlink()
+                return Path(f"/proc/self/fd/{file_descriptor}").readlink()
             return None
         for folder in self.part.absolute().parents:
             with contextlib.suppress(OSError):  # missing, not writable, full, or name exists
-                copy = folder / self.part.name
-                copy_new(descriptor, copy)
-                return copy
+                copy_path = folder / self.part.name
+                copy_new(file_descriptor, copy_path)
+                return copy_path
         return None
 
     def _require_writer(self) -> McapWriter:
@@ -407,55 +413,56 @@ class SessionWriter:
             raise SessionError(f"{self.part}: writing failed before, the recording ends there.")
         return self._mcap
 
-    def _checked_view(self, block: Buffer, size: int) -> memoryview:
-        """Return a view of the block; raise if its length is no multiple of `size` bytes."""
+    def _checked_view(self, block: Buffer, message_size: int) -> memoryview:
+        """Return a view of encoded messages; raise unless it contains a whole number of them."""
         self._require_writer()
-        view = memoryview(block).cast("B")
-        if len(view) % size:
+        block_view = memoryview(block).cast("B")
+        if len(block_view) % message_size:
             raise ValueError(
-                f"a block of {len(view)} bytes is not a whole number of {size}-byte messages"
+                f"a block of {len(block_view)} bytes is not a whole number of "
+                f"{message_size}-byte messages"
             )
-        return view
+        return block_view
 
-    def _write_chunk(self, *, everything: bool) -> None:
+    def _write_chunk(self, *, include_later_messages: bool) -> None:
         """Write the collected messages as one chunk.
 
         Controller terms and ages of readings that are later than the last sample stay for the next
-        chunk, unless `everything` is True.
+        chunk, unless `include_later_messages` is True.
         """
-        mcap = self._require_writer()
+        mcap_writer = self._require_writer()
         samples = np.frombuffer(self._samples, SAMPLE_WIRE_DTYPE)
         controls = np.frombuffer(self._controls, CONTROL_WIRE_DTYPE)
         timings = np.frombuffer(self._timings, TIMING_WIRE_DTYPE)
-        if not everything:
+        if not include_later_messages:
             controls, timings = (
                 messages[: np.searchsorted(messages["t_ns"], samples["t_ns"][-1], side="right")]
                 for messages in (controls, timings)
             )
         chunk_parts: list[bytes] = []
-        indexes: dict[int, npt.NDArray[np.void]] = {}
-        offset = 0
-        for topic, wire in (
+        message_indexes: dict[int, npt.NDArray[np.void]] = {}
+        chunk_offset = 0
+        for topic, wire_messages in (
             (SAMPLE_TOPIC, samples),
             (CONTROL_TOPIC, controls),
             (TIMING_TOPIC, timings),
             (TOUCH_TOPIC, np.frombuffer(self._touches, TOUCH_WIRE_DTYPE)),
         ):
-            if len(wire):
+            if len(wire_messages):
                 channel, _ = _CHANNEL_NUMBERS_AND_SCHEMAS[topic]
-                records = _message_records(wire, channel, self._start_utc_ns)
+                records = _message_records(wire_messages, channel, self._start_utc_ns)
                 chunk_parts.append(records.tobytes())
-                indexes[channel] = _message_index(records, offset)
-                offset += records.nbytes
+                message_indexes[channel] = _message_index(records, chunk_offset)
+                chunk_offset += records.nbytes
         if self._events:
             channel, _ = _CHANNEL_NUMBERS_AND_SCHEMAS[EVENT_TOPIC]
-            events, indexes[channel] = _event_records(
-                self._events, channel, self._event_count, offset
+            event_records, message_indexes[channel] = _event_records(
+                self._events, channel, self._event_count, chunk_offset
             )
-            chunk_parts.append(events)
+            chunk_parts.append(event_records)
             self._event_count += len(self._events)
-        if indexes:
-            mcap.add_chunk(b"".join(chunk_parts), indexes)
+        if message_indexes:
+            mcap_writer.add_chunk(b"".join(chunk_parts), message_indexes)
             self._stream.flush()
             self._is_sync_needed = True
         self._samples = bytearray()
@@ -465,7 +472,7 @@ class SessionWriter:
         self._events = []
 
     def _sync_when_due(self) -> None:
-        """Sync the file to the disk if it has changed and the last sync is a second ago."""
+        """Sync the file to the disk if it has changed since the last sync, a second or more ago."""
         if self._is_sync_needed and time.monotonic() - self._last_sync_s >= SYNC_INTERVAL_S:
             self._sync()
             self._check_part_file()
@@ -479,47 +486,51 @@ class SessionWriter:
 
 
 def _message_records(
-    wire: npt.NDArray[np.void], channel: int, start_utc_ns: int
+    wire_messages: npt.NDArray[np.void], channel: int, start_utc_ns: int
 ) -> npt.NDArray[np.void]:
-    """Return MCAP message records (n,) for messages (n,) of a wire dtype."""
-    records = np.empty(wire.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire.dtype)])
-    records["opcode"] = Opcode.MESSAGE
-    records["length"] = records.dtype.itemsize - RECORD_HEAD_SIZE
-    records["channel"] = channel
-    records["sequence"] = wire["tick"]
-    records["log_time"] = wire["t_ns"] + start_utc_ns
-    records["publish_time"] = records["log_time"]
-    records["data"] = wire
-    return records
+    """Return the MCAP message records (n,) that contain the encoded messages (n,)."""
+    message_records = np.empty(
+        wire_messages.shape, [*_MESSAGE_HEAD_FIELDS, ("data", wire_messages.dtype)]
+    )
+    message_records["opcode"] = Opcode.MESSAGE
+    message_records["length"] = message_records.dtype.itemsize - RECORD_HEAD_SIZE
+    message_records["channel"] = channel
+    message_records["sequence"] = wire_messages["tick"]
+    message_records["log_time"] = wire_messages["t_ns"] + start_utc_ns
+    message_records["publish_time"] = message_records["log_time"]
+    message_records["data"] = wire_messages
+    return message_records
 
 
 def _message_index(records: npt.NDArray[np.void], offset: int) -> npt.NDArray[np.void]:
     """Return the message index of records of equal length that begin at `offset` of a chunk."""
-    index = np.empty(records.shape, INDEX_DTYPE)
-    index["log_time"] = records["log_time"]
-    index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
-    return index
+    message_index = np.empty(records.shape, INDEX_DTYPE)
+    message_index["log_time"] = records["log_time"]
+    message_index["offset"] = offset + records.dtype.itemsize * np.arange(len(records))
+    return message_index
 
 
 def _event_records(
     events: Sequence[tuple[int, bytes]], channel: int, first_sequence: int, offset: int
 ) -> tuple[bytes, npt.NDArray[np.void]]:
     """Return the message records of events (log time in ns, message), and their message index."""
-    records = b""
-    index = np.empty(len(events), INDEX_DTYPE)
-    for i, (log_time, data) in enumerate(events):
-        index[i] = (log_time, offset + len(records))
-        length = MESSAGE_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(data)
-        records += MESSAGE_HEAD_FORMAT.pack(
-            Opcode.MESSAGE, length, channel, first_sequence + i, log_time, log_time
+    event_records = b""
+    message_index = np.empty(len(events), INDEX_DTYPE)
+    for i, (log_time, message_data) in enumerate(events):
+        message_index[i] = (log_time, offset + len(event_records))
+        record_length = MESSAGE_HEAD_FORMAT.size - RECORD_HEAD_SIZE + len(message_data)
+        event_records += MESSAGE_HEAD_FORMAT.pack(
+            Opcode.MESSAGE, record_length, channel, first_sequence + i, log_time, log_time
         )
-        records += data
-    return records, index
+        event_records += message_data
+    return event_records, message_index
 
 
 def _segments_record(segments: Mapping[str, tuple[int, int]]) -> dict[str, str]:
     """Return the record ``segments``: name → "first,end" in ticks."""
-    return {name: f"{first},{end}" for name, (first, end) in segments.items()}
+    return {
+        segment_name: f"{first_tick},{end}" for segment_name, (first_tick, end) in segments.items()
+    }
 
 
 def _chunk_samples(metadata: Mapping[str, str]) -> int:
@@ -575,14 +586,14 @@ def copy_new(descriptor: int, target: Path) -> None:
 
     Raises FileExistsError if `target` exists.
     """
-    with target.open("xb") as copy:
+    with target.open("xb") as target_descriptor:
         try:
-            position = 0
-            while data := os.pread(descriptor, _COPY_BLOCK_BYTES, position):
-                copy.write(data)
-                position += len(data)
-            copy.flush()
-            os.fsync(copy.fileno())
+            copied_bytes = 0
+            while block_bytes := os.pread(descriptor, _COPY_BLOCK_BYTES, copied_bytes):
+                target_descriptor.write(block_bytes)
+                copied_bytes += len(block_bytes)
+            target_descriptor.flush()
+            os.fsync(target_descriptor.fileno())
         except OSError:
             target.unlink()
             raise

@@ -108,7 +108,7 @@ class Status(IntFlag):
     """In this tick the control loop detected that the beam touched an obstacle."""
 
 
-def field_tag(number: int, protobuf_type: str) -> int:
+def field_tag(field_number: int, protobuf_type: str) -> int:
     """Return the protobuf tag byte that precedes a field of a fixed-layout message.
 
     Parameters
@@ -124,23 +124,27 @@ def field_tag(number: int, protobuf_type: str) -> int:
     >>> hex(field_tag(2, "fixed32"))
     '0x15'
     """
-    return number << 3 | _WIRE_TYPES[protobuf_type]
+    return field_number << 3 | _WIRE_TYPES[protobuf_type]
 
 
-def _native_dtype(types: dict[str, str]) -> np.dtype[np.void]:
+def _native_dtype(field_types: dict[str, str]) -> np.dtype[np.void]:
     """Return the array type of a decoded message with the given fields and protobuf types."""
     # Aligned: NumPy's loops over one field are then as fast as over any strided array.
     return np.dtype(
-        [(name, _NUMPY_TYPES[protobuf_type]) for name, protobuf_type in types.items()], align=True
+        [
+            (field_name, _NUMPY_TYPES[protobuf_type])
+            for field_name, protobuf_type in field_types.items()
+        ],
+        align=True,
     )
 
 
-def _wire_dtype(types: dict[str, str]) -> np.dtype[np.void]:
+def _wire_dtype(field_types: dict[str, str]) -> np.dtype[np.void]:
     """Return the array type of an encoded message: each field after its tag byte ``tag_NAME``."""
-    fields: list[tuple[str, str]] = []
-    for name, protobuf_type in types.items():
-        fields += [(f"tag_{name}", "u1"), (name, _NUMPY_TYPES[protobuf_type])]
-    return np.dtype(fields)
+    dtype_fields: list[tuple[str, str]] = []
+    for field_name, protobuf_type in field_types.items():
+        dtype_fields += [(f"tag_{field_name}", "u1"), (field_name, _NUMPY_TYPES[protobuf_type])]
+    return np.dtype(dtype_fields)
 
 
 SAMPLE_FIELDS: Final = tuple(SAMPLE_TYPES)
@@ -343,21 +347,21 @@ def pack_touch(
     kind
         One of ``TOUCH_KINDS``; any other text is encoded as unknown.
     """
-    values = (
+    touch_values = (
         t_ns, tick, x_m, x_std_m, force_n, force_std_n, stiffness_n_per_m, stiffness_std_n_per_m,
         TOUCH_KINDS.index(kind) if kind in TOUCH_KINDS else 0,
     )  # fmt: skip
     return _encode_messages(
-        dict(zip(TOUCH_TYPES, values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE
+        dict(zip(TOUCH_TYPES, touch_values, strict=True)), TOUCH_TYPES, TOUCH_WIRE_DTYPE
     )
 
 
-def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
+def encode_samples(field_values: Mapping[str, npt.ArrayLike]) -> bytes:
     """Return the encoded bytes of samples, in the fixed layout that `decode_samples` reads.
 
     Parameters
     ----------
-    columns : mapping of str to array (n,)
+    field_values : mapping of str to array (n,)
         Name of a sample field → values; ``tick`` is required, other absent fields are 0.
 
     Examples
@@ -366,19 +370,21 @@ def encode_samples(columns: Mapping[str, npt.ArrayLike]) -> bytes:
     >>> decode_samples(encode_samples({"tick": [0, 1], "angle_rad": [0.1, 0.2]}))["angle_rad"]
     array([0.1, 0.2])
     """
-    return _encode_messages(columns, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
+    return _encode_messages(field_values, SAMPLE_TYPES, SAMPLE_WIRE_DTYPE)
 
 
 def _encode_messages(
-    columns: Mapping[str, npt.ArrayLike], types: dict[str, str], wire_dtype: np.dtype[np.void]
+    field_values: Mapping[str, npt.ArrayLike],
+    field_types: dict[str, str],
+    wire_dtype: np.dtype[np.void],
 ) -> bytes:
     """Return messages encoded in the fixed layout, from field name → values (n,)."""
-    wire = np.zeros(np.size(columns["tick"]), wire_dtype)
-    for number, (name, protobuf_type) in enumerate(types.items(), start=1):
-        wire[f"tag_{name}"] = field_tag(number, protobuf_type)
-        if name in columns:
-            wire[name] = columns[name]
-    return wire.tobytes()
+    wire_messages = np.zeros(np.size(field_values["tick"]), wire_dtype)
+    for field_number, (field_name, protobuf_type) in enumerate(field_types.items(), start=1):
+        wire_messages[f"tag_{field_name}"] = field_tag(field_number, protobuf_type)
+        if field_name in field_values:
+            wire_messages[field_name] = field_values[field_name]
+    return wire_messages.tobytes()
 
 
 def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.NDArray[np.bool_]:
@@ -393,60 +399,68 @@ def is_fixed_layout(wire: npt.NDArray[np.void], types: dict[str, str]) -> npt.ND
     -------
     array (n,) of bool
     """
-    offsets, tags = _tag_offsets_and_values(wire.dtype, tuple(types.items()))
-    data = np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
-    is_fixed: npt.NDArray[np.bool_] = (data[:, offsets] == tags).all(axis=1)
+    tag_offsets, tag_values = _tag_offsets_and_values(wire.dtype, tuple(types.items()))
+    message_bytes = (
+        np.ascontiguousarray(wire).view(np.uint8).reshape(wire.size, wire.dtype.itemsize)
+    )
+    is_fixed: npt.NDArray[np.bool_] = (message_bytes[:, tag_offsets] == tag_values).all(axis=1)
     return is_fixed
 
 
 @cache
 def _tag_offsets_and_values(
-    wire_dtype: np.dtype[np.void], types: tuple[tuple[str, str], ...]
+    wire_dtype: np.dtype[np.void], field_types: tuple[tuple[str, str], ...]
 ) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.uint8]]:
     """Return the offsets and the values of the tag bytes in an encoded message."""
     assert wire_dtype.fields is not None
-    offsets = [wire_dtype.fields[f"tag_{name}"][1] for name, _ in types]
-    tags = [
-        field_tag(number, protobuf_type) for number, (_, protobuf_type) in enumerate(types, start=1)
+    tag_offsets = [wire_dtype.fields[f"tag_{field_name}"][1] for field_name, _ in field_types]
+    tag_values = [
+        field_tag(field_number, protobuf_type)
+        for field_number, (_, protobuf_type) in enumerate(field_types, start=1)
     ]
-    return np.array(offsets), np.array(tags, dtype=np.uint8)
+    return np.array(tag_offsets), np.array(tag_values, dtype=np.uint8)
 
 
-def to_native(wire: npt.NDArray[np.void], names: Iterable[str], out: npt.NDArray[np.void]) -> None:
+def to_native(
+    wire_messages: npt.NDArray[np.void],
+    field_names: Iterable[str],
+    native_messages: npt.NDArray[np.void],
+) -> None:
     """Copy fields of encoded messages into an array of decoded messages.
 
     Parameters
     ----------
-    wire : array (n,) of encoded messages
+    wire_messages : array (n,) of encoded messages
     names
         Names of the fields to copy.
-    out : array (n,) of decoded messages, which is written to
+    native_messages : array (n,) of decoded messages, which is written to
     """
-    for name in names:
-        out[name] = wire[name]
+    for field_name in field_names:
+        native_messages[field_name] = wire_messages[field_name]
 
 
 def _decode_messages(
     block: Buffer,
-    types: dict[str, str],
+    field_types: dict[str, str],
     wire_dtype: np.dtype[np.void],
     dtype: np.dtype[np.void],
 ) -> npt.NDArray[np.void]:
     """Return the decoded messages of a block of bytes; raise ValueError if a tag byte is wrong."""
-    size = memoryview(block).nbytes
-    if size % wire_dtype.itemsize:
+    block_bytes = memoryview(block).nbytes
+    if block_bytes % wire_dtype.itemsize:
         raise ValueError(
-            f"a block of {size} bytes is not a whole number of {wire_dtype.itemsize}-byte messages"
+            f"a block of {block_bytes} bytes is not a whole number of {wire_dtype.itemsize}-byte "
+            "messages"
         )
-    wire = np.frombuffer(block, wire_dtype)
-    is_fixed = is_fixed_layout(wire, types)
+    wire_messages = np.frombuffer(block, wire_dtype)
+    is_fixed = is_fixed_layout(wire_messages, field_types)
     if not is_fixed.all():
         raise ValueError(
             f"message {int(np.argmin(is_fixed))} of the block is not of the fixed layout"
         )
-    native = np.empty(wire.shape, dtype)
-    to_native(wire, types, native)
-    return native
+    decoded_messages = np.empty(wire_messages.shape, dtype)
+    to_native(wire_messages, field_types, decoded_messages)
+    return decoded_messages
 
 
 def decode_samples(block: Buffer) -> npt.NDArray[np.void]:

@@ -72,7 +72,7 @@ class EstimateRequest:
     """Whether the fit may start from the previous estimate, which takes a third of the time."""
 
 
-def write_start(stream: BinaryIO, start: StreamStart) -> None:
+def write_start(input_stream: BinaryIO, stream_start: StreamStart) -> None:
     """Write the first line of the online fit's input stream: the session's metadata.
 
     Parameters
@@ -82,8 +82,10 @@ def write_start(stream: BinaryIO, start: StreamStart) -> None:
     start
         Metadata and segments of the session.
     """
-    stream.write(json.dumps({"version": _STREAM_VERSION, **asdict(start)}).encode() + b"\n")
-    stream.flush()
+    input_stream.write(
+        json.dumps({"version": _STREAM_VERSION, **asdict(stream_start)}).encode() + b"\n"
+    )
+    input_stream.flush()
 
 
 def write_samples(stream: BinaryIO, block: Buffer) -> None:
@@ -112,10 +114,10 @@ def write_request(stream: BinaryIO, request: EstimateRequest) -> None:
     _write_frame(stream, _REQUEST_FRAME, json.dumps(asdict(request)).encode())
 
 
-def _write_frame(stream: BinaryIO, frame_kind: bytes, content: Buffer) -> None:
+def _write_frame(stream: BinaryIO, frame_kind: bytes, frame_content: Buffer) -> None:
     """Write a frame (kind, length, content) to the stream."""
-    stream.write(_FRAME_HEAD_FORMAT.pack(frame_kind, memoryview(content).nbytes))
-    stream.write(content)
+    stream.write(_FRAME_HEAD_FORMAT.pack(frame_kind, memoryview(frame_content).nbytes))
+    stream.write(frame_content)
     stream.flush()
 
 
@@ -133,10 +135,16 @@ def read_start(stream: BinaryIO) -> StreamStart:
             raise _stream_error(
                 f"it is of version {first_line['version']!r}, not {_STREAM_VERSION}"
             )
-        segments = first_line["segments"].items()
+        segment_items = first_line["segments"].items()
         return StreamStart(
-            metadata={str(key): str(value) for key, value in first_line["metadata"].items()},
-            segments={str(name): (int(first), int(end)) for name, (first, end) in segments},
+            metadata={
+                str(key): str(metadata_value)
+                for key, metadata_value in first_line["metadata"].items()
+            },
+            segments={
+                str(segment_name): (int(first_tick), int(end))
+                for segment_name, (first_tick, end) in segment_items
+            },
             every_s=None if first_line["every_s"] is None else float(first_line["every_s"]),
         )
     except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
@@ -155,20 +163,20 @@ def read_frames(stream: BinaryIO) -> Iterator[npt.NDArray[np.void] | EstimateReq
     SessionError
         If the data is not a frame, or ends within a frame.
     """
-    while head := stream.read(_FRAME_HEAD_FORMAT.size):
-        if len(head) < _FRAME_HEAD_FORMAT.size:
+    while frame_head := stream.read(_FRAME_HEAD_FORMAT.size):
+        if len(frame_head) < _FRAME_HEAD_FORMAT.size:
             raise _stream_error("it ended within a frame")
-        frame_kind, length = _FRAME_HEAD_FORMAT.unpack(head)
-        if length > _MAX_FRAME_BYTES:
-            raise _stream_error(f"a frame of {length} bytes")
-        content = stream.read(length)
-        if len(content) < length:
+        frame_kind, content_length = _FRAME_HEAD_FORMAT.unpack(frame_head)
+        if content_length > _MAX_FRAME_BYTES:
+            raise _stream_error(f"a frame of {content_length} bytes")
+        frame_content = stream.read(content_length)
+        if len(frame_content) < content_length:
             raise _stream_error("it ended within a frame")
         try:
             if frame_kind == _SAMPLES_FRAME:
-                yield decode_samples(content)
+                yield decode_samples(frame_content)
             elif frame_kind == _REQUEST_FRAME:
-                yield _parsed_request(json.loads(content))
+                yield _parsed_request(json.loads(frame_content))
             else:
                 raise _stream_error(f"a frame of unknown kind {frame_kind!r}")
         except (ValueError, TypeError, KeyError, AttributeError, OverflowError) as error:
@@ -185,11 +193,11 @@ def _parsed_request(document: Mapping[str, Any]) -> EstimateRequest:
     )
 
 
-def _stream_error(what: str) -> SessionError:
-    """Return the error for an invalid stream; `what` describes the defect."""
+def _stream_error(defect_text: str) -> SessionError:
+    """Return the error for an invalid stream; `defect_text` describes the defect."""
     return SessionError(
-        f"The stream of samples to the online fit is broken: {what}. It has to come from a program "
-        "of the same version."
+        f"The stream of samples to the online fit is broken: {defect_text}. It has to come from "
+        "a program of the same version."
     )
 
 
@@ -212,19 +220,24 @@ def mode_line(mode: Mapping[str, Any]) -> str:
     ...                  "damping_ratio": {"value": 0.00909, "interval_95": None}}))
     mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
     """
-    hz, damping = mode["frequency_hz"], mode["damping_ratio"]
-    text = (
+    hz, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
+    mode_text = (
         f"mode {mode['mode']}: {with_half_width(hz['value'], hz['interval_95'])} Hz, "
-        f"damping {with_half_width(damping['value'], damping['interval_95'], 100.0)} %"
+        "damping "
+        f"{with_half_width(damping_estimate['value'], damping_estimate['interval_95'], 100.0)} %"
     )
-    inertia = mode.get("participation")
-    if inertia is None:
-        return text
-    inertia_text = with_half_width(inertia["value"], inertia["interval_95"], _KG_MM2_PER_KG_M2)
-    return f"{text}, inertia {inertia_text} kg·mm²"
+    inertia_estimate = mode.get("participation")
+    if inertia_estimate is None:
+        return mode_text
+    inertia_text = with_half_width(
+        inertia_estimate["value"], inertia_estimate["interval_95"], _KG_MM2_PER_KG_M2
+    )
+    return f"{mode_text}, inertia {inertia_text} kg·mm²"
 
 
-def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> list[str]:
+def estimate_lines(
+    fit_document: Mapping[str, Any], earlier_document: Mapping[str, Any] | None = None
+) -> list[str]:
     """Return lines of text that report an estimate of the online fit to the operator.
 
     Parameters
@@ -234,30 +247,33 @@ def estimate_lines(answer: Mapping[str, Any], before: Mapping[str, Any] | None =
     before
         Earlier estimate with which the modes are compared, or None for no comparison.
     """
-    findings = [f"  {sentence}" for sentence in answer["findings"]]
-    if answer["problem"]:
-        return [f"After {answer['duration_s']:.1f} s: {answer['problem']}", *findings]
-    validity = Validity.of_document(answer.get("validity")).short
+    findings = [f"  {finding_sentence}" for finding_sentence in fit_document["findings"]]
+    if fit_document["problem"]:
+        return [f"After {fit_document['duration_s']:.1f} s: {fit_document['problem']}", *findings]
+    validity = Validity.of_document(fit_document.get("validity")).short
     heading = f"± 95 %, statistical only; tip slope {validity}"
-    lines = [f"After {answer['duration_s']:.1f} s ({heading}):"]
+    report_lines = [f"After {fit_document['duration_s']:.1f} s ({heading}):"]
     earlier_modes = {
-        mode["mode"]: mode for mode in (before or {}).get("modes", ()) if mode["shown"]
+        mode["mode"]: mode for mode in (earlier_document or {}).get("modes", ()) if mode["shown"]
     }
-    for mode in answer["modes"]:
+    for mode in fit_document["modes"]:
         if mode["shown"]:
-            change = (
+            change_text = (
                 _change_text(earlier_modes[mode["mode"]], mode)
                 if mode["mode"] in earlier_modes
                 else ""
             )
-            doubt = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
-            lines.append(f"  {mode_line(mode)}{change}{f' (doubtful: {doubt})' if doubt else ''}")
-    unseen = unseen_modes(answer["modes"])
-    if unseen:
-        lines.append(f"  not visible so far: {unseen}")
-    if uniform_beam := Validity.of_document(answer.get("validity")).uniform_beam:
-        lines.append(f"  {uniform_beam.sentence}")
-    return [*lines, *findings]
+            doubt_text = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
+            report_lines.append(
+                f"  {mode_line(mode)}{change_text}"
+                f"{f' (doubtful: {doubt_text})' if doubt_text else ''}"
+            )
+    unseen_text = unseen_modes(fit_document["modes"])
+    if unseen_text:
+        report_lines.append(f"  not visible so far: {unseen_text}")
+    if uniform_beam := Validity.of_document(fit_document.get("validity")).uniform_beam:
+        report_lines.append(f"  {uniform_beam.sentence}")
+    return [*report_lines, *findings]
 
 
 def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
@@ -276,17 +292,23 @@ def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
     >>> unseen_modes([{"mode": n, "shown": n == 1} for n in (1, 2, 3)])
     'modes 2 and 3'
     """
-    unseen = [str(mode["mode"]) for mode in modes if not mode.get("shown", True)]
-    return f"mode{'s' if len(unseen) > 1 else ''} {listed(unseen)}" if unseen else ""
-
-
-def _change_text(before: Mapping[str, Any], mode: Mapping[str, Any]) -> str:
-    """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
-    hz, damping = mode["frequency_hz"], mode["damping_ratio"]
-    shift_hz = hz["value"] - before["frequency_hz"]["value"]
-    earlier_damping = before["damping_ratio"]["value"]
-    digits = decimals(hz["std"]) if hz["std"] else 4
-    relative_change = (
-        f", {100 * (damping['value'] / earlier_damping - 1):+.2g} %" if earlier_damping else ""
+    unseen_numbers = [str(mode["mode"]) for mode in modes if not mode.get("shown", True)]
+    return (
+        f"mode{'s' if len(unseen_numbers) > 1 else ''} {listed(unseen_numbers)}"
+        if unseen_numbers
+        else ""
     )
-    return f"; change {shift_hz:+.{digits}f} Hz{relative_change}"
+
+
+def _change_text(earlier_mode: Mapping[str, Any], mode: Mapping[str, Any]) -> str:
+    """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
+    hz, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
+    shift_hz = hz["value"] - earlier_mode["frequency_hz"]["value"]
+    earlier_damping = earlier_mode["damping_ratio"]["value"]
+    decimal_digits = decimals(hz["std"]) if hz["std"] else 4
+    relative_change = (
+        f", {100 * (damping_estimate['value'] / earlier_damping - 1):+.2g} %"
+        if earlier_damping
+        else ""
+    )
+    return f"; change {shift_hz:+.{decimal_digits}f} Hz{relative_change}"

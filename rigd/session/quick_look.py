@@ -78,15 +78,15 @@ def read_quick_look(path: Path) -> Document | None:
         if document["version"] != QUICK_LOOK_VERSION:
             return None
         return dict(document) | {
-            **{name: _checked_text(document.get(name) or "") for name in _TEXT_KEYS},
-            **{name: int(document.get(name) or 0) for name in _TIME_KEYS},
+            **{key_name: _checked_text(document.get(key_name) or "") for key_name in _TEXT_KEYS},
+            **{key_name: int(document.get(key_name) or 0) for key_name in _TIME_KEYS},
             "modes": modes_of(document.get("modes")),
             "validity": Validity.of_document(document.get("validity")).as_json(),
             "response": _valid_response(document.get("response")),
             "model": _valid_curves(document.get("model"), (*_CURVE_KEYS, *_CONFIDENCE_BAND_KEYS)),
             **{
-                name: [_checked_text(line) for line in document.get(name) or []]
-                for name in _LINE_LIST_KEYS
+                key_name: [_checked_text(text_line) for text_line in document.get(key_name) or []]
+                for key_name in _LINE_LIST_KEYS
             },
         }
     except _PARSING_ERRORS:
@@ -98,8 +98,8 @@ def last_quick_look(
     specimen: str,
     *,
     before_utc_ns: int | None = None,
-    but: str = "",
-    usable: Callable[[Document], object],
+    excluded_session: str = "",
+    is_usable: Callable[[Document], object],
 ) -> tuple[Path, Document] | None:
     """Return the last usable quick look at a session of a specimen.
 
@@ -122,15 +122,17 @@ def last_quick_look(
         Path of the session file, and the quick look's document from `read_quick_look`; None if
         there is no such session.
     """
-    for path in sorted(_newest_quick_looks(folder), key=_start_utc_ns, reverse=True):
+    for report_path in sorted(_newest_quick_looks(folder), key=_start_utc_ns, reverse=True):
         if (
-            path.name != but + QUICK_LOOK_SUFFIX
-            and (report := read_quick_look(path)) is not None
-            and report["specimen"] == specimen
-            and (before_utc_ns is None or report["start_utc_ns"] < before_utc_ns)
-            and usable(report)
+            report_path.name != excluded_session + QUICK_LOOK_SUFFIX
+            and (report_document := read_quick_look(report_path)) is not None
+            and report_document["specimen"] == specimen
+            and (before_utc_ns is None or report_document["start_utc_ns"] < before_utc_ns)
+            and is_usable(report_document)
         ):
-            return path.with_name(path.name.removesuffix(QUICK_LOOK_SUFFIX) + ".mcap"), report
+            return report_path.with_name(
+                report_path.name.removesuffix(QUICK_LOOK_SUFFIX) + ".mcap"
+            ), report_document
     return None
 
 
@@ -138,10 +140,12 @@ def _newest_quick_looks(folder: Path) -> list[Path]:
     """Return the paths of the 200 newest quick looks in a folder."""
     times_and_paths: list[tuple[float, Path]] = []
     with suppress(OSError):
-        for path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
+        for report_path in folder.glob(f"*{QUICK_LOOK_SUFFIX}"):
             with suppress(OSError):
-                times_and_paths.append((path.stat().st_mtime, path))
-    return [path for _, path in sorted(times_and_paths, reverse=True)[:_MAX_FILES_READ]]
+                times_and_paths.append((report_path.stat().st_mtime, report_path))
+    return [
+        report_path for _, report_path in sorted(times_and_paths, reverse=True)[:_MAX_FILES_READ]
+    ]
 
 
 def _start_utc_ns(path: Path) -> int:
@@ -157,13 +161,13 @@ def _start_utc_ns(path: Path) -> int:
 
 def _file_beginning(path: Path) -> bytes:
     """Return the first mebibyte of a file, without waiting if the file is a pipe."""
-    descriptor = os.open(path, os.O_RDONLY | _NONBLOCKING_FLAGS)
-    with open(descriptor, "rb") as file:  # noqa: PTH123 - of a descriptor
-        return file.read(_MAX_FILE_BYTES)
+    file_descriptor = os.open(path, os.O_RDONLY | _NONBLOCKING_FLAGS)
+    with open(file_descriptor, "rb") as opened_file:  # noqa: PTH123 - of a descriptor
+        return opened_file.read(_MAX_FILE_BYTES)
 
 
 def modes_of(documents: object) -> list[Document]:
-    """Return the valid modes of a quick look or a report.
+    """Return the valid modes of the beam from the JSON list of a quick look or a report.
 
     Parameters
     ----------
@@ -181,28 +185,28 @@ def modes_of(documents: object) -> list[Document]:
     return list(_valid_modes(documents)) if isinstance(documents, list) else []
 
 
-def _valid_modes(documents: list[object]) -> Iterator[Document]:
-    """Yield the valid modes of a list of any JSON values."""
-    for index, mode in enumerate(documents[:_MAX_MODES], start=1):
+def _valid_modes(mode_documents: list[object]) -> Iterator[Document]:
+    """Yield the entries of a list of JSON values that validly describe a mode of the beam."""
+    for mode_index, mode in enumerate(mode_documents[:_MAX_MODES], start=1):
         if isinstance(mode, dict):
-            number, shown = mode.get("mode", index), mode.get("shown") is not False
-            frequency, damping = (
+            mode_number, is_shown = mode.get("mode", mode_index), mode.get("shown") is not False
+            frequency_estimate, damping_estimate = (
                 _valid_estimate(mode.get(k)) for k in ("frequency_hz", "damping_ratio")
             )
             if (
-                type(number) is int
-                and frequency is not None
-                and frequency["value"] > 0
-                and damping is not None
+                type(mode_number) is int
+                and frequency_estimate is not None
+                and frequency_estimate["value"] > 0
+                and damping_estimate is not None
             ):
-                source = mode.get("source")
+                mode_source = mode.get("source")
                 yield {
-                    "mode": number,
-                    "shown": shown,
-                    "frequency_hz": frequency,
-                    "damping_ratio": damping,
+                    "mode": mode_number,
+                    "shown": is_shown,
+                    "frequency_hz": frequency_estimate,
+                    "damping_ratio": damping_estimate,
                     "participation": _valid_estimate(mode.get("participation")),
-                    "source": source if source in _MODE_SOURCES else None,
+                    "source": mode_source if mode_source in _MODE_SOURCES else None,
                 }
 
 
@@ -223,24 +227,32 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         ``targets`` with name, quantity, mode, value, and estimated and requested deviation.
     """
     try:
-        text = (outcome or {})["fit"]
-        document = json.loads(text, parse_constant=lambda _: None, parse_float=_finite_or_none)
-        duration_s = finite_number(document["duration_s"])
-        parameters = {
-            _checked_text(name): _valid_estimate(value)
-            for name, value in document.get("parameters", {}).items()
+        fit_text = (outcome or {})["fit"]
+        fit_document = json.loads(
+            fit_text, parse_constant=lambda _: None, parse_float=_finite_or_none
+        )
+        duration_s = finite_number(fit_document["duration_s"])
+        parameter_estimates = {
+            _checked_text(parameter_name): _valid_estimate(estimate_document)
+            for parameter_name, estimate_document in fit_document.get("parameters", {}).items()
         }
-        search = document.get("search") or {}
+        search_document = fit_document.get("search") or {}
         return {
             "duration_s": max(duration_s or 0.0, 0.0),
-            "problem": _checked_text(document.get("problem") or ""),
-            "validity": Validity.of_document(document.get("validity")).as_json(),
-            "modes": modes_of(document.get("modes")),
-            "parameters": {name: value for name, value in parameters.items() if value is not None},
-            "findings": [_checked_text(line) for line in document.get("findings") or []],
+            "problem": _checked_text(fit_document.get("problem") or ""),
+            "validity": Validity.of_document(fit_document.get("validity")).as_json(),
+            "modes": modes_of(fit_document.get("modes")),
+            "parameters": {
+                parameter_name: estimate_document
+                for parameter_name, estimate_document in parameter_estimates.items()
+                if estimate_document is not None
+            },
+            "findings": [
+                _checked_text(text_line) for text_line in fit_document.get("findings") or []
+            ],
             "search": {
-                "reason": _checked_text(search.get("reason") or ""),
-                "targets": list(_valid_targets(search.get("targets"))),
+                "reason": _checked_text(search_document.get("reason") or ""),
+                "targets": list(_valid_targets(search_document.get("targets"))),
             },
         }
     except (*_PARSING_ERRORS, AttributeError):
@@ -248,79 +260,91 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
 
 
 def _valid_targets(documents: object) -> Iterator[Document]:
-    """Yield the valid precision targets of any JSON value."""
-    for target in documents if isinstance(documents, list) else ():
-        if isinstance(target, dict):
-            numbers = {
-                name: finite_number(target.get(name)) for name in ("value", "std", "asked_std")
+    """Yield the entries of a JSON value that validly state a requested precision."""
+    for target_document in documents if isinstance(documents, list) else ():
+        if isinstance(target_document, dict):
+            target_numbers = {
+                number_key: finite_number(target_document.get(number_key))
+                for number_key in ("value", "std", "asked_std")
             }
-            if numbers["asked_std"] is not None:
-                mode = target.get("mode")
+            if target_numbers["asked_std"] is not None:
+                mode = target_document.get("mode")
                 yield {
-                    "name": _checked_text(target.get("name") or ""),
+                    "name": _checked_text(target_document.get("name") or ""),
                     # Older files have names only.
-                    "quantity": _checked_text(target.get("quantity") or ""),
+                    "quantity": _checked_text(target_document.get("quantity") or ""),
                     "mode": mode if type(mode) is int else None,
-                    **numbers,
+                    **target_numbers,
                 }
 
 
-def _valid_estimate(document: object) -> Document | None:
+def _valid_estimate(estimate_document: object) -> Document | None:
     """Return an estimate with value, standard deviation and interval, or None if it is invalid."""
-    if not isinstance(document, dict) or (value := finite_number(document.get("value"))) is None:
+    if (
+        not isinstance(estimate_document, dict)
+        or (estimated_value := finite_number(estimate_document.get("value"))) is None
+    ):
         return None
-    bounds = document.get("interval_95")
-    interval = (
-        [finite_number(end) for end in bounds]
-        if isinstance(bounds, list) and len(bounds) == 2
+    interval_bounds = estimate_document.get("interval_95")
+    confidence_interval = (
+        [finite_number(end) for end in interval_bounds]
+        if isinstance(interval_bounds, list) and len(interval_bounds) == 2
         else None
     )
-    flag = document.get("flag")
+    flag_text = estimate_document.get("flag")
     return {
-        "value": value,
-        "std": finite_number(document.get("std")),
-        "interval_95": None if interval is None or None in interval else interval,
-        "flag": _checked_text(flag) if isinstance(flag, str) else None,
+        "value": estimated_value,
+        "std": finite_number(estimate_document.get("std")),
+        "interval_95": None
+        if confidence_interval is None or None in confidence_interval
+        else confidence_interval,
+        "flag": _checked_text(flag_text) if isinstance(flag_text, str) else None,
     }
 
 
-def _valid_response(document: object) -> Document | None:
+def _valid_response(response_document: object) -> Document | None:
     """Return a frequency response with coherence and resolution, or None if it is invalid."""
-    curves = _valid_curves(document, _CURVE_KEYS)
-    if curves is None or not isinstance(document, dict):
+    response_curves = _valid_curves(response_document, _CURVE_KEYS)
+    if response_curves is None or not isinstance(response_document, dict):
         return None
-    coherence = _finite_numbers(document.get("coherence"))
+    coherence = _finite_numbers(response_document.get("coherence"))
     return {
-        **curves,
-        "coherence": coherence if len(coherence) == len(curves["frequency_hz"]) else None,
-        "resolution_hz": finite_number(document.get("resolution_hz")),
+        **response_curves,
+        "coherence": coherence if len(coherence) == len(response_curves["frequency_hz"]) else None,
+        "resolution_hz": finite_number(response_document.get("resolution_hz")),
     }
 
 
-def _valid_curves(document: object, names: tuple[str, ...]) -> Document | None:
+def _valid_curves(curves_document: object, curve_keys: tuple[str, ...]) -> Document | None:
     """Return lists of finite numbers by name, or None unless all have the same length above 0."""
-    if not isinstance(document, dict):
+    if not isinstance(curves_document, dict):
         return None
-    curves = {name: _finite_numbers(document.get(name)) for name in names}
-    points = len(curves["frequency_hz"])
-    if not points or any(len(curve) != points for curve in curves.values()):
+    curves = {
+        curve_key: _finite_numbers(curves_document.get(curve_key)) for curve_key in curve_keys
+    }
+    point_count = len(curves["frequency_hz"])
+    if not point_count or any(len(curve) != point_count for curve in curves.values()):
         return None
     return curves
 
 
-def _finite_numbers(values: object) -> list[float]:
+def _finite_numbers(json_values: object) -> list[float]:
     """Return a list of finite numbers, or an empty list if it contains any other value."""
-    numbers = [finite_number(value) for value in values] if isinstance(values, list) else []
+    numbers = (
+        [finite_number(json_value) for json_value in json_values]
+        if isinstance(json_values, list)
+        else []
+    )
     return [] if None in numbers else numbers  # type: ignore[return-value]
 
 
-def _finite_or_none(text: str) -> float | None:
+def _finite_or_none(number_text: str) -> float | None:
     """Return the finite number that a text states, or None if it is infinite or NaN."""
-    return finite_number(float(text))
+    return finite_number(float(number_text))
 
 
-def _checked_text(value: object) -> str:
-    """Return a text without control characters, cut to 1000; raise TypeError if it is no text."""
-    if not isinstance(value, str):
+def _checked_text(json_value: object) -> str:
+    """Return a text without control characters, cut to 1000 characters; raise TypeError if none."""
+    if not isinstance(json_value, str):
         raise TypeError
-    return printable(value, _MAX_TEXT_CHARACTERS)
+    return printable(json_value, _MAX_TEXT_CHARACTERS)

@@ -38,45 +38,53 @@ def touches_of(outcome: Mapping[str, str] | None) -> list[dict[str, Any]]:
         For each touch its number, kind and estimated quantities; an invalid quantity is None.
     """
     try:
-        documents = json.loads((outcome or {}).get("touches", "[]"))
+        touch_documents = json.loads((outcome or {}).get("touches", "[]"))
     except (ValueError, RecursionError):
         return []
-    if not isinstance(documents, list):
+    if not isinstance(touch_documents, list):
         return []
-    return [_checked_touch(each) for each in documents[:_MAX_TOUCHES] if isinstance(each, dict)]
+    return [
+        _checked_touch(touch_document)
+        for touch_document in touch_documents[:_MAX_TOUCHES]
+        if isinstance(touch_document, dict)
+    ]
 
 
-def _checked_touch(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a touch with checked values from a JSON object."""
-    number, kind = document.get("number"), document.get("kind")
+def _checked_touch(touch_document: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a touch of the beam with its valid values from a JSON object."""
+    touch_number, touch_kind = touch_document.get("number"), touch_document.get("kind")
     touch: dict[str, Any] = {
-        "number": number if isinstance(number, int) and 0 < number < 10**9 else 0,
-        **{name: _checked_estimate(document.get(name)) for name in _QUANTITY_UNITS},
+        "number": touch_number if isinstance(touch_number, int) and 0 < touch_number < 10**9 else 0,
+        **{
+            quantity_name: _checked_estimate(touch_document.get(quantity_name))
+            for quantity_name in _QUANTITY_UNITS
+        },
     }
-    first_estimate_mark = {"final": False} if document.get("final") is False else {}
+    first_estimate_mark = {"final": False} if touch_document.get("final") is False else {}
     return (
         touch
-        | {"kind": kind[:_MAX_KIND_CHARACTERS] if isinstance(kind, str) else ""}
+        | {"kind": touch_kind[:_MAX_KIND_CHARACTERS] if isinstance(touch_kind, str) else ""}
         | first_estimate_mark
     )
 
 
-def _checked_estimate(document: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
-    """Return an estimate with its uncertainty from any JSON value, or None if it is invalid."""
-    if not isinstance(document, dict):
+def _checked_estimate(estimate_document: Any) -> dict[str, Any] | None:  # noqa: ANN401 - any JSON value
+    """Return a touch's estimate with its uncertainty from a JSON value, or None if invalid."""
+    if not isinstance(estimate_document, dict):
         return None
-    bounds = document.get("interval_95")
-    numbers = [
-        document.get("value"),
-        document.get("std"),
-        *(bounds if isinstance(bounds, list) else ()),
+    interval_bounds = estimate_document.get("interval_95")
+    estimate_numbers = [
+        estimate_document.get("value"),
+        estimate_document.get("std"),
+        *(interval_bounds if isinstance(interval_bounds, list) else ()),
     ]
-    if len(numbers) != 4 or not all(
-        isinstance(each, int | float) and abs(each) < 1e15 and isfinite(each) for each in numbers
+    if len(estimate_numbers) != 4 or not all(
+        isinstance(number, int | float) and abs(number) < 1e15 and isfinite(number)
+        for number in estimate_numbers
     ):
         return None
-    value, std, low, high = map(float, numbers)
-    return {"value": value, "std": std, "interval_95": [low, high]}
+    estimated_value, std, lower_bound, upper_bound = map(float, estimate_numbers)
+    return {"value": estimated_value, "std": std, "interval_95": [lower_bound, upper_bound]}
 
 
 def touch_line(touch: Mapping[str, Any]) -> str:
@@ -87,16 +95,19 @@ def touch_line(touch: Mapping[str, Any]) -> str:
     touch
         Touch as in JSON documents and from `touches_of`.
     """
-    texts = [
-        f"{with_half_width(estimate['value'], estimate['interval_95'])} {unit}"
-        for name, unit in _QUANTITY_UNITS.items()
-        if (estimate := touch.get(name)) is not None
+    quantity_texts = [
+        f"{with_half_width(estimate['value'], estimate['interval_95'])} {unit_text}"
+        for quantity_name, unit_text in _QUANTITY_UNITS.items()
+        if (estimate := touch.get(quantity_name)) is not None
     ]
-    kind = touch.get("kind", "")
-    texts.append("kind: cannot tell" if kind == "unknown" else kind)
-    estimates_text = ", ".join(part for part in texts if part) or "not estimated"
-    first = "" if touch.get("final", True) else " (first estimate)"
-    return f"Touch {touch['number']}: {estimates_text}{first}"
+    touch_kind = touch.get("kind", "")
+    quantity_texts.append("kind: cannot tell" if touch_kind == "unknown" else touch_kind)
+    estimates_text = (
+        ", ".join(quantity_text for quantity_text in quantity_texts if quantity_text)
+        or "not estimated"
+    )
+    first_estimate_note = "" if touch.get("final", True) else " (first estimate)"
+    return f"Touch {touch['number']}: {estimates_text}{first_estimate_note}"
 
 
 def packed_touches(touches: Sequence[tuple[int, Mapping[str, Any]]], rate_hz: float) -> bytes:
@@ -110,17 +121,20 @@ def packed_touches(touches: Sequence[tuple[int, Mapping[str, Any]]], rate_hz: fl
         Sample rate, in ticks per second.
     """
 
-    def value_and_std(touch: Mapping[str, Any], name: str) -> tuple[float, float]:
-        estimate = touch.get(name)
+    def value_and_std(touch: Mapping[str, Any], quantity_name: str) -> tuple[float, float]:
+        estimate = touch.get(quantity_name)
         return (nan, nan) if estimate is None else (estimate["value"], estimate["std"])
 
-    messages = []
+    encoded_messages = []
     for tick, touch in touches:
-        time = touch.get("time_s")
-        time_s = tick / rate_hz if time is None else time["value"]
-        values = (value_and_std(touch, name) for name in ("x_m", "force_n", "stiffness_n_per_m"))
-        x, force, stiffness = values
-        messages.append(
+        touch_time = touch.get("time_s")
+        time_s = tick / rate_hz if touch_time is None else touch_time["value"]
+        touch_values = (
+            value_and_std(touch, quantity_name)
+            for quantity_name in ("x_m", "force_n", "stiffness_n_per_m")
+        )
+        x, force, stiffness = touch_values
+        encoded_messages.append(
             pack_touch(round(1e9 * time_s), tick, *x, *force, *stiffness, touch.get("kind", ""))
         )
-    return b"".join(messages)
+    return b"".join(encoded_messages)

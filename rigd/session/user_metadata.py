@@ -29,7 +29,7 @@ class MetadataError(UserError, ValueError):
     """Raised if user metadata break a rule; the message states name, value and remedy."""
 
 
-def check_name(name: str) -> None:
+def check_name(metadata_name: str) -> None:
     """Raise if a name is not allowed for user metadata.
 
     Raises
@@ -37,16 +37,18 @@ def check_name(name: str) -> None:
     MetadataError
         If the name has forbidden characters, is too long, or has an option of its own.
     """
-    if not _NAME_PATTERN.fullmatch(name):
+    if not _NAME_PATTERN.fullmatch(metadata_name):
         raise MetadataError(
-            f"metadata {_shown_value(name)}: a name has lower-case letters, digits and _ only, "
-            "begins with a letter, and has at most 40 characters, such as temperature_c."
+            f"metadata {_shown_value(metadata_name)}: a name has lower-case letters, digits and "
+            "_ only, begins with a letter, and has at most 40 characters, such as temperature_c."
         )
-    if name in NOTES:
-        raise MetadataError(f"metadata {name}: has its own place; give it as {name} instead.")
+    if metadata_name in NOTES:
+        raise MetadataError(
+            f"metadata {metadata_name}: has its own place; give it as {metadata_name} instead."
+        )
 
 
-def metadata_keys(values: Mapping[str, object]) -> dict[str, str]:
+def metadata_keys(metadata_values: Mapping[str, object]) -> dict[str, str]:
     """Check user metadata, and return them as keys and texts for the record ``session``.
 
     Parameters
@@ -70,77 +72,88 @@ def metadata_keys(values: Mapping[str, object]) -> dict[str, str]:
     >>> metadata_keys({"temperature_c": "21.40", "batch": "B 7"})
     {'meta_temperature_c': '21.4', 'meta_batch': 'B 7'}
     """
-    if len(values) > _MAX_NAMES:
-        raise MetadataError(f"metadata: {len(values)} names are more than {_MAX_NAMES}.")
-    keys = {}
-    for name, value in values.items():
-        check_name(name)
-        keys[META_PREFIX + name] = (
-            _number_text(name, value) if unit_of(name) else _checked_text(name, value)
+    if len(metadata_values) > _MAX_NAMES:
+        raise MetadataError(f"metadata: {len(metadata_values)} names are more than {_MAX_NAMES}.")
+    text_by_key = {}
+    for metadata_name, metadata_value in metadata_values.items():
+        check_name(metadata_name)
+        text_by_key[META_PREFIX + metadata_name] = (
+            _number_text(metadata_name, metadata_value)
+            if unit_of(metadata_name)
+            else _checked_text(metadata_name, metadata_value)
         )
-    return keys
+    return text_by_key
 
 
-def added_metadata(session: Mapping[str, str]) -> dict[str, float | str]:
-    """Return the metadata that users added to a session, from its record ``session``.
+def added_metadata(session_record: Mapping[str, str]) -> dict[str, float | str]:
+    """Return the metadata that users added to a session, from its record ``session_record``.
 
     Parameters
     ----------
     session
-        Record ``session`` of a session file from any source.
+        Record ``session_record`` of a session file from any source.
 
     Returns
     -------
     dict of str to (float or str)
         Name → number if the name ends in a unit and the text is a finite number, else the text.
     """
-    metadata: dict[str, float | str] = {}
-    for key, text in session.items():
+    user_metadata: dict[str, float | str] = {}
+    for key, metadata_text in session_record.items():
         if key.startswith(META_PREFIX):
-            name = key.removeprefix(META_PREFIX)
-            number = _finite_or_none(text) if unit_of(name) else None
-            metadata[name] = text if number is None else number
-    return metadata
+            metadata_name = key.removeprefix(META_PREFIX)
+            number = _finite_or_none(metadata_text) if unit_of(metadata_name) else None
+            user_metadata[metadata_name] = metadata_text if number is None else number
+    return user_metadata
 
 
-def _number_text(name: str, value: object) -> str:
+def _number_text(metadata_name: str, metadata_value: object) -> str:
     """Return the text of a number; raise MetadataError if the value is not a finite number."""
-    number = _finite_or_none(value)
+    number = _finite_or_none(metadata_value)
     if number is None:
         raise MetadataError(
-            f"metadata {name} = {_shown_value(value)} is not a finite number; the name ends in a "
-            f"unit, so give a number in {unit_of(name)} with a decimal point, or choose another "
-            "name."
+            f"metadata {metadata_name} = {_shown_value(metadata_value)} is not a finite number; "
+            "the name ends in a "
+            f"unit, so give a number in {unit_of(metadata_name)} with a decimal point, or choose "
+            "another name."
         )
     return repr(number)
 
 
-def _finite_or_none(value: object) -> float | None:
+def _finite_or_none(number_or_text: object) -> float | None:
     """Return the finite number of a number or a text, or None if the value is something else."""
     try:
-        return finite_number(float(value) if isinstance(value, str) else value)
+        return finite_number(
+            float(number_or_text) if isinstance(number_or_text, str) else number_or_text
+        )
     except ValueError:
         return None
 
 
-def _checked_text(name: str, value: object) -> str:
+def _checked_text(metadata_name: str, metadata_value: object) -> str:
     """Return a text of one line; raise MetadataError if the value is not such a text."""
-    if isinstance(value, int | float) and not isinstance(value, bool):
-        value = str(value)
-    if not (isinstance(value, str) and value.strip() and value.isprintable()):
+    if isinstance(metadata_value, int | float) and not isinstance(metadata_value, bool):
+        metadata_value = str(metadata_value)
+    if not (
+        isinstance(metadata_value, str) and metadata_value.strip() and metadata_value.isprintable()
+    ):
         raise MetadataError(
-            f"metadata {name} = {_shown_value(value)} is not plain text of one line; give such a "
-            "text or a number."
+            f"metadata {metadata_name} = {_shown_value(metadata_value)} is not plain text of one "
+            "line; give such a text or a number."
         )
-    if len(value) > _MAX_TEXT_CHARACTERS:
+    if len(metadata_value) > _MAX_TEXT_CHARACTERS:
         raise MetadataError(
-            f"metadata {name}: {len(value)} characters are more than {_MAX_TEXT_CHARACTERS}; put "
-            "long texts into the note."
+            f"metadata {metadata_name}: {len(metadata_value)} characters are more than "
+            f"{_MAX_TEXT_CHARACTERS}; put long texts into the note."
         )
-    return value
+    return metadata_value
 
 
-def _shown_value(value: object) -> str:
+def _shown_value(metadata_value: object) -> str:
     """Return a value for an error message, cut to 40 characters."""
-    text = repr(value)
-    return text if len(text) <= _MAX_SHOWN_CHARACTERS else f"{text[:_MAX_SHOWN_CHARACTERS]}…"
+    value_text = repr(metadata_value)
+    return (
+        value_text
+        if len(value_text) <= _MAX_SHOWN_CHARACTERS
+        else f"{value_text[:_MAX_SHOWN_CHARACTERS]}…"
+    )

@@ -103,7 +103,13 @@ class Library:
             Name of a session to exclude, because it is running.
         """
         newest = await asyncio.to_thread(
-            partial(last_quick_look, self._folder, specimen, but=but, usable=itemgetter("response"))
+            partial(
+                last_quick_look,
+                self._folder,
+                specimen,
+                excluded_session=but,
+                is_usable=itemgetter("response"),
+            )
         )
         if newest is None:
             return None

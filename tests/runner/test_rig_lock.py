@@ -21,8 +21,8 @@ def test_whoever_comes_second_is_told_who_is_there(runtime_folder):
 
 def test_simulated_rigs_of_their_own_share_but_not_with_a_daemon(runtime_folder):
     with (
-        RigLock("sim", "rigd run", hardware=False, alone=False),
-        RigLock("sim", "rigd run", hardware=False, alone=False),
+        RigLock("sim", "rigd run", hardware=False, exclusive=False),
+        RigLock("sim", "rigd run", hardware=False, exclusive=False),
         pytest.raises(RigBusyError),
     ):
         RigLock("sim", "rigd serve", hardware=False).acquire()
@@ -30,7 +30,7 @@ def test_simulated_rigs_of_their_own_share_but_not_with_a_daemon(runtime_folder)
         RigLock("sim", "rigd serve", hardware=False),
         pytest.raises(RigBusyError, match="rigd start"),
     ):
-        RigLock("sim", "rigd run", hardware=False, alone=False).acquire()
+        RigLock("sim", "rigd run", hardware=False, exclusive=False).acquire()
 
 
 def test_hardware_is_locked_for_all_users_of_the_computer(runtime_folder, monkeypatch, tmp_path):

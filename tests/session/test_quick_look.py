@@ -185,7 +185,7 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     quick_look_path(tmp_path / "torn.mcap").write_text("{")
 
     def last(specimen, usable=bool, **but):
-        found = last_quick_look(tmp_path, specimen, usable=usable, **but)
+        found = last_quick_look(tmp_path, specimen, is_usable=usable, **but)
         return None if found is None else found[0].name
 
     assert last("A") == "late.mcap"
@@ -193,7 +193,7 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     assert last("A", usable=lambda look: look["response"]) == "early.mcap"
     assert last("") == "none.mcap"
     assert last("C") is None
-    assert last_quick_look(tmp_path / "missing", "A", usable=bool) is None
+    assert last_quick_look(tmp_path / "missing", "A", is_usable=bool) is None
 
 
 def test_the_fit_of_a_file_is_read_as_far_as_it_can_be_used():
