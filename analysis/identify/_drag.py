@@ -314,7 +314,7 @@ def _converged_drag_fit(
         assert drag_expansion is not None
         descent = partial(Refit.descend, comparison, unknowns, noise=noise)
         start_refit = descent(
-            x, columns=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
+            x, torque_spectra=drag_expansion.by_law[: 1 + has_two_numbers], max_evaluations=1
         )
         refit = start_refit.further(_SHORT_DESCENT_EVALUATIONS)
         if has_two_numbers or is_rough_fit or _relative_drag_std(refit) > _ONE_NUMBER_LAW_STD:
@@ -331,7 +331,9 @@ def _converged_drag_fit(
             # Not before: a second number would compensate for wrong damping of the beam.
             has_two_numbers = True
             refit = descent(
-                refit.x, columns=drag_expansion.by_law, max_evaluations=_SHORT_DESCENT_EVALUATIONS
+                refit.x,
+                torque_spectra=drag_expansion.by_law,
+                max_evaluations=_SHORT_DESCENT_EVALUATIONS,
             )
         x, law, noise = refit.x, _law_at_minimum(refit), refit.residual_noise()
         if law.at(drag_expansion.speed_m_s) <= 0:

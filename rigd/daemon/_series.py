@@ -84,7 +84,7 @@ class ServedSeries:
 
         Parameters
         ----------
-        fault
+        fault_reason
             Sentence on the rig's fault, or empty if the rig is ready.
         """
         if fault_reason:

@@ -111,7 +111,7 @@ class ProgressLine:
         missed, late
             Number of missed ticks and of late ticks so far. They are shown only if a tick was
             missed.
-        number
+        session_number_text
             Number of the session in its series, such as ``2/5``; empty for a single session.
         """
         # Before tick 0 the counter still has the value of the previous session.

@@ -85,7 +85,7 @@ def run_in_foreground(
 
     Parameters
     ----------
-    build
+    build_excitation
         Function that returns the excitation for a profile.
     group
         Started processes of the rig. They are ended when this function returns.

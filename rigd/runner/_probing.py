@@ -184,7 +184,7 @@ def probe_in_foreground(
         Name or path of the profile.
     fast, hardware
         Options of the command line.
-    says
+    report_line
         Function that gets messages for the operator before the move begins.
 
     Returns

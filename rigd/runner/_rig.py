@@ -186,7 +186,7 @@ class Rig:
             Session to run.
         stop
             Stop request of the operator, which ends the session.
-        watcher, can_receive_stop
+        on_progress, can_receive_stop
             See :class:`rigd.runner.session.SessionRun`.
 
         Raises

@@ -551,7 +551,7 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
 
     Parameters
     ----------
-    loop
+    closed_loop
         Linear closed loop of the rig.
     excitation
         Excitation of the session.

@@ -52,7 +52,7 @@ class QuickLook:
 
         Parameters
         ----------
-        session
+        session_path
             Path of the session file.
         error
             Sentence that states why the quick look failed.

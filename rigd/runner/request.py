@@ -90,7 +90,7 @@ def load_rig(
 
     Parameters
     ----------
-    name
+    profile_name
         Name of the profile, or path of its file.
     fast
         Whether the session runs under the virtual clock, faster than real time.
@@ -326,7 +326,7 @@ def remaining_file_text(session_path: Path | None) -> str:
 
     Parameters
     ----------
-    path
+    session_path
         Path of the session file, or None if no file was begun.
     """
     from rigd.session import holds_samples

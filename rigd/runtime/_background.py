@@ -86,7 +86,7 @@ def die_with_parent(parent_pid: int) -> None:
 
     Parameters
     ----------
-    parent
+    parent_pid
         Process id of the parent. If it has already ended, this process ends at once.
     """
     signal_when_orphaned(signal.SIGKILL)

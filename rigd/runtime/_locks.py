@@ -52,7 +52,7 @@ class LockFile:
         ----------
         holder
             Name of this program, for error messages of other programs.
-        alone
+        exclusive
             Whether the lock is exclusive.
 
         Raises

@@ -126,7 +126,7 @@ def send_signal(process: RunningProcess, start_ticks: int, signal_number: int) -
         Process that gets the signal.
     start_ticks
         Start time of the process, which shows whether its process id was reused meanwhile.
-    number
+    signal_number
         Number of the signal.
     """
     if process.start_ticks != start_ticks:

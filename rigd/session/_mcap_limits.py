@@ -143,9 +143,9 @@ def decompressed_chunk(
         Decompressor made by :func:`zstd_decompressor`.
     compression
         Name of the compression in the chunk: ``zstd``, ``lz4``, or empty for none.
-    packed
+    packed_bytes
         Compressed content of the chunk.
-    size
+    unpacked_bytes
         Length of the decompressed content in bytes, as the chunk states it.
     location_text
         Position of the chunk, for error messages.

@@ -113,7 +113,7 @@ def field_tag(field_number: int, protobuf_type: str) -> int:
 
     Parameters
     ----------
-    number
+    field_number
         Field number, from 1 to 15.
     protobuf_type
         Type of the field: "sfixed64", "fixed32" or "double".
@@ -431,7 +431,7 @@ def to_native(
     Parameters
     ----------
     wire_messages : array (n,) of encoded messages
-    names
+    field_names
         Names of the fields to copy.
     native_messages : array (n,) of decoded messages, which is written to
     """

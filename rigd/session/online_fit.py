@@ -77,9 +77,9 @@ def write_start(input_stream: BinaryIO, stream_start: StreamStart) -> None:
 
     Parameters
     ----------
-    stream
+    input_stream
         Standard input of the fit program.
-    start
+    stream_start
         Metadata and segments of the session.
     """
     input_stream.write(
@@ -242,9 +242,9 @@ def estimate_lines(
 
     Parameters
     ----------
-    answer
+    fit_document
         Estimate in the format of docs/online_fit.md.
-    before
+    earlier_document
         Earlier estimate with which the modes are compared, or None for no comparison.
     """
     findings = [f"  {finding_sentence}" for finding_sentence in fit_document["findings"]]

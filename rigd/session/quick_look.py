@@ -111,9 +111,9 @@ def last_quick_look(
         Name of the specimen, or empty for sessions that state no specimen.
     before_utc_ns
         Only sessions that started before this time are considered; None for all sessions.
-    but
+    excluded_session
         File name, without suffix, of a session that is not considered.
-    usable
+    is_usable
         Function that returns whether a quick look's document can be used.
 
     Returns

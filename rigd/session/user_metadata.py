@@ -53,7 +53,7 @@ def metadata_keys(metadata_values: Mapping[str, object]) -> dict[str, str]:
 
     Parameters
     ----------
-    values
+    metadata_values
         Name → value: a number, a number's text, or any other text.
 
     Returns
@@ -90,7 +90,7 @@ def added_metadata(session_record: Mapping[str, str]) -> dict[str, float | str]:
 
     Parameters
     ----------
-    session
+    session_record
         Record ``session_record`` of a session file from any source.
 
     Returns

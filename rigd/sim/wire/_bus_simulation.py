@@ -247,7 +247,7 @@ class BusSimulation:
     periods : int
         Simulated time since the start, in periods. In lock-step the nodes' time continues while the
         rig itself waits for a host, so that the nodes can be set up.
-    moved : int
+    rig_periods : int
         Number of periods by which the rig itself has advanced.
     syncs : int
         Number of received SYNCs.
