@@ -96,11 +96,15 @@ def profile_from_text(text: str, path: Path) -> Profile:
     document = parse_document(text, path)
     problems: list[str] = []
     values, sources = flatten_document(document, problems)
-    absent = {
-        name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
+    absent_sections = {
+        section_name
+        for section_name in OPTIONAL_SECTIONS
+        if not any(k.startswith(section_name + ".") for k in values)
     }
-    unknown = frozenset(key for key, source in sources.items() if source == UNKNOWN)
-    values = validate_values(values, problems, frozenset(absent), unknown)
+    unknown_keys = frozenset(
+        key for key, number_source in sources.items() if number_source == UNKNOWN
+    )
+    values = validate_values(values, problems, frozenset(absent_sections), unknown_keys)
     if not problems:
         problems.extend(_find_eds(path, values))
         problems.extend(diagnostics.contradictions(values))
@@ -108,7 +112,11 @@ def profile_from_text(text: str, path: Path) -> Profile:
     if problems:
         raise problems_error(path, problems)
 
-    sections = {name: _build_section(name, values) for name in SECTIONS if name not in absent}
+    sections = {
+        section_name: _build_section(section_name, values)
+        for section_name in SECTIONS
+        if section_name not in absent_sections
+    }
     return Profile(
         name=values["name"],
         description=values["description"],
@@ -160,7 +168,7 @@ def parse_document(text: str, path: Path) -> dict[str, Any]:
 def problems_error(path: Path, problems: Iterable[str]) -> ProfileError:
     """Return the error to raise for a file, with a line for each problem."""
     # An array that is too short has an equal problem for each missing number.
-    return ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
+    return ProfileError("\n".join(f"{path}: {problem}" for problem in dict.fromkeys(problems)))
 
 
 def _find_profile(name_or_path: str | Path) -> Path:
@@ -188,8 +196,12 @@ def known_profiles() -> list[str]:
 
 def _known_profiles_text() -> str:
     """Return the names of all known profiles as a clause for messages."""
-    names = known_profiles()
-    return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
+    profile_names = known_profiles()
+    return (
+        "known profiles are " + ", ".join(profile_names)
+        if profile_names
+        else "no profiles are known here"
+    )
 
 
 def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
@@ -209,9 +221,10 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
 def flatten_document(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the document's values and the numbers' sources, each by dotted keys.
+    """Return a profile's values, and the origins of its numbers, each by dotted keys.
 
-    A message for each missing or invalid source is appended to `problems`.
+    An origin is what the key ``source`` of a number states. A message for each missing or invalid
+    one is appended to `problems`.
     """
     values: dict[str, Any] = {}
     sources: dict[str, str] = {}
@@ -221,21 +234,21 @@ def flatten_document(
             if _is_number(key):
                 problems.append(diagnostics.bare_number_message(key, entry))
             continue
-        source = entry.get("source")
-        if source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
-            sources[key] = source
+        number_source = entry.get("source")
+        if number_source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
+            sources[key] = number_source
             values[key] = math.nan
             continue
         values[key] = entry.get("value")
-        if source == UNKNOWN:
+        if number_source == UNKNOWN:
             problems.append(diagnostics.invalid_unknown_message(key, entry))
-        elif source in SOURCES:
-            sources[key] = source
+        elif number_source in SOURCES:
+            sources[key] = number_source
         elif _is_number(key):
-            problems.append(diagnostics.missing_source_message(key, source))
+            problems.append(diagnostics.missing_source_message(key, number_source))
         problems.extend(
-            f"{key} has the unknown part '{other}'; only value and source go there."
-            for other in sorted(entry.keys() - {"value", "source"})
+            f"{key} has the unknown part '{other_keys}'; only value and source go there."
+            for other_keys in sorted(entry.keys() - {"value", "source"})
         )
     return values, sources
 
@@ -251,20 +264,20 @@ def _dotted_entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str
     A table that is not a section and has ``value`` or ``source`` is the entry of a number.
     """
     for key, entry in table.items():
-        dotted = prefix + key
+        dotted_key = prefix + key
         if isinstance(entry, dict) and (
-            dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
+            dotted_key in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
-            yield from _dotted_entries(entry, dotted + ".")
+            yield from _dotted_entries(entry, dotted_key + ".")
         else:
-            yield dotted, entry
+            yield dotted_key, entry
 
 
 def validate_values(
     values: Mapping[str, Any],
     problems: list[str],
-    absent: frozenset[str],
-    unknown: frozenset[str] = frozenset(),
+    absent_sections: frozenset[str],
+    unknown_keys: frozenset[str] = frozenset(),
 ) -> dict[str, Any]:
     """Check types and ranges of all values, and return them with defaults for missing keys.
 
@@ -274,48 +287,54 @@ def validate_values(
         Values of the file by dotted keys.
     problems
         List to which a message for each problem is appended.
-    absent
+    absent_sections
         Names of sections that the file omits; the top level has the empty name.
-    unknown
+    unknown_keys
         Keys whose value is unknown; their NaN is not checked.
     """
     # TOML has only arrays, and strict validation requires tuples.
     tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
     try:
-        known_values = {key: value for key, value in tuple_values.items() if key not in unknown}
-        model = _validation_model(absent, unknown).model_validate(known_values)
+        known_values = {
+            key: key_value for key, key_value in tuple_values.items() if key not in unknown_keys
+        }
+        validation_model = _validation_model(absent_sections, unknown_keys).model_validate(
+            known_values
+        )
     except ValidationError as error:
-        details = error.errors(include_url=False)
+        error_details = error.errors(include_url=False)
         missing_keys = [
-            str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]
+            str(d["loc"][0]) for d in error_details if d["type"] == "missing" and not d["loc"][1:]
         ]
         problems.extend(diagnostics.missing_key_messages(missing_keys, tuple_values))
-        for detail in details:
-            if detail["type"] == "extra_forbidden":
+        for error_detail in error_details:
+            if error_detail["type"] == "extra_forbidden":
                 problems.append(
-                    diagnostics.unknown_key_message(str(detail["loc"][0]), tuple_values)
+                    diagnostics.unknown_key_message(str(error_detail["loc"][0]), tuple_values)
                 )
-            elif str(detail["loc"][0]) not in missing_keys:
-                problems.append(diagnostics.wrong_value_message(detail))
+            elif str(error_detail["loc"][0]) not in missing_keys:
+                problems.append(diagnostics.wrong_value_message(error_detail))
         return tuple_values
-    usable: dict[str, Any] = model.model_dump(by_alias=True)
-    problems.extend(diagnostics.implausible_numbers(usable))
-    return usable | dict.fromkeys(unknown, math.nan)
+    usable_values: dict[str, Any] = validation_model.model_dump(by_alias=True)
+    problems.extend(diagnostics.implausible_numbers(usable_values))
+    return usable_values | dict.fromkeys(unknown_keys, math.nan)
 
 
 @cache
-def _validation_model(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
+def _validation_model(
+    absent_sections: frozenset[str], unknown_keys: frozenset[str]
+) -> type[BaseModel]:
     """Return the pydantic model that validates all keys of a profile at once.
 
     A model for each section would be slow to build.
     """
-    definitions: dict[str, Any] = {
-        f"key_{index}": (annotation, Field(default=key_defaults().get(key, ...), alias=key))
-        for index, (key, annotation) in enumerate(key_types().items())
-        if key.rpartition(".")[0] not in absent and key not in unknown
+    field_definitions: dict[str, Any] = {
+        f"key_{key_index}": (value_type, Field(default=key_defaults().get(key, ...), alias=key))
+        for key_index, (key, value_type) in enumerate(key_types().items())
+        if key.rpartition(".")[0] not in absent_sections and key not in unknown_keys
     }
-    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-    return create_model("Profile", __config__=config, **definitions)
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    return create_model("Profile", __config__=model_config, **field_definitions)
 
 
 def _build_section(sections: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401

@@ -62,14 +62,14 @@ def load_specimen(path: Path) -> Specimen:
         If the file cannot be read or has mistakes. Every problem is reported with its key, value,
         unit and remedy.
     """
-    text = read_text(path)
-    if len(text.encode()) > _MAX_BYTES:
+    file_text = read_text(path)
+    if len(file_text.encode()) > _MAX_BYTES:
         raise ProfileError(f"{path}: is longer than {_MAX_BYTES} bytes; shorten its notes.")
     problems: list[str] = []
-    values, _ = flatten_document(parse_document(text, path), problems)
-    note = values.pop(_NOTE_KEY, "")
-    if not isinstance(note, str):
-        problems.append(f"{_NOTE_KEY} = {note!r} must be text in quotes.")
+    values, _ = flatten_document(parse_document(file_text, path), problems)
+    specimen_note = values.pop(_NOTE_KEY, "")
+    if not isinstance(specimen_note, str):
+        problems.append(f"{_NOTE_KEY} = {specimen_note!r} must be text in quotes.")
     valid_prefixes = (f"{_BEAM_SECTION}.", f"{_UNCERTAINTY_SECTION}.")
     for key in [
         key for key in values if not key.startswith(valid_prefixes) or key == _RIG_UNCERTAINTY_KEY
@@ -79,22 +79,33 @@ def load_specimen(path: Path) -> Specimen:
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
             f"[uncertainty] all but {_RIG_UNCERTAINTY_KEY.partition('.')[2]}, and note; remove it."
         )
-    sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
-    sections |= {_DAMPING_SECTION for key in values if key.startswith(f"{_DAMPING_SECTION}.")}
-    values = validate_values(values, problems, frozenset({"", *SECTIONS} - sections))
+    known_sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
+    known_sections |= {_DAMPING_SECTION for key in values if key.startswith(f"{_DAMPING_SECTION}.")}
+    values = validate_values(values, problems, frozenset({"", *SECTIONS} - known_sections))
     if not problems:
         problems.extend(diagnostics.first_mode_contradictions(values))
     if problems:
         raise problems_error(path, problems)
-    beam = BeamSection(**{field: values[key] for key, field in section_fields(_BEAM_SECTION)})
+    beam = BeamSection(
+        **{field_name: values[key] for key, field_name in section_fields(_BEAM_SECTION)}
+    )
     damping = None
-    if _DAMPING_SECTION in sections:
-        damping = Damping(**{field: values[key] for key, field in section_fields(_DAMPING_SECTION)})
+    if _DAMPING_SECTION in known_sections:
+        damping = Damping(
+            **{field_name: values[key] for key, field_name in section_fields(_DAMPING_SECTION)}
+        )
     uncertainty = ScaleUncertainty(
-        **{field: values[key] for key, field in section_fields(_UNCERTAINTY_SECTION)}
+        **{field_name: values[key] for key, field_name in section_fields(_UNCERTAINTY_SECTION)}
     )
     return Specimen(
-        path.stem, path, text, beam.uniform, damping, uncertainty, note, beam.tip_mass_kg
+        path.stem,
+        path,
+        file_text,
+        beam.uniform,
+        damping,
+        uncertainty,
+        specimen_note,
+        beam.tip_mass_kg,
     )
 
 
@@ -139,21 +150,21 @@ def with_specimen(profile: Profile, name: str) -> Profile:
 
 def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
     """Return a sentence on the specimen's differences from the profile, for the operator."""
-    prefix = f"Specimen {specimen.name} ({specimen.path}): "
+    sentence_start = f"Specimen {specimen.name} ({specimen.path}): "
     differences = [
-        f"{name.removesuffix(suffix_of(name)).replace('_', ' ')} "
-        f"{specimen_value:g} {unit_of(name)} (profile: {its:g})"
-        for name in (each.name for each in fields(Beam))
-        if (specimen_value := getattr(specimen.beam, name))
-        != (its := getattr(profile.rig.beam, name))
+        f"{field_name.removesuffix(suffix_of(field_name)).replace('_', ' ')} "
+        f"{specimen_value:g} {unit_of(field_name)} (profile: {its:g})"
+        for field_name in (beam_field.name for beam_field in fields(Beam))
+        if (specimen_value := getattr(specimen.beam, field_name))
+        != (its := getattr(profile.rig.beam, field_name))
     ]
     if specimen.tip_mass_kg is not None:
         differences.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
     if specimen.damping not in (None, profile.rig.damping):
         differences.append("nominal damping of its own")
     if not differences:
-        return f"{prefix}beam as in the profile."
-    sentence = f"{prefix}{', '.join(differences)}; for prediction, nominal model and file."
+        return f"{sentence_start}beam as in the profile."
+    sentence = f"{sentence_start}{', '.join(differences)}; for prediction, nominal model and file."
     if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
         sentence += " The simulated rig keeps the beam of the profile."
     return sentence
