@@ -130,10 +130,10 @@ def _sessions_of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
     with_modes = [row for row in rows if row.modes]
     specimen_names = sorted({row.specimen for row in with_modes})
     if len(specimen_names) > 1:
-        all_names = ", ".join(
+        named = ", ".join(
             repr(specimen_name) if specimen_name else "none" for specimen_name in specimen_names
         )
-        fail(f"--trend: the sessions are of several specimens ({all_names}); name one by --specimen.",
+        fail(f"--trend: the sessions are of several specimens ({named}); name one by --specimen.",
              EXIT_WRONG_USE)  # fmt: skip
     return with_modes
 
