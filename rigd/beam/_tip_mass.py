@@ -544,14 +544,14 @@ class LoadedBeam:
 
         A row is NaN if the path was lost.
         """
-        offsets = np.array(self.stiffness_offsets)
-        if not zeros and offsets.size:
+        stiffness_offsets = np.array(self.stiffness_offsets)
+        if not zeros and stiffness_offsets.size:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
-            z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
+            z[1 : 1 + stiffness_offsets.size] *= (1 + stiffness_offsets[: z.size - 1]) ** 0.25
         roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
         is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if is_rigid and not (zeros and offsets.any()):
+        if is_rigid and not (zeros and stiffness_offsets.any()):
             return roots
         has_root = ~np.isnan(roots[:, 0])
         # One of a conjugate pair suffices; without oscillation both have to be found.
@@ -566,7 +566,9 @@ class LoadedBeam:
             relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
         )
         if zeros:
-            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
+            relative_change = max(
+                relative_change, float(np.abs(stiffness_offsets).max(initial=0.0))
+            )
         step_count = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
         previous_roots = current_roots
         for step_number in range(1, step_count + 1):
@@ -576,7 +578,7 @@ class LoadedBeam:
                 self.damping,
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
-                tuple((fraction if zeros else 1.0) * offsets),
+                tuple((fraction if zeros else 1.0) * stiffness_offsets),
             )
             is_last_step = step_number == step_count
             start_roots = 2 * current_roots - previous_roots if step_number > 1 else current_roots
@@ -594,10 +596,10 @@ class LoadedBeam:
         roots[has_root] = np.column_stack([first_roots, second_roots])
         return roots
 
-    def _newton_roots(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
+    def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
         """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
 
-        `s` has the starts and `tolerance` is the relative length of the last step. The result is
+        `s` has the starts and `step_tolerance` is the relative length of the last step. The result is
         NaN where no root is found near its start.
         """
         start_roots = s
@@ -607,10 +609,10 @@ class LoadedBeam:
                 newton_step = at.response / self.derivative_by_s(s, at)
                 newton_step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
                 s = s + newton_step
-                if not np.nanmax(np.abs(newton_step / s), initial=0.0) > tolerance:
+                if not np.nanmax(np.abs(newton_step / s), initial=0.0) > step_tolerance:
                     break
             # Far from any root every step is short, too.
-            has_converged = (np.abs(newton_step) < max(tolerance, 1e-9) * np.abs(s)) & (
+            has_converged = (np.abs(newton_step) < max(step_tolerance, 1e-9) * np.abs(s)) & (
                 np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start_roots)
             )
             return np.where(has_converged, s, np.nan + 0j)
@@ -643,13 +645,13 @@ def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
     a, b = decay * decay, rotation * rotation
     reciprocal = 1 / (4 * decay * rotation + (1 + a) * (1 + b))
     sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
-    scaled_functions = (
+    scaled_values = (
         z * (sine - cosine) * reciprocal,
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
     scaled_f, scaled_u, scaled_b = (
         np.where(lower_half_plane, function_values.conj(), function_values)
-        for function_values in scaled_functions
+        for function_values in scaled_values
     )
     return scaled_f, scaled_u, scaled_b

@@ -179,14 +179,14 @@ def state_output(
     column_scale = np.linalg.norm(real_rows, axis=0)
     weighted_response = exact_response * point_weights / response_size
     fit_target = np.concatenate([weighted_response.real, weighted_response.imag])
-    coefficients = np.zeros(basis_columns.shape[1])
-    coefficients[fitted_columns] = (
+    output_coefficients = np.zeros(basis_columns.shape[1])
+    output_coefficients[fitted_columns] = (
         np.linalg.lstsq(real_rows / column_scale, fit_target, rcond=_SINGULAR_VALUE_CUTOFF)[0]
         / column_scale
     )
     # The rms, not the largest error, since a response has zeros of its own.
     within_band = point_weights == 1
-    relative_residual = ((basis_columns @ coefficients - exact_response) / response_size)[
+    relative_residual = ((basis_columns @ output_coefficients - exact_response) / response_size)[
         within_band
     ]
     rms_error = float(np.sqrt(np.mean(np.abs(relative_residual) ** 2)))
@@ -195,8 +195,8 @@ def state_output(
             f"A response of the beam is realised with a relative error of {rms_error:.1e} (rms); "
             f"{_MAX_OUTPUT_ERROR:.1e} is accepted."
         )
-    inertia, viscosity, stiffness = coefficients[-3:].tolist()
-    return StateOutput(coefficients[:-3], inertia, viscosity, stiffness)
+    inertia, viscosity, stiffness = output_coefficients[-3:].tolist()
+    return StateOutput(output_coefficients[:-3], inertia, viscosity, stiffness)
 
 
 def _basis_functions(s: Complex, poles: Complex) -> Complex:
@@ -280,12 +280,12 @@ def realise(
     s = 1j * omega[far]
     exact_response = _exact_transfer(loaded_beam, s)
     relative_weight = point_weights[far] / exact_response
-    coefficients = _fit_coefficients(
+    output_coefficients = _fit_coefficients(
         _basis_functions(s, poles) * relative_weight[:, None],
         point_weights[far].astype(np.complex128),
     )
 
-    relative_error = _relative_error(loaded_beam, poles, zeros, coefficients)
+    relative_error = _relative_error(loaded_beam, poles, zeros, output_coefficients)
     if not relative_error <= max_relative_error:
         raise RealisationError(
             f"{damping} on {beam} is realised with a relative error of {relative_error:.1e} "
@@ -293,7 +293,7 @@ def realise(
             f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was "
             "requested."
         )
-    realisation = _build_realisation(poles, modes, coefficients, relative_error)
+    realisation = _build_realisation(poles, modes, output_coefficients, relative_error)
     growth_per_s = _growth_on_frictionless_motor(realisation, beam)
     if growth_per_s > MAX_GROWTH_PER_S:
         raise RealisationError(

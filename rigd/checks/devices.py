@@ -65,7 +65,7 @@ class InspectedDrive(Protocol):
 
 
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the drive's identity, rated torque and safeguards.
+    """Yield check results on the drive's identity, rated torque and safeguards.
 
     They are never failed: a drive that contradicts the profile cannot be connected.
     """
@@ -103,7 +103,7 @@ def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRo
 
 
 def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
-    """Yield result rows on the drive's watchdog, missing objects, and objects that were set."""
+    """Yield check results on the drive's watchdog, missing objects, and objects that were set."""
     watchdog, watchdog_s = capabilities.watchdog, capabilities.watchdog_s
     is_unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield CheckRow(
@@ -174,7 +174,7 @@ class MeasurableSensor(Protocol):
 
 
 def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the sensor's identity, calibration and measuring range.
+    """Yield check results on the sensor's identity, calibration and measuring range.
 
     Parameters
     ----------
@@ -244,7 +244,7 @@ def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> I
 def _measured_rows(
     measured_values: Mapping[str, float], rig: RigParameters, gap_cause: str = ""
 ) -> Iterator[CheckRow]:
-    """Yield the rows on the sensor's measured rate and response times.
+    """Yield check results on the sensor's measured rate and response times.
 
     `gap_cause` is the reason for gaps that the sensor reports.
     """
@@ -280,7 +280,7 @@ def _required_calibration_value(key: str, rig: RigParameters) -> str:
 
 
 def _range_row(calibration: Mapping[str, object], profile_range: tuple[float, ...]) -> CheckRow:
-    """Return the row that compares the sensor's measuring range with that of the profile."""
+    """Return the result that compares the sensor's measuring range with that of the profile."""
     limits_text = "profile: " + format_value("range_n_nm", profile_range)
     key = next((key for key in _RANGE_KEYS if key in calibration), "")
     reported_range = calibration.get(key)
@@ -406,7 +406,7 @@ def _exchange_rows(
 
 
 def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget) -> CheckRow:
-    """Return the row that compares the delays of the devices' replies with the deadline."""
+    """Return the result that compares the delays of the devices' replies with the deadline."""
     acquisition = profile.rig.acquisition
     median_ms, p99_ms = np.percentile(delays_ms, [50, 99]).tolist()
     found_text = f"p50 {median_ms:.2f} ms, p99 {p99_ms:.2f} ms"
@@ -434,7 +434,7 @@ def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget)
 
 
 def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRow]:
-    """Yield the row on whether scales and signs are known or need a probing move."""
+    """Yield the check result on whether scales and signs are known or need a probing move."""
     if target is ActuationTarget.SIMULATED:
         return
     not_measured = [key for key in PROBED_KEYS if profile.sources.get(key) != "measured"]
@@ -543,7 +543,7 @@ def _connection_text(target: ActuationTarget) -> str:
 
 
 def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow]:
-    """Yield the rows on the target that will move and on its bus and serial line."""
+    """Yield check results on the target that will move and on its bus and serial line."""
     simulator = find_simulator(rig.name)
     if simulator is not None:
         target_text = f"{target.value} (process {simulator.pid})"

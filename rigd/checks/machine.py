@@ -75,7 +75,7 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
-    """Yield the rows on the real-time settings that the system would grant to a session."""
+    """Yield check results on the real-time settings that the system would grant to a session."""
     try:
         granted_settings = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
@@ -157,7 +157,7 @@ _MIN_RUNTIME_FRACTION = 0.95
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[CheckRow]:
-    """Yield the rows on settings of this computer that can delay ticks, with advice.
+    """Yield check results on settings of this computer that can delay ticks, with advice.
 
     Parameters
     ----------
@@ -179,7 +179,7 @@ def machine_rows(
 
 
 def _kernel_row(root: Path, kernel: str) -> CheckRow:
-    """Return the row on whether the kernel is a real-time kernel."""
+    """Return the check result on whether the kernel is a real-time kernel."""
     is_preemptible = "PREEMPT_RT" in kernel or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
     if is_preemptible:
         found_text = "PREEMPT_RT"
@@ -200,7 +200,7 @@ def _kernel_row(root: Path, kernel: str) -> CheckRow:
 
 
 def _virtual_row(root: Path) -> CheckRow:
-    """Return the row on whether this computer is a virtual machine."""
+    """Return the check result on whether this computer is a virtual machine."""
     cpu_info_words = set(_read_or_empty(root / "proc/cpuinfo").split())
     is_virtual = "hypervisor" in cpu_info_words or bool(
         _read_or_empty(root / "sys/hypervisor/type")
@@ -219,7 +219,7 @@ def _virtual_row(root: Path) -> CheckRow:
 
 
 def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
-    """Return the row on whether the loop's core is isolated from other programs."""
+    """Return the check result on whether the loop's core is isolated from other programs."""
     isolated_numbers = isolated_cores(root)
     cores_text = ", ".join(map(str, sorted(isolated_numbers)))
     loop_core_isolated = (
@@ -256,7 +256,7 @@ def _isolation_advice(last: int) -> str:
 
 
 def _governor_row(root: Path) -> CheckRow:
-    """Return the row on the governor of the processor's frequency."""
+    """Return the check result on the governor of the processor's frequency."""
     governors = {
         _read_or_empty(governor_file)
         for governor_file in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
@@ -276,7 +276,7 @@ def _governor_row(root: Path) -> CheckRow:
 
 
 def _clock_row(root: Path) -> CheckRow:
-    """Return the row on the kernel's clock source."""
+    """Return the check result on the kernel's clock source."""
     clock_source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
     # Architectures other than x86 have a fast counter of their own.
     is_fast = clock_source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
@@ -294,7 +294,7 @@ def _clock_row(root: Path) -> CheckRow:
 
 
 def _wall_clock_row() -> CheckRow:
-    """Return the row on whether the wall clock is synchronised."""
+    """Return the check result on whether the wall clock is synchronised."""
     is_synchronised = _is_wall_clock_synchronised()
     return CheckRow(
         _COMPUTER_GROUP,
@@ -310,7 +310,7 @@ def _wall_clock_row() -> CheckRow:
 
 
 def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
-    """Return the row on the fraction of time that the kernel leaves to real-time processes."""
+    """Return the result on the fraction of time that the kernel leaves to real-time processes."""
     runtime_us = _read_number(root / _RUNTIME_FILE, -1)
     period_us = _read_number(root / _PERIOD_FILE, 1_000_000)
     runtime_fraction = runtime_us / period_us if runtime_us >= 0 else 1.0

@@ -70,7 +70,7 @@ STABILITY_ROW = "loop_stability"
 
 
 def stability_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on whether the closed loop of a profile's rig is stable."""
+    """Yield the check result on whether the closed loop of a profile's rig is stable."""
     try:
         closed_loop, warning_text = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
@@ -90,7 +90,7 @@ def stability_rows(profile: Profile) -> Iterator[CheckRow]:
 
 
 def margin_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the stability margins of the closed loop; skipped if it is unstable."""
+    """Yield results on the stability margins of the closed loop; skipped if it is unstable."""
     from rigd.control import loop_margins
 
     try:
@@ -115,7 +115,7 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
 def _margin_rows(
     margins: "Margins", least_gain_factor: float, least_delay_s: float
 ) -> Iterator[CheckRow]:
-    """Yield the rows on the stability margins at one signal of the loop."""
+    """Yield check results on the stability margins at one signal of the loop."""
     row_group = f"loop, {margins.cut}"
     gain_up_text = (
         "any"
@@ -327,7 +327,7 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
 
 
 def travel_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows that compare the stopping distance after each failure with the free angle.
+    """Yield results that compare the stopping distance after each failure with the free angle.
 
     The free angle is that between the limit of the angle and the mechanical stop.
     """
@@ -430,7 +430,7 @@ EDS_ROW = "eds"
 
 
 def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
-    """Yield the rows that compare a drive's EDS file with the requirements on a drive.
+    """Yield the check results that compare a drive's EDS file with the requirements on a drive.
 
     Parameters
     ----------
@@ -470,7 +470,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
 
 
 def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the EDS file that the profile names; none if it names no file."""
+    """Yield check results on the EDS file that the profile names; none if it names no file."""
     drive_settings = profile.rig.cia402
     if drive_settings is not None and drive_settings.eds:
         yield from eds_rows(Path(drive_settings.eds), profile.rig)
@@ -485,7 +485,7 @@ An additional device, or repeated frames after a disturbance, would not fit."""
 
 
 def profile_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the profile's name and its assumed, not verified, numbers."""
+    """Yield check results on the profile's name and its assumed, not verified, numbers."""
     yield CheckRow("profile", profile.name, str(profile.path), "", CheckResult.OK)
     assumed_keys = [
         key for key, number_source in profile.sources.items() if number_source == "assumed"
@@ -501,7 +501,7 @@ def profile_rows(profile: Profile) -> Iterator[CheckRow]:
 
 
 def record_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on the longest possible record, and whether a default chirp fits into it."""
+    """Yield the result on the longest possible record, and whether a default chirp fits into it."""
     chirp_parameters = signature(chirp).parameters
     limit_text = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
     default_chirp_s = sum(
@@ -533,7 +533,7 @@ _EXAMPLE_TILT_DEG = 0.5
 
 
 def axis_tilt_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on the measured inclination of the motor's axis; it refuses no session."""
+    """Yield the result on the measured inclination of the motor's axis; it refuses no session."""
     if profile.rig.devices.drive == "sim":
         found_text, detail_text, check_result = (
             "the simulated rig has no gravity",
@@ -586,7 +586,7 @@ CAN_IDENTIFIERS_ROW, CAN_LOAD_ROW, SERIAL_LOAD_ROW = "can_identifiers", "can_loa
 
 
 def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the CAN identifiers and on the load of the CAN bus and the serial line."""
+    """Yield results on the CAN identifiers and on the load of the CAN bus and the serial line."""
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 
@@ -601,14 +601,14 @@ def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
 
 
 def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:
-    """Return the row on the CAN identifiers."""
+    """Return the check result on the CAN identifiers."""
     return CheckRow(
         "CAN bus", "identifiers", found_text, "no collision", check_result, name=CAN_IDENTIFIERS_ROW
     )
 
 
 def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
-    """Return the row on the load of the CAN bus."""
+    """Return the check result on the load of the CAN bus."""
     from rigd.devices.canbus import MAX_LOAD
 
     frames_text = ", ".join(
@@ -626,7 +626,7 @@ def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
 
 
 def _line_row(serial_settings: "AtiSerial") -> CheckRow:
-    """Return the row on the load of the serial line."""
+    """Return the check result on the load of the serial line."""
     from rigd.devices.ati import RECORD_BITS
     from rigd.devices.canbus import MAX_LOAD
 

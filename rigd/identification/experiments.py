@@ -418,9 +418,9 @@ def _smooth_rise(x: Real) -> Real:
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
 
-def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
+def _peak_torque(loop: ClosedLoop, reference_rad: Real) -> float:
     """Return the motor's largest predicted torque in N·m for a reference angle in rad."""
-    return float(np.max(np.abs(loop.simulate(reference).torque_nm)))
+    return float(np.max(np.abs(loop.simulate(reference_rad).torque_nm)))
 
 
 def _checked_excitation(
@@ -445,7 +445,7 @@ def _checked_excitation(
     end = reference_rad.size - round(schedule.end_s * rate_hz)
     stored_parameters = {
         **asdict(schedule),
-        "speeds_rad_s": " ".join(repr(speed) for speed in schedule.speeds_rad_s),
+        "speeds_rad_s": " ".join(repr(speed_rad_s) for speed_rad_s in schedule.speeds_rad_s),
         "torque_percent": torque_percent,
         "stroke_rad": stroke_rad,
         # Settings of the controller, which differ from the profile's file after the trial.

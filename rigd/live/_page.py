@@ -255,12 +255,14 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _send_retry(self) -> None:
         """Send an error after which the browser repeats its request in a second."""
-        self._send_text(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", retry=True)
+        self._send_text(
+            HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", asks_retry=True
+        )
 
-    def _send_text(self, status: HTTPStatus, text: str, *, retry: bool = False) -> None:
-        """Send a text; with `retry` the browser repeats its request in a second."""
+    def _send_text(self, status: HTTPStatus, text: str, *, asks_retry: bool = False) -> None:
+        """Send a text; with `asks_retry` the browser repeats its request in a second."""
         self.send_response(status)
-        if retry:
+        if asks_retry:
             self.send_header("Refresh", "1")
         self.send_header("Content-Type", "text/plain; charset=utf-8")
         self._end_headers()

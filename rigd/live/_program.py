@@ -58,9 +58,9 @@ class RerunProgram:
 
     Parameters
     ----------
-    options
+    rerun_options
         Options of the program's command line.
-    environment
+    extra_environment
         Environment variables in addition to those of this process.
 
     Raises

@@ -48,10 +48,10 @@ class SessionRecordReader:
         Session to read.
     channels
         Shared memory of the rig's processes.
-    seen
+    seen_samples
         Number of samples that an earlier publisher has shown, counted as `LiveSession.begins`.
         Those that are still in the ring are read again for the scene.
-    last
+    last_response
         Frequency response of the last session of the same specimen, or None.
 
     Attributes

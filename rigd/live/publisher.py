@@ -273,30 +273,32 @@ class _ShownSession:
 
     def show_touches(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Queue the drawings and log lines of estimated touches."""
-        scene, t_ns = self.reader.scene, self.reader.t_ns
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
         log_notes = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
-        self.backlog.put_required([*scene.touches(touches), *scene.events(log_notes)])
+        self.backlog.put_required([*view_scene.touches(touches), *view_scene.events(log_notes)])
 
     def show_fit(self, fit: "Mapping[str, Any]") -> None:
         """Queue the drawings and log lines of a fit of the record so far."""
-        scene, t_ns = self.reader.scene, self.reader.t_ns
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
         log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
-        self.backlog.put_required([*scene.fit(fit), *scene.events(log_notes)])
+        self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
 
     def finish(self, end: LiveEnd) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
         self.reader.end(end.ends)
         self.queue_new_records()
-        scene, t_ns = self.reader.scene, self.reader.t_ns
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
         banner_state = ended(end.outcome, end.reason)
         if self.supervisor_lost:
             is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
             banner_state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
-            self.backlog.put_required(scene.events([Note(t_ns, "error", banner_state.reason)]))
+            self.backlog.put_required(view_scene.events([Note(t_ns, "error", banner_state.reason)]))
         elif end.outcome:
-            self.backlog.put_required(scene.events([outcome_note(t_ns, end.outcome, end.reason)]))
+            self.backlog.put_required(
+                view_scene.events([outcome_note(t_ns, end.outcome, end.reason)])
+            )
         # They follow all queued drawings, which show a running session.
-        self.backlog.put([*scene.finish(), *scene.state(t_ns, banner_state)], 0)
+        self.backlog.put([*view_scene.finish(), *view_scene.state(t_ns, banner_state)], 0)
         self.has_ended = True
         self._add_quick_look()
 
@@ -308,9 +310,9 @@ class _ShownSession:
         quick_look, self._quick_look_path = read_quick_look(self._quick_look_path), None
         if quick_look is None:
             return
-        scene, t_ns = self.reader.scene, self.reader.t_ns
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
         self.backlog.put_required(
-            scene.events([Note(t_ns, "info", text_line) for text_line in quick_look["text"]])
+            view_scene.events([Note(t_ns, "info", text_line) for text_line in quick_look["text"]])
         )
 
     def send(self, drawing_stream: DrawingStream, *, connected: bool) -> None:
@@ -398,7 +400,7 @@ class Backlog:
         self._required_drawings.extend(drawings)
 
     def drop_required(self) -> None:
-        """Remove the drawings of `put_required`, which the frame of a new connection contains."""
+        """Remove the drawings of `put_required`; a new connection has received them already."""
         self._required_drawings.clear()
 
     def take(self) -> "tuple[list[Drawing], int]":

@@ -151,7 +151,7 @@ def with_specimen(profile: Profile, name: str) -> Profile:
 def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
     """Return a sentence on the specimen's differences from the profile, for the operator."""
     sentence_start = f"Specimen {specimen.name} ({specimen.path}): "
-    differences = [
+    difference_texts = [
         f"{field_name.removesuffix(suffix_of(field_name)).replace('_', ' ')} "
         f"{specimen_value:g} {unit_of(field_name)} (profile: {its:g})"
         for field_name in (beam_field.name for beam_field in fields(Beam))
@@ -159,12 +159,14 @@ def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
         != (its := getattr(profile.rig.beam, field_name))
     ]
     if specimen.tip_mass_kg is not None:
-        differences.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
+        difference_texts.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
     if specimen.damping not in (None, profile.rig.damping):
-        differences.append("nominal damping of its own")
-    if not differences:
+        difference_texts.append("nominal damping of its own")
+    if not difference_texts:
         return f"{sentence_start}beam as in the profile."
-    sentence = f"{sentence_start}{', '.join(differences)}; for prediction, nominal model and file."
+    sentence = (
+        f"{sentence_start}{', '.join(difference_texts)}; for prediction, nominal model and file."
+    )
     if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
         sentence += " The simulated rig keeps the beam of the profile."
     return sentence

@@ -93,7 +93,7 @@ class EncoderWatch:
         Net torque that exceeds any friction of the shaft.
     delay_ticks
         Ticks from a torque command to the torque.
-    scales
+    scale_watch
         Check of the scales of encoder and motor, or None to omit it.
 
     Attributes

@@ -278,13 +278,13 @@ class LimitWatch:
         checked_values += (
             (
                 "wrench range",
-                f"sensor's {axis}",
+                f"sensor's {axis_name}",
                 "N" if i < _FORCE_AXES else "N·m",
                 axis_value,
                 axis_limit,
                 warning_level,
             )
-            for i, (axis, axis_value, axis_limit, warning_level) in enumerate(
+            for i, (axis_name, axis_value, axis_limit, warning_level) in enumerate(
                 zip(_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
             )
         )
@@ -323,13 +323,13 @@ class LimitWatch:
         )
         self._previous_elapsed_ticks, self._elapsed_ticks = elapsed_ticks, 1
         limit_rad_s = self._limits.velocity_rad_s
-        near_rad_s = _warning_fraction("velocity") * limit_rad_s
+        warning_rad_s = _warning_fraction("velocity") * limit_rad_s
         checked_values: list[_CheckedValue] = [
-            ("velocity", "", "", speed_rad_s, limit_rad_s, near_rad_s)
+            ("velocity", "", "", speed_rad_s, limit_rad_s, warning_rad_s)
         ]
         if not self._ticks_without_jump_check:
-            near_rad = _warning_fraction("encoder jump") * max_jump_rad
-            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, near_rad))
+            warning_rad = _warning_fraction("encoder jump") * max_jump_rad
+            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, warning_rad))
         return checked_values
 
     def check_stale(
