@@ -599,8 +599,8 @@ class LoadedBeam:
     def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
         """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
 
-        `s` has the starts and `step_tolerance` is the relative length of the last step. The result is
-        NaN where no root is found near its start.
+        `s` has the start values; `step_tolerance` is the relative length of the last step. The
+        result is NaN where no root is found near its start.
         """
         start_roots = s
         with np.errstate(all="ignore"):

@@ -81,7 +81,7 @@ def _rows_without_devices(profile: Profile) -> list[CheckRow]:
 
 
 def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the result on whether `rigd run chirp` without options stays within the profile's limits.
+    """Yield the result on whether a default `rigd run chirp` stays within the profile's limits.
 
     It is at most a warning, since other sessions may stay within the limits: a hold moves nothing.
     """

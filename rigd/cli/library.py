@@ -112,14 +112,14 @@ def specimens() -> None:
 
     for specimen_name, specimen_path in specimen_files().items():
         try:
-            loaded_specimen = load_specimen(specimen_path)
+            described = load_specimen(specimen_path)
         except ProfileError as error:
             beam_text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
-            beam = loaded_specimen.beam
+            beam = described.beam
             beam_text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
-                f"{beam.bending_stiffness_n_m2:g} N·m²{loaded_specimen.note and f', {loaded_specimen.note}'} "
+                f"{beam.bending_stiffness_n_m2:g} N·m²{described.note and f', {described.note}'} "
                 f"({specimen_path})"
             )
         typer.echo(readable_message(f"{specimen_name}: {beam_text}"))

@@ -325,7 +325,7 @@ def _is_accepted(ratio: float | None) -> bool:
 
 
 def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
-    """Describe why the shaft moved in the wrong direction or not at all; return "" if it moved."""
+    """Describe a shaft or encoder that did not move or moved the wrong way; "" otherwise."""
     if end is ProbeEnd.REVERSED:
         return (
             "the encoder counts against the torque: one of both has the wrong sign. Check "
