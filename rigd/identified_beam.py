@@ -199,7 +199,7 @@ class IdentifiedBeam:
         return (*self.mode_uncertainty, *(largest_uncertainty,) * mode_count)[:mode_count]
 
 
-def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
+def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
     It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
@@ -209,7 +209,7 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
 
     Parameters
     ----------
-    path
+    document_path
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     length_m
@@ -228,8 +228,8 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         If the file cannot be read or lacks parameters, if it has an effect or a finding that this
         use does not take into account, or if a required number is flagged.
     """
-    path = Path(path)
-    headline_label, headline, refusal = _read_headline(path)
+    document_path = Path(document_path)
+    headline_label, headline, refusal = _read_headline(document_path)
     if refusal and not use.modes:
         raise IdentifiedBeamError(
             f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a "
@@ -244,17 +244,17 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
     parameters = parameter_object.get("parameters")
     if not isinstance(parameters, dict):
         raise IdentifiedBeamError(f"{headline_label}.parameters is missing; {_ADVICE}.")
-    values = parameter_values(headline_label, parameters)
+    values_by_name = parameter_values(headline_label, parameters)
     if refusal:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
-        values = {
+        values_by_name = {
             n: v
-            for n, v in values.items()
+            for n, v in values_by_name.items()
             if _parameter_key(n) not in (_OFFSET_PREFIX, *_END_PARAMETERS)
         }
-    _require_known_effects(headline_label, values, use)
+    _require_known_effects(headline_label, values_by_name, use)
     std = {}
-    for parameter_name in values:
+    for parameter_name in values_by_name:
         parameter_std = (
             _standard_deviation(parameters[parameter_name])
             if refusal
@@ -265,22 +265,22 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         if parameter_std is not None:
             std[parameter_name] = parameter_std
     density_over_stiffness, stiffness_n_m2 = (
-        values[parameter_name] for parameter_name in _REQUIRED_PARAMETERS
+        values_by_name[parameter_name] for parameter_name in _REQUIRED_PARAMETERS
     )
     identified_beam = IdentifiedBeam(
         beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
         damping=Damping(
-            zeta=values.get("zeta", 0.0),
-            alpha=values.get("alpha", 1.0),
-            gamma=values.get("gamma", 0.0),
-            lambda_=values.get("lambda", 1.0),
+            zeta=values_by_name.get("zeta", 0.0),
+            alpha=values_by_name.get("alpha", 1.0),
+            gamma=values_by_name.get("gamma", 0.0),
+            lambda_=values_by_name.get("lambda", 1.0),
         ),
-        tool_inertia_kg_m2=values.get("tool_inertia_kg_m2"),
-        delay_s=values.get("delay_s"),
+        tool_inertia_kg_m2=values_by_name.get("tool_inertia_kg_m2"),
+        delay_s=values_by_name.get("delay_s"),
         std=std,
-        tip_mass_kg=values.get("tip_mass_kg", 0.0),
-        root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_stiffness_offsets(headline_label, values),
+        tip_mass_kg=values_by_name.get("tip_mass_kg", 0.0),
+        root_compliance_rad_per_nm=values_by_name.get("root_compliance_rad_per_nm", 0.0),
+        stiffness_offsets=_stiffness_offsets(headline_label, values_by_name),
         mode_uncertainty=_mode_uncertainty(headline_label, parameter_object.get("modes")),
     )
     return (
@@ -436,15 +436,15 @@ def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
     return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
-def parameter_values(label: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+def parameter_values(label: str, parameter_entries: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a headline's parameters, after a check of their ranges.
 
     Parameters
     ----------
     label
         Name of the headline in messages.
-    parameters
-        Object ``parameters`` of the headline.
+    parameter_entries
+        Object ``parameter_entries`` of the headline.
 
     Raises
     ------
@@ -453,7 +453,7 @@ def parameter_values(label: str, parameters: Mapping[str, Any]) -> dict[str, flo
     """
     values_by_name = {
         parameter_name: _parameter_value(label, parameter_name, parameter_entry)
-        for parameter_name, parameter_entry in parameters.items()
+        for parameter_name, parameter_entry in parameter_entries.items()
     }
     for parameter_name in _REQUIRED_PARAMETERS:
         if parameter_name not in values_by_name:
@@ -490,12 +490,13 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     return unmodelled_findings
 
 
-def _parameter_key(name: str) -> str:
+def _parameter_key(parameter_name: str) -> str:
     """Return the key of a parameter in `_PARAMETERS`; that of an offset lacks the mode's number."""
     return (
         _OFFSET_PREFIX
-        if name.startswith(_OFFSET_PREFIX) and name[len(_OFFSET_PREFIX) :].isdecimal()
-        else name
+        if parameter_name.startswith(_OFFSET_PREFIX)
+        and parameter_name[len(_OFFSET_PREFIX) :].isdecimal()
+        else parameter_name
     )
 
 
@@ -534,9 +535,9 @@ def _parameter_value(label: str, name: str, entry: object) -> float:
     )
 
 
-def _require_known_effects(label: str, values: Mapping[str, float], use: Use) -> None:
+def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
     """Raise IdentifiedBeamError if the analysis found an effect that the use cannot include."""
-    for parameter_name, parameter_value in values.items():
+    for parameter_name, parameter_value in values_by_name.items():
         definition = _PARAMETERS[_parameter_key(parameter_name)]
         if (
             not definition.effect
@@ -554,8 +555,8 @@ def _require_known_effects(label: str, values: Mapping[str, float], use: Use) ->
             "the analysis found "
             f"{definition.effect}, which {use.name} does not take into account; {remedy_text}."
         )
-    if values.get("tip_mass_kg") and any(
-        values[n] for n in values if _parameter_key(n) == _OFFSET_PREFIX
+    if values_by_name.get("tip_mass_kg") and any(
+        values_by_name[n] for n in values_by_name if _parameter_key(n) == _OFFSET_PREFIX
     ):
         raise IdentifiedBeamError(
             f"{label}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
@@ -610,11 +611,11 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
     return std if std is not None and std > 0 else None
 
 
-def _stiffness_offsets(label: str, values: Mapping[str, float]) -> tuple[float, ...]:
+def _stiffness_offsets(label: str, values_by_name: Mapping[str, float]) -> tuple[float, ...]:
     """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
     offset_by_mode = {
         int(n[len(_OFFSET_PREFIX) :]): offset_value
-        for n, offset_value in values.items()
+        for n, offset_value in values_by_name.items()
         if _parameter_key(n) == _OFFSET_PREFIX
     }
     mode_numbers = range(2, 2 + len(offset_by_mode))

@@ -128,8 +128,8 @@ class DeflectionFilter:
         if self._start_rad is None:
             self._start_rad = float(angle_rad[0])
         turned_rad = angle_rad - self._start_rad
-        for start in range(0, turned_rad.size, _CHUNK):
-            chunk_rad = turned_rad[start : start + _CHUNK]
+        for chunk_start in range(0, turned_rad.size, _CHUNK):
+            chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK]
             chunk_powers = self._powers[:, _CHUNK - chunk_rad.size :]
             self._state = chunk_powers[:, 0] * self._state + chunk_powers[:, 1:] @ chunk_rad
         deflection: Real = (self._scaled_shapes @ self._state).real + self._direct * turned_rad[-1]

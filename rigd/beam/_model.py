@@ -148,11 +148,11 @@ class TransferGrid:
             Parameters of the exact model.
         """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
-        for part in self._parts:
-            c = 1 + damping.zeta * self._power_of_s(damping.alpha, part)
-            s_lambda = self._power_of_s(damping.lambda_, part)
-            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
-            np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[part])
+        for grid_slice in self._parts:
+            c = 1 + damping.zeta * self._power_of_s(damping.alpha, grid_slice)
+            s_lambda = self._power_of_s(damping.lambda_, grid_slice)
+            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice))
+            np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[grid_slice])
         return g.reshape(self.shape)
 
     def evaluate_with_gradient(
@@ -189,31 +189,31 @@ class TransferGrid:
         stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
-        for part in self._parts:
-            s_alpha = self._power_of_s(damping.alpha, part)
-            s_lambda = self._power_of_s(damping.lambda_, part)
+        for grid_slice in self._parts:
+            s_alpha = self._power_of_s(damping.alpha, grid_slice)
+            s_lambda = self._power_of_s(damping.lambda_, grid_slice)
             c = 1 + damping.zeta * s_alpha
-            q = self._fourth_power_of_z(beam, damping, c, s_lambda, part)
-            f, slope, remainder = _f_with_slope(q)
-            np.multiply(per_length * c, f, out=g[part])
+            q = self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice)
+            f, f_slope, remainder = _f_with_slope(q)
+            np.multiply(per_length * c, f, out=g[grid_slice])
             internal = (per_length * s_alpha) * remainder
-            slope *= stiffness_volume
-            external = s_lambda * slope
-            for row, parameter_name in zip(gradient[:, part], wrt, strict=True):
+            f_slope *= stiffness_volume
+            external = s_lambda * f_slope
+            for row, parameter_name in zip(gradient[:, grid_slice], wrt, strict=True):
                 match parameter_name:
                     case "zeta":
                         row[:] = internal
                     case "alpha":
-                        np.multiply(damping.zeta * self._log_s[part], internal, out=row)
+                        np.multiply(damping.zeta * self._log_s[grid_slice], internal, out=row)
                     case "gamma":
                         row[:] = external
                     case "lambda":
-                        np.multiply(damping.gamma * self._log_s[part], external, out=row)
+                        np.multiply(damping.gamma * self._log_s[grid_slice], external, out=row)
                     case "ln_density_over_stiffness":
-                        inertial = beam.density_over_stiffness * self._s_squared[part]
-                        np.multiply(inertial, slope, out=row)
+                        inertial = beam.density_over_stiffness * self._s_squared[grid_slice]
+                        np.multiply(inertial, f_slope, out=row)
                     case "ln_stiffness":
-                        row[:] = g[part]
+                        row[:] = g[grid_slice]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
 
     def _power_of_s(self, order: float, grid_slice: slice) -> Complex:
@@ -378,7 +378,7 @@ def _evaluate_f(q: Complex) -> Complex:
 
 def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
     """Return the beam's response function F(q), dF/dq and ``F - q dF/dq``, without cancellation."""
-    f, slope, remainder = np.empty((3, q.size), dtype=np.complex128)
+    f, f_slope, remainder = np.empty((3, q.size), dtype=np.complex128)
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
@@ -389,13 +389,13 @@ def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
         )
         d_squared = d * d
         f[is_small] = small_q * n / d
-        slope[is_small] = (n * d - small_q * wronskian) / d_squared
+        f_slope[is_small] = (n * d - small_q * wronskian) / d_squared
         remainder[is_small] = small_q * small_q * wronskian / d_squared
     is_large = ~is_small
     large_q = q[is_large]
     f_high, s_high = _scaled_form(large_q)
     q_slope = 0.25 * (f_high * (1 + f_high) + s_high)
     f[is_large] = f_high
-    slope[is_large] = q_slope / large_q
+    f_slope[is_large] = q_slope / large_q
     remainder[is_large] = f_high - q_slope
-    return f, slope, remainder
+    return f, f_slope, remainder

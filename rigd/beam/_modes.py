@@ -107,7 +107,7 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
     return frequencies_rad_s
 
 
-def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
+def mode_shape(mode_number: int, x_over_length: ArrayLike) -> Real:
     """Return a mode shape of the clamped–free beam, normalised to the mean square 1.
 
     Its value at the tip is 2. It is computed without growing exponentials, so high modes are as
@@ -115,7 +115,7 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
 
     Parameters
     ----------
-    number
+    mode_number
         Number of the mode, from 1.
     x_over_length
         Positions along the beam, 0 (axis) to 1 (tip), of any shape.
@@ -130,13 +130,13 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
     >>> print(mode_shape(2, [0.25, 0.5, 1.0]).round(4))
     [-0.8345 -1.4273  2.    ]
     """
-    z = float(clamped_free_eigenvalues(number)[-1])
+    z = float(clamped_free_eigenvalues(mode_number)[-1])
     x = z * np.asarray(x_over_length, dtype=np.float64)
     cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
     one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
     growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
-    shape_sign = 1.0 if number % 2 == 1 else -1.0
+    shape_sign = 1.0 if mode_number % 2 == 1 else -1.0
     mode_values: Real = shape_sign * (
         np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part
     )
@@ -457,13 +457,13 @@ def _newton_roots(
             inertial = np.exp(2 * log_s)
             external = external_coefficient * np.exp(damping.lambda_ * log_s)
             internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
-            residual = inertial + external + internal + omega_squared
+            equation_residual = inertial + external + internal + omega_squared
             residual_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
-            newton_step = residual / residual_slope
+            newton_step = equation_residual / residual_slope
             log_s = log_s - newton_step
             if not (np.abs(newton_step) > 1e-12).any():  # nor where one is NaN
                 break
         residual_scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
-        is_solution = np.abs(residual) < 1e-9 * residual_scale
+        is_solution = np.abs(equation_residual) < 1e-9 * residual_scale
         return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

@@ -86,14 +86,14 @@ class PointForceGrid:
         )
         self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
-    def per_angle(self, x_m: ArrayLike, order: int = 0) -> Complex:
+    def per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
         """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
         ----------
         x_m
             Distance from the motor's axis, any shape.
-        order
+        derivative_order
             Order of the derivative with respect to x, 0 to 3.
 
         Returns
@@ -108,14 +108,18 @@ class PointForceGrid:
             b4, b4 * self._series_at_tip(3), b4 * self._series_at_tip(2)
         )
         out[self._small_q_indices] = (
-            _power_series(b4, x.ravel(), 1, order)
-            + moment * _power_series(b4, x.ravel(), 2, order)
-            + shear * _power_series(b4, x.ravel(), 3, order)
+            _power_series(b4, x.ravel(), 1, derivative_order)
+            + moment * _power_series(b4, x.ravel(), 2, derivative_order)
+            + shear * _power_series(b4, x.ravel(), 3, derivative_order)
         )
-        out[self._large_q_indices] = self._exponentials.response_per_angle(x.ravel(), order)
+        out[self._large_q_indices] = self._exponentials.response_per_angle(
+            x.ravel(), derivative_order
+        )
         return out.reshape((*self._shape, *x.shape))
 
-    def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
+    def per_force(
+        self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
+    ) -> Complex:
         """Return the displacement of the beam per point force, or its derivative by x.
 
         The motor holds the root at angle zero.
@@ -125,7 +129,7 @@ class PointForceGrid:
         x_m, force_at_m
             Positions of displacement and force, as distances from the motor's axis; broadcast
             against each other.
-        order
+        derivative_order
             Order of the derivative with respect to `x_m`, 0 to 3; the third jumps at the force,
             where its value on the root's side is returned.
 
@@ -146,14 +150,16 @@ class PointForceGrid:
         moment, shear = self._root_derivatives(
             b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
         )
-        beyond_force = np.where(x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
+        beyond_force = np.where(
+            x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, derivative_order), 0.0
+        )
         out[self._small_q_indices] = (
-            moment * _power_series(b4, x, 2, order)
-            + shear * _power_series(b4, x, 3, order)
+            moment * _power_series(b4, x, 2, derivative_order)
+            + shear * _power_series(b4, x, 3, derivative_order)
             + beyond_force
         ) / stiffness
         out[self._large_q_indices] = (
-            self._exponentials.response_per_force_over_stiffness(x, at, order)
+            self._exponentials.response_per_force_over_stiffness(x, at, derivative_order)
             / self._q_stiffness[self._large_q_indices, None]
         )
         return out.reshape((*self._shape, *shape))
@@ -217,12 +223,12 @@ class PointForceGrid:
         return moment, shear
 
 
-def _power_series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
-    """Return the power series ``K_n``, or its derivative of `order`, at the points x, shape (s, m).
+def _power_series(b4: Complex, x: Real, n: int, derivative_order: int = 0) -> Complex:
+    """Return the power series ``K_n``, or a derivative of it, at the points x, shape (s, m).
 
     `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
     """
-    n -= order
+    n -= derivative_order
     if n < 0:
         return b4 * _power_series(b4, x, n + 4)
     series_argument = b4 * x**4
@@ -261,11 +267,15 @@ class _ExponentialSolution:
             np.complex128
         )
 
-    def response_per_angle(self, x: Real, order: int) -> Complex:
+    def response_per_angle(self, x: Real, derivative_order: int) -> Complex:
         """Return the displacement per root angle at x, or its derivative by x; shape (s, m)."""
-        return self._weighted_sum(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
+        return self._weighted_sum(
+            self._inverse[:, :, 1, None] / self._b[:, :, None], x, derivative_order
+        )
 
-    def response_per_force_over_stiffness(self, x: Real, at: Real, order: int) -> Complex:
+    def response_per_force_over_stiffness(
+        self, x: Real, at: Real, derivative_order: int
+    ) -> Complex:
         """Return displacement times bending stiffness per point force, or its derivative by x.
 
         Point i of x, shape (m,), is displaced by the force at point i of `at`. The result has the
@@ -290,21 +300,21 @@ class _ExponentialSolution:
         )
         distance_m = np.abs(x - at)
         derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
-        direct_response = (derivative_sign * b) ** order * decaying_amplitude * np.exp(
+        direct_response = (derivative_sign * b) ** derivative_order * decaying_amplitude * np.exp(
             -b * distance_m
-        ) + (derivative_sign * c) ** order * other_amplitude * np.exp(-c * distance_m)
+        ) + (derivative_sign * c) ** derivative_order * other_amplitude * np.exp(-c * distance_m)
         coefficients = -self._inverse @ at_ends
-        return direct_response + self._weighted_sum(coefficients, x, order)
+        return direct_response + self._weighted_sum(coefficients, x, derivative_order)
 
-    def _weighted_sum(self, coefficients: Complex, x: Real, order: int) -> Complex:
-        """Return the sum of the four exponentials weighted by coefficients (s, 4, m or 1)."""
+    def _weighted_sum(self, coefficients: Complex, x: Real, derivative_order: int) -> Complex:
+        """Return the four exponential solutions' weighted sum; weights of shape (s, 4, m or 1)."""
         b, c = self._b, self._kappa * self._b
         from_tip = self._length_m - x
         exponentials = (
-            (-b) ** order * np.exp(-b * x),
-            b**order * np.exp(-b * from_tip),
-            (-c) ** order * np.exp(-c * x),
-            c**order * np.exp(-c * from_tip),
+            (-b) ** derivative_order * np.exp(-b * x),
+            b**derivative_order * np.exp(-b * from_tip),
+            (-c) ** derivative_order * np.exp(-c * x),
+            c**derivative_order * np.exp(-c * from_tip),
         )
         weighted_sum: Complex = sum(
             (coefficients[:, i] * exponential for i, exponential in enumerate(exponentials)),

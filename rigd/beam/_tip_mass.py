@@ -388,7 +388,10 @@ class LoadedBeam:
             Laplace variable in rad/s, not 0.
         """
         force_grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
-        displacement, slope = force_grid.per_angle(tip) - tip, force_grid.per_angle(tip, 1) - 1
+        displacement, slope_per_angle = (
+            force_grid.per_angle(tip) - tip,
+            force_grid.per_angle(tip, 1) - 1,
+        )
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
@@ -404,15 +407,15 @@ class LoadedBeam:
                 * (elastic_factor * k4 * (1 + stiffness_offset) + inertial_factor)
             )
             displacement = displacement + 2 * offset_term
-            slope = slope + tip_slopes[offset_index] * offset_term
+            slope_per_angle = slope_per_angle + tip_slopes[offset_index] * offset_term
         if self.tip_mass_kg:
             tip_force = self._tip_force_per_angle(s, force_grid)
             displacement = displacement + force_grid.per_force(tip, tip) * tip_force
-            slope = slope + force_grid.per_force(tip, tip, 1) * tip_force
+            slope_per_angle = slope_per_angle + force_grid.per_force(tip, tip, 1) * tip_force
         clamp_factor = 1 / (
             1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
         )
-        return displacement * clamp_factor, slope * clamp_factor
+        return displacement * clamp_factor, slope_per_angle * clamp_factor
 
     def _tip_force_per_angle(self, s: Complex, force_grid: PointForceGrid) -> Complex:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
@@ -631,8 +634,8 @@ def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]
         for out, series_numerator in zip((f, u, b), series_numerators, strict=True):
             out[is_small] = small_q * series_numerator / series_divisor
     if not is_small.all():
-        for out, values in zip((f, u, b), _scaled_functions(q[~is_small]), strict=True):
-            out[~is_small] = values
+        for out, function_values in zip((f, u, b), _scaled_functions(q[~is_small]), strict=True):
+            out[~is_small] = function_values
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 

@@ -470,7 +470,7 @@ def _far_from_landmarks(omega: Real, poles: Complex, zeros: Complex) -> NDArray[
 
 
 def _build_realisation(
-    poles: Complex, modes: NDArray[np.intp], coefficients: Real, error: float
+    poles: Complex, modes: NDArray[np.intp], coefficients: Real, relative_error: float
 ) -> Realisation:
     """Build the realisation from its poles and the fitted coefficients ``c, D, V, K``."""
     upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
@@ -485,7 +485,9 @@ def _build_realisation(
     b = np.ones(n)
     b[upper_rows + 1] = 0.0
     inertia, viscosity, stiffness = (float(coefficient) for coefficient in coefficients[-3:])
-    return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles, modes)
+    return Realisation(
+        a, b, coefficients[:-3], inertia, viscosity, stiffness, relative_error, poles, modes
+    )
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
@@ -717,15 +719,15 @@ def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: 
     return _matrix_exponential(extended_matrix)[:n, n:]
 
 
-def _matrix_exponential(matrix: Real) -> Real:
+def _matrix_exponential(square_matrix: Real) -> Real:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
     cases. scipy has the same, but importing it takes longer than all else a fast session starts.
     """
-    matrix_norm = float(np.linalg.norm(matrix, 1))
+    matrix_norm = float(np.linalg.norm(square_matrix, 1))
     squarings = max(0, math.ceil(math.log2(matrix_norm / 5.37))) if matrix_norm > 0 else 0
-    x = matrix / 2.0**squarings
+    x = square_matrix / 2.0**squarings
     x2 = x @ x
     x4 = x2 @ x2
     matrix_powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3

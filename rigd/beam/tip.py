@@ -176,7 +176,7 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     -------
     displacement
         Displacement of the tip per angle in m/rad, in the shape of `s`.
-    slope
+    tip_slope
         Slope of the tip per angle, dimensionless, in the shape of `s`.
     """
     external = damping.gamma * s**damping.lambda_
@@ -191,8 +191,8 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     sines = 2 * rotation * (1 - a) + 2j * imaginary_sign * decay * (1 - b)
     cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
     displacement: Complex = beam.length_m * sines * reciprocal / z
-    slope: Complex = cosines * reciprocal
-    return displacement, slope
+    tip_slope: Complex = cosines * reciprocal
+    return displacement, tip_slope
 
 
 def _fast_fft_length(min_length: int) -> int:

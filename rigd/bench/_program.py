@@ -298,9 +298,9 @@ def _holds(measured: LoopMeasurement) -> bool:
     return measured.held_between_stalls >= HELD_FRACTION
 
 
-def _median(values: list[float]) -> float:
+def _median(numbers: list[float]) -> float:
     """Return the median of at least one value."""
-    ordered_values = sorted(values)
+    ordered_values = sorted(numbers)
     middle_index = len(ordered_values) // 2
     return (
         ordered_values[middle_index]

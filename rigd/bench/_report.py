@@ -130,8 +130,8 @@ def _measurements(results: Results) -> list[LoopMeasurement]:
     return [results.alone, *([] if peer is None else [peer]), *results.sessions]
 
 
-def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
-    """Yield the lines of the table of latencies."""
+def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
+    """Yield the lines of the report's table of wake-up latencies and execution times in µs."""
     yield (
         f"{'':{_NAME_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
         f"{'CPU':>5}  faults"
@@ -140,7 +140,7 @@ def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
         f"{'':{_NAME_WIDTH}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
         f"{'p50':>8}{'p99':>8}   {'%':>7}  {'%':>5}"
     )
-    for measurement in rows:
+    for measurement in measurements:
         latency_percentiles = percentiles(measurement.lateness_us)
         number_cells = (
             latency_percentiles.p50,
@@ -150,7 +150,7 @@ def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
             latency_percentiles.largest,
         )
         cells_text = f"{measurement.name:{_NAME_WIDTH}}" + "".join(
-            f"{number:8.0f}" for number in number_cells
+            f"{percentile_us:8.0f}" for percentile_us in number_cells
         )
         if measurement.work_us.size:
             work_percentiles = percentiles(measurement.work_us)
@@ -250,13 +250,13 @@ def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
     return counts
 
 
-def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
+def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
     """Return the lines of text with the histograms of several series of delays, side by side.
 
-    `columns` has a name and the delays in µs of each series. The length of a bar is proportional to
-    the logarithm of its count, so that rare delays are visible.
+    Each column has a series' name and its delays in µs. The length of a bar is proportional to the
+    logarithm of its count, so that rare delays are visible.
     """
-    bin_counts = [counts_of(delays_us) for _, delays_us in columns]
+    bin_counts = [counts_of(delays_us) for _, delays_us in histogram_columns]
     used_bins = [
         bin_no
         for bin_no in range(len(edges_us()))
@@ -266,7 +266,7 @@ def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> l
         return []
     longest_count = max(max(bin_totals) for bin_totals in bin_counts)
     header_line = " " * (_LABEL_WIDTH + 3) + "".join(
-        f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in columns
+        f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
     )
     histogram_text = [header_line.rstrip()]
     for bin_no in range(used_bins[0], used_bins[-1] + 1):
@@ -280,15 +280,15 @@ def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> l
     return histogram_text
 
 
-def _histogram_bar(count: int, longest: int) -> str:
+def _histogram_bar(bin_count: int, longest: int) -> str:
     """Return the bar of a bin; `longest` is the count of the longest bar."""
-    bar_length = round((_BAR_WIDTH - 1) * log10(1 + count) / log10(1 + longest))
-    return f"{_BAR_CHARACTER * max(bar_length, int(count > 0)):<{_BAR_WIDTH}}"
+    bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest))
+    return f"{_BAR_CHARACTER * max(bar_length, int(bin_count > 0)):<{_BAR_WIDTH}}"
 
 
-def _bin_label(index: int) -> str:
+def _bin_label(bin_index: int) -> str:
     """Return the label of a bin with its edges."""
     bin_edges_us = edges_us()
-    if index + 1 == len(bin_edges_us):
-        return f"{bin_edges_us[index]:.0f} µs and more"
-    return f"{bin_edges_us[index]:.0f}–{bin_edges_us[index + 1]:.0f} µs"
+    if bin_index + 1 == len(bin_edges_us):
+        return f"{bin_edges_us[bin_index]:.0f} µs and more"
+    return f"{bin_edges_us[bin_index]:.0f}–{bin_edges_us[bin_index + 1]:.0f} µs"

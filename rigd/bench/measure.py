@@ -158,7 +158,7 @@ def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
     return LatencyPercentiles(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
 
 
-def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
+def wake_ups_us(sample_records: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
     """Return the wake-up latency of each sample in µs, relative to the awaited deadline.
 
     The lateness in a sample is relative to the tick that was run. After missed ticks this tick is
@@ -166,14 +166,14 @@ def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np
 
     Parameters
     ----------
-    samples
+    sample_records
         Recorded samples, without those that the recorder lost.
     rate_hz
         Loop rate in ticks per second.
     """
-    tick_numbers: npt.NDArray[np.int64] = samples["tick"].astype(np.int64)
+    tick_numbers: npt.NDArray[np.int64] = sample_records["tick"].astype(np.int64)
     missed_ticks = np.diff(tick_numbers, prepend=-1) - 1
-    latency_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed_ticks * (
+    latency_us: npt.NDArray[np.float64] = sample_records["lateness_ns"] * 1e-3 + missed_ticks * (
         1e6 / rate_hz
     )
     return latency_us
@@ -182,7 +182,7 @@ def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np
 def record_measurement(
     name: str,
     rate_hz: float,
-    samples: npt.NDArray[np.void],
+    sample_records: npt.NDArray[np.void],
     *,
     scheduled_ticks: int,
     cpu_percent: float | None,
@@ -196,7 +196,7 @@ def record_measurement(
         Name of the measurement.
     rate_hz
         Loop rate in ticks per second.
-    samples
+    sample_records
         Samples of the record; ticks without a sample were missed.
     scheduled_ticks
         Number of scheduled ticks.
@@ -206,10 +206,10 @@ def record_measurement(
     return LoopMeasurement(
         name,
         rate_hz,
-        wake_ups_us(samples, rate_hz),
-        samples["work_ns"] * 1e-3,
+        wake_ups_us(sample_records, rate_hz),
+        sample_records["work_ns"] * 1e-3,
         scheduled_ticks,
-        scheduled_ticks - samples.size,
+        scheduled_ticks - sample_records.size,
         cpu_percent,
         page_faults,
     )

@@ -242,15 +242,16 @@ def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
     )
 
 
-def _isolation_advice(last: int) -> str:
-    """Return the advice to isolate the last core, whose number is `last`."""
-    if last == 0:
+def _isolation_advice(last_core: int) -> str:
+    """Return the advice to isolate the last core, whose number is `last_core`."""
+    if last_core == 0:
         return (
             "Isolated core: this computer has one core, which everything shares; use one with more."
         )
     return (
         "Isolated core: other programs may share the loop's core. Boot with "
-        f"isolcpus={last} nohz_full={last} irqaffinity=0 (GRUB_CMDLINE_LINUX in /etc/default/grub, "
+        f"isolcpus={last_core} nohz_full={last_core} irqaffinity=0 (GRUB_CMDLINE_LINUX in "
+        "/etc/default/grub, "
         "then update-grub)."
     )
 

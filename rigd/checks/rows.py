@@ -52,9 +52,9 @@ def _unit_suffix(key: str) -> str:
     return "" if key.endswith("_counts") else suffix_of(key)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(document_value: object) -> bool:
     """Return whether a value is an integer or a float, but not a boolean."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(document_value, int | float) and not isinstance(document_value, bool)
 
 
 # Rows

@@ -66,23 +66,23 @@ def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _print_result(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
+def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
     """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
 
     `on_paper` states that the rows are those of an EDS file only.
     """
     from rigd.checks.rows import overall
 
-    verdict = overall(rows)
+    verdict = overall(check_rows)
     if as_json:
-        json_document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
+        json_document = {"verdict": verdict, "rows": [row.as_dict() for row in check_rows]}
         typer.echo(json.dumps(json_document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
         from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, CheckResult, print_table
 
-        print_table(rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
-        has_failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}
+        print_table(check_rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
+        has_failed = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
         if has_failed and has_failed.issubset(ACCEPTABLE) and not on_paper:
             accepted_rows = " ".join(
                 f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in has_failed

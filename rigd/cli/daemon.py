@@ -145,14 +145,14 @@ def status(
         _watch_status(profile)
         return
     with daemon_of(profile) as client:
-        reply = client.ask("status")
+        daemon_reply = client.ask("status")
     if as_json:
-        del reply["reply"], reply["ok"]
-        typer.echo(json.dumps(reply))
+        del daemon_reply["reply"], daemon_reply["ok"]
+        typer.echo(json.dumps(daemon_reply))
         return
     from rigd.cli.status_view import print_status
 
-    print_status(reply)
+    print_status(daemon_reply)
 
 
 def stop(
@@ -184,17 +184,17 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd tare
     """
     with daemon_of(profile) as client:
-        reply = client.ask("tare")
+        daemon_reply = client.ask("tare")
     if as_json:
-        typer.echo(json.dumps(_measured_values(reply)))
+        typer.echo(json.dumps(_measured_values(daemon_reply)))
         return
-    for axis, axis_mean in reply["mean"].items():
+    for axis, axis_mean in daemon_reply["mean"].items():
         value_name, unit_text = axis.removesuffix(suffix_of(axis)), unit_of(axis)
         typer.echo(
-            f"{value_name}: mean {axis_mean:.3f} {unit_text}, s.d. {reply['std'][axis]:.3f} "
+            f"{value_name}: mean {axis_mean:.3f} {unit_text}, s.d. {daemon_reply['std'][axis]:.3f} "
             f"{unit_text}"
         )
-    typer.echo(f"coupling torque: s.d. {reply['torque_std_nm']:.3f} N·m")
+    typer.echo(f"coupling torque: s.d. {daemon_reply['torque_std_nm']:.3f} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
@@ -205,11 +205,11 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd zero
     """
     with daemon_of(profile) as client:
-        reply = client.ask("zero")
+        daemon_reply = client.ask("zero")
     if as_json:
-        typer.echo(json.dumps(_measured_values(reply)))
+        typer.echo(json.dumps(_measured_values(daemon_reply)))
     else:
-        typer.echo(f"Zero set (shift {reply['moved_rad']:.5f} rad).")
+        typer.echo(f"Zero set (shift {daemon_reply['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:
@@ -227,18 +227,18 @@ def reset_by_daemon(profile: str | None) -> bool:
         }:
             return False
     with daemon_of(profile) as client:
-        reply = client.ask("reset")
+        daemon_reply = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
-    if reply["zero_lost"]:
+    if daemon_reply["zero_lost"]:
         typer.echo("The zero of the angle was lost: move the motor to mid-travel; run rigd zero.")
     return True
 
 
-def _measured_values(reply: dict[str, Any]) -> dict[str, Any]:
+def _measured_values(daemon_reply: dict[str, Any]) -> dict[str, Any]:
     """Return the measured values in a daemon's reply, without the reply's name and result."""
     return {
         value_name: measured_value
-        for value_name, measured_value in reply.items()
+        for value_name, measured_value in daemon_reply.items()
         if value_name not in ("reply", "ok")
     }
 
@@ -258,9 +258,9 @@ def _watch_status(profile: str | None) -> None:
         while True:
             try:
                 connected_client = connected_client or Client(find(wanted_rig))
-                reply = connected_client.ask("status")
-                wanted_rig = wanted_rig or reply["daemon"]["profile"]
-                live_display.update(status_table(reply), refresh=True)
+                daemon_reply = connected_client.ask("status")
+                wanted_rig = wanted_rig or daemon_reply["daemon"]["profile"]
+                live_display.update(status_table(daemon_reply), refresh=True)
             except RigdError as error:
                 if connected_client is not None:
                     connected_client.close()

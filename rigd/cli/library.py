@@ -125,9 +125,9 @@ def specimens() -> None:
         typer.echo(readable_message(f"{specimen_name}: {beam_text}"))
 
 
-def _sessions_of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
+def _sessions_of_one_specimen(session_rows: "list[SessionRow]") -> "list[SessionRow]":
     """Return the sessions whose modes are known; end the command if they have several specimens."""
-    with_modes = [row for row in rows if row.modes]
+    with_modes = [row for row in session_rows if row.modes]
     specimen_names = sorted({row.specimen for row in with_modes})
     if len(specimen_names) > 1:
         named = ", ".join(
@@ -148,26 +148,26 @@ def _local_start(row: "SessionRow") -> str:
         return ""
 
 
-def _table_lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def _table_lines(titles: Sequence[str], table_rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table, without columns whose cells are all empty."""
     filled_columns = [
         column_index
         for column_index in range(len(titles))
-        if any(row[column_index] for row in rows)
+        if any(row[column_index] for row in table_rows)
     ]
     column_widths = {
-        column_index: max(len(row[column_index]) for row in (titles, *rows))
+        column_index: max(len(row[column_index]) for row in (titles, *table_rows))
         for column_index in filled_columns
     }
-    for row in (titles, *rows):
+    for row in (titles, *table_rows):
         yield "  ".join(
             f"{row[column_index]:{column_widths[column_index]}}" for column_index in filled_columns
         ).rstrip()
 
 
-def _session_lines(rows: "list[SessionRow]") -> Iterator[str]:
+def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
     """Yield the lines of the list of sessions."""
-    if not rows:
+    if not session_rows:
         yield "No sessions."
         return
     column_titles = (
@@ -189,10 +189,10 @@ def _session_lines(rows: "list[SessionRow]") -> Iterator[str]:
                 _uniform_beam_text(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
-            for row in rows
+            for row in session_rows
         ],
     )
-    for row in rows:
+    for row in session_rows:
         if row.problem:
             yield f"{printable(row.path.name)}: {row.problem}"
 

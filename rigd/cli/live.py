@@ -30,9 +30,9 @@ def has_screen() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def tunnel_advice(view: "LiveAddress") -> str:
+def tunnel_advice(live_view: "LiveAddress") -> str:
     """Return a sentence with the command that opens a live view from another computer."""
-    page_port, grpc_port = view.page_port, view.grpc_port
+    page_port, grpc_port = live_view.page_port, live_view.grpc_port
     return (
         f"From another computer: ssh -L {page_port}:127.0.0.1:{page_port} -L "
         f"{grpc_port}:127.0.0.1:{grpc_port} "
@@ -131,7 +131,7 @@ def _only_running_view(rig: str | None) -> "LiveAddress | None":
 
     views = find_views(rig)
     if len(views) > 1:
-        rigs = ", ".join(view.rig for view in views)
+        rigs = ", ".join(live_view.rig for live_view in views)
         fail(f"Several live views are running ({rigs}); name one with --profile.", EXIT_FAILED)
     return views[0] if views else None
 
@@ -139,9 +139,9 @@ def _only_running_view(rig: str | None) -> "LiveAddress | None":
 def _wait_for_view(rig: str | None) -> "LiveAddress":
     """Wait until a live view runs, and return its address."""
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
-    while (view := _only_running_view(rig)) is None:
+    while (live_view := _only_running_view(rig)) is None:
         time.sleep(_POLL_PERIOD_S)
-    return view
+    return live_view
 
 
 def _start_advice(profile: str | None) -> str:
@@ -170,18 +170,19 @@ def _start_advice(profile: str | None) -> str:
     )
 
 
-def _show_view(view: "LiveAddress") -> None:
+def _show_view(live_view: "LiveAddress") -> None:
     """Show a live view in a window until the window is closed."""
     from rigd.live import Viewer
 
     with interrupted_by_end_signals(), scratch_folder() as scratch_path:
-        viewer = Viewer(view, scratch_path)
+        viewer = Viewer(live_view, scratch_path)
         typer.echo(
-            f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
+            f"The live view of {live_view.rig} is shown; close the window, or press Ctrl-C, "
+            "to end.",
             err=True,
         )
         try:
-            exit_code = _follow_servers(viewer, view)
+            exit_code = _follow_servers(viewer, live_view)
         finally:
             viewer.close()
     if exit_code:
@@ -198,19 +199,19 @@ def _follow_servers(viewer: "Viewer", shown: "LiveAddress") -> int:
     view_is_running = True
     while (exit_code := viewer.exit_code) is None:
         time.sleep(_POLL_PERIOD_S)
-        view = next(iter(find_views(shown.rig)), None)
-        if view is not None and view.server != shown.server:
-            if not viewer.connect(view):
+        live_view = next(iter(find_views(shown.rig)), None)
+        if live_view is not None and live_view.server != shown.server:
+            if not viewer.connect(live_view):
                 continue  # tried again in the next round
-            typer.echo(f"The live view of {view.rig} has restarted.", err=True)
-            shown = view
-        elif view is None and view_is_running:
+            typer.echo(f"The live view of {live_view.rig} has restarted.", err=True)
+            shown = live_view
+        elif live_view is None and view_is_running:
             typer.echo(
                 f"The live view of {shown.rig} has ended; the window stays open and shows the next "
                 "one.",
                 err=True,
             )
-        view_is_running = view is not None
+        view_is_running = live_view is not None
     return exit_code
 
 
@@ -315,11 +316,11 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
     """Show a recording in a window until the window is closed."""
     from rigd.live import FileWindow
 
-    with FileWindow(recording, scratch) as window:
+    with FileWindow(recording, scratch) as file_window:
         typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
-        if window.wait():
+        if file_window.wait():
             fail(
-                f"{window.fault} rigd replay {path} --web shows the same in a browser.",
+                f"{file_window.fault} rigd replay {path} --web shows the same in a browser.",
                 EXIT_FAILED,
             )
 

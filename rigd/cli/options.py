@@ -47,7 +47,7 @@ _PROGRESS_DELAY_S = 2.0
 
 
 @contextlib.contextmanager
-def progress(name: str) -> Iterator[Callable[[float], None]]:
+def progress(task_name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress line; yield a function that must be called with the completed fraction.
 
     The line appears after `_PROGRESS_DELAY_S`, on a terminal only.
@@ -59,7 +59,7 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
         def on_progress(fraction: float) -> None:
             nonlocal show_fraction
             if show_fraction is None and time.monotonic() - start_s > _PROGRESS_DELAY_S:
-                show_fraction = exit_stack.enter_context(_progress_line(name))
+                show_fraction = exit_stack.enter_context(_progress_line(task_name))
             if show_fraction is not None:
                 show_fraction(fraction)
 
@@ -67,10 +67,10 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
 
 
 @contextlib.contextmanager
-def _progress_line(name: str) -> Iterator[Callable[[float], None]]:
+def _progress_line(task_name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress line at once; yield a function that receives the completed fraction."""
     with progress_bar() as bar:
-        task_id = bar.add_task(name, total=1.0)
+        task_id = bar.add_task(task_name, total=1.0)
         yield lambda fraction: bar.update(task_id, completed=fraction)
 
 
@@ -191,11 +191,11 @@ def session_notes(
     } | metadata_keys(metadata)
 
 
-def profile_named(name: str) -> "Profile":
+def profile_named(name_or_file: str) -> "Profile":
     """Load a profile by its name or file.
 
     The slow modules of profiles are imported in the function, for a quick start of other commands.
     """
     from rigd.profile import load_profile
 
-    return load_profile(name)
+    return load_profile(name_or_file)

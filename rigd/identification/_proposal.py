@@ -230,19 +230,19 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 
         Number of passes that were omitted before the estimate.
     """
     rig = profile.rig
-    motor = rig.motor
+    rig_motor = rig.motor
     compared_numbers: list[tuple[str, MotorQuantity, float]] = [
-        ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
+        ("motor.inertia_kg_m2", estimate.inertia_kg_m2, rig_motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
             estimate.viscous_nm_s_per_rad,
-            motor.viscous_nm_s_per_rad,
+            rig_motor.viscous_nm_s_per_rad,
         ),
-        ("motor.coulomb_nm", estimate.coulomb_nm, motor.coulomb_nm),
+        ("motor.coulomb_nm", estimate.coulomb_nm, rig_motor.coulomb_nm),
         (
             "motor.rated_torque_nm",
-            _scaled(motor.rated_torque_nm, estimate.torque_scale),
-            motor.rated_torque_nm,
+            _scaled(rig_motor.rated_torque_nm, estimate.torque_scale),
+            rig_motor.rated_torque_nm,
         ),
         ("actuation.delay_s", estimate.actuation_delay_s, rig.actuation.delay_s),
         (
@@ -319,13 +319,13 @@ def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> li
     return operator_notes
 
 
-def _format_with_std(value: float, std: float) -> tuple[str, str]:
+def _format_with_std(estimate_value: float, std: float) -> tuple[str, str]:
     """Format a value and its standard deviation, to two significant digits of the latter."""
     if std <= 0.0:
-        return f"{value:.6g}", "0"
-    exponent = floor(log10(max(abs(value), std)))
+        return f"{estimate_value:.6g}", "0"
+    exponent = floor(log10(max(abs(estimate_value), std)))
     significant_digits = max(0, exponent - floor(log10(std)) + 1)
     if -3 <= exponent < 4:
         decimals = max(0, significant_digits - exponent)
-        return f"{value:.{decimals}f}", f"{std:.2g}"
-    return f"{value:.{significant_digits}e}", f"{std:.2g}"
+        return f"{estimate_value:.{decimals}f}", f"{std:.2g}"
+    return f"{estimate_value:.{significant_digits}e}", f"{std:.2g}"

@@ -461,7 +461,11 @@ def estimate_motor(
     MotorEstimateError
         If there are too few windows, or the fit does not converge.
     """
-    moving_windows = [window for window in windows if _moves_throughout(window, timing.rate_hz)]
+    moving_windows = [
+        pass_readings
+        for pass_readings in windows
+        if _moves_throughout(pass_readings, timing.rate_hz)
+    ]
     repeat_stacks = _group_repeats(moving_windows, len(windows))
     fit = _fit_equation(repeat_stacks, timing, hold_scale=False)
     is_scale_known = (
@@ -507,15 +511,15 @@ def estimate_motor(
     )
 
 
-def _moves_throughout(window: PassReadings, rate_hz: float) -> bool:
+def _moves_throughout(pass_readings: PassReadings, rate_hz: float) -> bool:
     """Return whether the shaft moves in the nominal direction during the whole window."""
     half_ticks = max(1, round(_HALF_SPEED_WINDOW_S * rate_hz))
-    angle_rad = window.angle_rad
+    angle_rad = pass_readings.angle_rad
     speed_rad_s = (
         (angle_rad[2 * half_ticks :] - angle_rad[: -2 * half_ticks]) * rate_hz / (2 * half_ticks)
     )
-    forward_speed_rad_s = speed_rad_s * np.sign(window.speed_rad_s)
-    return bool(np.min(forward_speed_rad_s) > _MIN_SPEED_FRACTION * abs(window.speed_rad_s))
+    forward_speed_rad_s = speed_rad_s * np.sign(pass_readings.speed_rad_s)
+    return bool(np.min(forward_speed_rad_s) > _MIN_SPEED_FRACTION * abs(pass_readings.speed_rad_s))
 
 
 def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_MotionRepeats]:
@@ -524,8 +528,8 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     `window_count` is the number of windows before those with a standstill were removed.
     """
     window_groups: dict[Hashable, list[PassReadings]] = {}
-    for window in windows:
-        window_groups.setdefault(window.key, []).append(window)
+    for pass_readings in windows:
+        window_groups.setdefault(pass_readings.key, []).append(pass_readings)
     complete_groups = [
         repeat_group
         for repeat_group in window_groups.values()
@@ -544,9 +548,9 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
     }
     return [
         _MotionRepeats(
-            np.array([window.angle_rad for window in repeat_group]),
-            np.array([window.torque_command_nm for window in repeat_group]),
-            np.array([window.coupling_torque_nm for window in repeat_group]),
+            np.array([pass_readings.angle_rad for pass_readings in repeat_group]),
+            np.array([pass_readings.torque_command_nm for pass_readings in repeat_group]),
+            np.array([pass_readings.coupling_torque_nm for pass_readings in repeat_group]),
             float(np.sign(repeat_group[0].speed_rad_s)),
             repeat_group[0].top_hz,
             session_indices[repeat_group[0].session],

@@ -363,12 +363,14 @@ def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) 
         offset_rad = next_offset_rad
 
 
-def _multisine_reference(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+def _multisine_reference(
+    schedule: PassSchedule, closed_loop: ClosedLoop, modulation: float
+) -> Real:
     """Return the reference angle in rad of the multisine alone.
 
     The response of the loop to it changes the speed of the passes by the fraction `modulation`.
     """
-    rate_hz = loop.model.rate_hz
+    rate_hz = closed_loop.model.rate_hz
     window_ticks = round(schedule.window_s * rate_hz)
     step_hz = rate_hz / window_ticks
     harmonic_numbers = np.arange(
@@ -387,7 +389,9 @@ def _multisine_reference(schedule: PassSchedule, loop: ClosedLoop, modulation: f
     speed_spectrum *= modulation * schedule.speeds_rad_s[0] / peak_speed
     reference_spectrum = np.zeros_like(speed_spectrum)
     reference_spectrum[harmonic_numbers] = (
-        speed_spectrum[harmonic_numbers] / (2j * pi * frequency_hz) / loop.response(frequency_hz)
+        speed_spectrum[harmonic_numbers]
+        / (2j * pi * frequency_hz)
+        / closed_loop.response(frequency_hz)
     )
     period_rad = np.fft.irfft(reference_spectrum, window_ticks)
 
@@ -418,22 +422,22 @@ def _smooth_rise(x: Real) -> Real:
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
 
-def _peak_torque(loop: ClosedLoop, reference_rad: Real) -> float:
+def _peak_torque(closed_loop: ClosedLoop, reference_rad: Real) -> float:
     """Return the motor's largest predicted torque in N·m for a reference angle in rad."""
-    return float(np.max(np.abs(loop.simulate(reference_rad).torque_nm)))
+    return float(np.max(np.abs(closed_loop.simulate(reference_rad).torque_nm)))
 
 
 def _checked_excitation(
     excitation_name: str,
     schedule: PassSchedule,
     profile: Profile,
-    loop: ClosedLoop,
+    closed_loop: ClosedLoop,
     reference_rad: Real,
     torque_percent: float,
     stroke_rad: float,
 ) -> Excitation:
     """Return the excitation with a reference; raise ExcitationError if its angle is too large."""
-    peak_rad = float(np.max(np.abs(loop.simulate(reference_rad).angle_rad)))
+    peak_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
     if peak_rad > stroke_rad:
         raise ExcitationError(
             f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_rad:.3g} rad; allow "

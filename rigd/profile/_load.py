@@ -67,8 +67,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
     >>> rig.rate_hz, rig.beam.length_m
     (1000.0, 0.98)
     """
-    path = _find_profile(name_or_path)
-    return profile_from_text(read_text(path), path)
+    profile_path = _find_profile(name_or_path)
+    return profile_from_text(read_text(profile_path), profile_path)
 
 
 def read_text(path: Path) -> str:
@@ -85,43 +85,45 @@ def read_text(path: Path) -> str:
         raise ProfileError(f"{path}: {error}.") from error
 
 
-def profile_from_text(text: str, path: Path) -> Profile:
-    """Validate the text of a profile and return the profile; `path` is its file, existing or not.
+def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
+    """Validate a profile's text and return the profile; the file `profile_path` need not exist.
 
     Raises
     ------
     ProfileError
         If the text has mistakes.
     """
-    document = parse_document(text, path)
+    document = parse_document(profile_text, profile_path)
     problems: list[str] = []
-    values, sources = flatten_document(document, problems)
+    profile_values, sources = flatten_document(document, problems)
     absent_sections = {
         section_name
         for section_name in OPTIONAL_SECTIONS
-        if not any(k.startswith(section_name + ".") for k in values)
+        if not any(k.startswith(section_name + ".") for k in profile_values)
     }
     unknown_keys = frozenset(
         key for key, number_source in sources.items() if number_source == UNKNOWN
     )
-    values = validate_values(values, problems, frozenset(absent_sections), unknown_keys)
+    profile_values = validate_values(
+        profile_values, problems, frozenset(absent_sections), unknown_keys
+    )
     if not problems:
-        problems.extend(_find_eds(path, values))
-        problems.extend(diagnostics.contradictions(values))
-        problems.extend(diagnostics.wiring_contradictions(values))
+        problems.extend(_find_eds(profile_path, profile_values))
+        problems.extend(diagnostics.contradictions(profile_values))
+        problems.extend(diagnostics.wiring_contradictions(profile_values))
     if problems:
-        raise problems_error(path, problems)
+        raise problems_error(profile_path, problems)
 
     sections = {
-        section_name: _build_section(section_name, values)
+        section_name: _build_section(section_name, profile_values)
         for section_name in SECTIONS
         if section_name not in absent_sections
     }
     return Profile(
-        name=values["name"],
-        description=values["description"],
-        path=path,
-        text=text,
+        name=profile_values["name"],
+        description=profile_values["description"],
+        path=profile_path,
+        text=profile_text,
         rig=RigParameters(
             rate_hz=sections["rig"].rate_hz,
             beam=sections["beam"].uniform,
@@ -132,7 +134,7 @@ def profile_from_text(text: str, path: Path) -> Profile:
             actuation=sections["actuation"],
             devices=sections["devices"],
             simulation=sections.get("simulation"),
-            name=values["name"],
+            name=profile_values["name"],
             can=sections.get("can"),
             acquisition=sections.get("acquisition"),
             cia402=sections.get("cia402"),
@@ -204,13 +206,13 @@ def _known_profiles_text() -> str:
     )
 
 
-def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
-    """Make the drive's EDS path in `values` absolute; yield a message if there is no file."""
-    eds_name = values.get("cia402.eds")
+def _find_eds(profile_path: Path, values_by_key: dict[str, Any]) -> Iterator[str]:
+    """Make the drive's EDS path in the values absolute; yield a message if there is no file."""
+    eds_name = values_by_key.get("cia402.eds")
     if not eds_name:
         return
-    eds = path.resolve().parent / eds_name
-    values["cia402.eds"] = str(eds)
+    eds = profile_path.resolve().parent / eds_name
+    values_by_key["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
             f'cia402.eds = "{eds_name}": there is no file {eds}; give its path, relative to the '
@@ -226,20 +228,20 @@ def flatten_document(
     An origin is what the key ``source`` of a number states. A message for each missing or invalid
     one is appended to `problems`.
     """
-    values: dict[str, Any] = {}
+    values_by_key: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for key, entry in _dotted_entries(document, ""):
         if not isinstance(entry, dict):
-            values[key] = entry
+            values_by_key[key] = entry
             if _is_number(key):
                 problems.append(diagnostics.bare_number_message(key, entry))
             continue
         number_source = entry.get("source")
         if number_source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
             sources[key] = number_source
-            values[key] = math.nan
+            values_by_key[key] = math.nan
             continue
-        values[key] = entry.get("value")
+        values_by_key[key] = entry.get("value")
         if number_source == UNKNOWN:
             problems.append(diagnostics.invalid_unknown_message(key, entry))
         elif number_source in SOURCES:
@@ -250,7 +252,7 @@ def flatten_document(
             f"{key} has the unknown part '{other_keys}'; only value and source go there."
             for other_keys in sorted(entry.keys() - {"value", "source"})
         )
-    return values, sources
+    return values_by_key, sources
 
 
 def _is_number(key: str) -> bool:
@@ -274,7 +276,7 @@ def _dotted_entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str
 
 
 def validate_values(
-    values: Mapping[str, Any],
+    values_by_key: Mapping[str, Any],
     problems: list[str],
     absent_sections: frozenset[str],
     unknown_keys: frozenset[str] = frozenset(),
@@ -283,7 +285,7 @@ def validate_values(
 
     Parameters
     ----------
-    values
+    values_by_key
         Values of the file by dotted keys.
     problems
         List to which a message for each problem is appended.
@@ -293,7 +295,7 @@ def validate_values(
         Keys whose value is unknown; their NaN is not checked.
     """
     # TOML has only arrays, and strict validation requires tuples.
-    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values_by_key.items()}
     try:
         known_values = {
             key: key_value for key, key_value in tuple_values.items() if key not in unknown_keys
@@ -337,6 +339,8 @@ def _validation_model(
     return create_model("Profile", __config__=model_config, **field_definitions)
 
 
-def _build_section(sections: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def _build_section(section_name: str, values_by_key: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the dataclass of a section with its validated values."""
-    return SECTIONS[sections](**{field: values[key] for key, field in section_fields(sections)})
+    return SECTIONS[section_name](
+        **{field_name: values_by_key[key] for key, field_name in section_fields(section_name)}
+    )

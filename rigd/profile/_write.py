@@ -179,7 +179,7 @@ def _exists_error(path: Path) -> ProfileError:
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
-def _line_indices(lines: Sequence[str]) -> dict[str, int]:
+def _line_indices(text_lines: Sequence[str]) -> dict[str, int]:
     """Return the index of the line of each section and each key of a profile.
 
     If a key occurs only in a comment, it is the index of the comment.
@@ -187,7 +187,7 @@ def _line_indices(lines: Sequence[str]) -> dict[str, int]:
     index_by_key: dict[str, int] = {}
     value_text: dict[str, int] = {}
     section = ""
-    for line_index, text_line in enumerate(lines):
+    for line_index, text_line in enumerate(text_lines):
         if section_title := re.match(r"\[([^\]]+)\]", text_line):
             index_by_key[section_title[1]] = line_index
             section = section_title[1] + "."
@@ -198,9 +198,9 @@ def _line_indices(lines: Sequence[str]) -> dict[str, int]:
     return value_text | index_by_key
 
 
-def _comment_lines(text: str) -> list[str]:
+def _comment_lines(comment: str) -> list[str]:
     """Return a text as lines of a profile's comment, wrapped and each with "# "."""
-    return textwrap.wrap(text, _COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
+    return textwrap.wrap(comment, _COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
 def _setting_line(setting: Setting) -> str:

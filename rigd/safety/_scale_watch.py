@@ -57,9 +57,9 @@ class ScaleWatch:
 
     __slots__ = ("_inertia_kg_m2", "_limit", "_moments", "_windows")
 
-    def __init__(self, inertia_kg_m2: float, limit: float) -> None:
+    def __init__(self, inertia_kg_m2: float, ratio_limit: float) -> None:
         self._inertia_kg_m2 = inertia_kg_m2
-        self._limit = limit
+        self._limit = ratio_limit
         self.reset()
 
     def reset(self) -> None:

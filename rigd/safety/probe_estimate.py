@@ -98,25 +98,25 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     ProbeEstimate
         Ratios of the measured values to those of the profile, and friction.
     """
-    angle = np.array(move.angles_rad)
+    angle_rad = np.array(move.angles_rad)
     smoothing_window = _smoothing_window(rig.rate_hz)
-    if angle.size < smoothing_window.size + _MIN_SAMPLES:
-        return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle)), speed_rad_s=0.0)
+    if angle_rad.size < smoothing_window.size + _MIN_SAMPLES:
+        return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle_rad)), speed_rad_s=0.0)
 
     def smooth(signal: Real) -> Real:
         return np.convolve(signal, smoothing_window, "valid")
 
-    speed = np.gradient(smooth(angle)) * rig.rate_hz
-    acceleration = np.gradient(speed) * rig.rate_hz
-    max_speed = float(np.max(np.abs(speed)))
+    speed_rad_s = np.gradient(smooth(angle_rad)) * rig.rate_hz
+    acceleration = np.gradient(speed_rad_s) * rig.rate_hz
+    max_speed = float(np.max(np.abs(speed_rad_s)))
     coupling_ratio, ratio_std, beam_nm = _coupling_ratio(
-        rig, angle, smooth(np.array(move.coupling_nm)), smoothing_window
+        rig, angle_rad, smooth(np.array(move.coupling_nm)), smoothing_window
     )
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
-    command_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle.size]
-    is_moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
+    command_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle_rad.size]
+    is_moving: NDArray[np.bool_] = np.abs(speed_rad_s) > _MIN_SPEED_FRACTION * max_speed
     motor_fit = _fit_motor_equation(
-        smooth(command_nm), acceleration, speed, beam_nm, is_moving, smoothing_window.size
+        smooth(command_nm), acceleration, speed_rad_s, beam_nm, is_moving, smoothing_window.size
     )
     torque_scale, scale_std, inertia, inertia_std, coulomb_nm, viscous_nm_s_per_rad = motor_fit
     if coupling_ratio and ratio_std and torque_scale and scale_std and inertia and inertia_std:
@@ -133,7 +133,7 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
         None if inertia_std is None else inertia_std / rig.inertia_kg_m2,
         coulomb_nm,
         viscous_nm_s_per_rad,
-        float(np.ptp(angle)),
+        float(np.ptp(angle_rad)),
         max_speed,
     )
 
@@ -182,9 +182,9 @@ def _coupling_ratio(
     return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
 
 
-def _samples_per_independent_one(window: Real) -> float:
+def _samples_per_independent_one(smoothing_window: Real) -> float:
     """Return how many smoothed samples carry the information of one independent sample."""
-    return 1.0 / float(window @ window)
+    return 1.0 / float(smoothing_window @ smoothing_window)
 
 
 def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
@@ -217,7 +217,7 @@ def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
 def _fit_motor_equation(
     command_nm: Real,
     acceleration: Real,
-    speed: Real,
+    speed_rad_s: Real,
     beam_nm: Real,
     is_moving: NDArray[np.bool_],
     window_ticks: float,
@@ -227,7 +227,9 @@ def _fit_motor_equation(
     Returns the torque scale and its standard deviation, the inertia and its standard deviation,
     Coulomb and viscous friction. All are None if they cannot be estimated.
     """
-    equation_columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[is_moving]
+    equation_columns = np.stack([beam_nm, acceleration, np.sign(speed_rad_s), speed_rad_s], axis=1)[
+        is_moving
+    ]
     column_norms = np.linalg.norm(equation_columns, axis=0)
     if len(equation_columns) < 2 * _MIN_SAMPLES or not column_norms.all():
         return (None,) * 6
@@ -284,7 +286,7 @@ def contradiction(
     """
     description = _motion_contradiction(rig, end)
     if not description and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
-        description = _coupling_contradiction(estimate, motor=motor)
+        description = _coupling_contradiction(estimate, tells_motor=motor)
     if not description and motor:
         description = _motor_contradiction(estimate)
     if not description and end is ProbeEnd.AWAY and motor:
@@ -346,7 +348,7 @@ def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
     return ""
 
 
-def _coupling_contradiction(estimate: ProbeEstimate, *, motor: bool) -> str:
+def _coupling_contradiction(estimate: ProbeEstimate, *, tells_motor: bool) -> str:
     """Describe a coupling torque that contradicts the profile's beam, or return ""."""
     coupling_ratio, std = estimate.coupling_ratio, estimate.coupling_std
     if coupling_ratio is None or std is None:
@@ -354,7 +356,7 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, motor: bool) -> str:
             f"the coupling torque is not the beam's at the measured angle ({_COUPLING_RATIO_KEYS})."
         )
     if abs(coupling_ratio) < _NO_TORQUE_RATIO:
-        if not motor:
+        if not tells_motor:
             return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
             f"the coupling torque is {coupling_ratio:.2f} times that of the profile's beam "
@@ -362,7 +364,7 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, motor: bool) -> str:
             "angle. Check that the antenna is mounted and the sensor works, and "
             "encoder.resolution_rad."
         )
-    if not motor and 0.0 < coupling_ratio < 1.0:
+    if not tells_motor and 0.0 < coupling_ratio < 1.0:
         return ""  # the shaft moves less than the encoder shows: its bounds hold
     ratio_text = f"{coupling_ratio:.2g} ± {std:.1g}"
     if coupling_ratio < 0.0:
@@ -421,6 +423,8 @@ def _motor_contradiction(estimate: ProbeEstimate) -> str:
     return ""
 
 
-def _is_same_ratio(first: float, second: float) -> bool:
+def _is_same_ratio(first_ratio: float, second_ratio: float) -> bool:
     """Return whether two ratios are positive and differ by less than `_SAME_RATIO_FACTOR`."""
-    return first > 0.0 < second and abs(log(first / second)) < log(_SAME_RATIO_FACTOR)
+    return first_ratio > 0.0 < second_ratio and abs(log(first_ratio / second_ratio)) < log(
+        _SAME_RATIO_FACTOR
+    )

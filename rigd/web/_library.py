@@ -124,10 +124,10 @@ class Library:
             _whole_number(request.query.get(filter_name, str(default_number)), filter_name)
             for filter_name, default_number in (("limit", _DEFAULT_ROWS), ("offset", 0))
         )
-        rows = await self.rows(**filters)
-        shown_rows = rows[first_row : first_row + min(row_limit, _MAX_ROWS)]
+        session_rows = await self.rows(**filters)
+        shown_rows = session_rows[first_row : first_row + min(row_limit, _MAX_ROWS)]
         return web.json_response(
-            {"total": len(rows), "sessions": [row.as_dict() for row in shown_rows]}
+            {"total": len(session_rows), "sessions": [row.as_dict() for row in shown_rows]}
         )
 
     async def _send_quick_look(self, request: web.Request) -> web.Response:
@@ -267,11 +267,11 @@ class Library:
 
     def _unused_folder(self, folder_name: str) -> Path:
         """Return the path of a new folder that no queued campaign will create either."""
-        folder_number, path = 1, self._folder / folder_name
-        while path.exists() or _campaign_url_path(path) in self._jobs.addresses:
+        folder_number, folder_path = 1, self._folder / folder_name
+        while folder_path.exists() or _campaign_url_path(folder_path) in self._jobs.addresses:
             folder_number += 1
-            path = self._folder / f"{folder_name}-{folder_number}"
-        return path
+            folder_path = self._folder / f"{folder_name}-{folder_number}"
+        return folder_path
 
     # Names
 
@@ -287,10 +287,10 @@ class Library:
         HTTPNotFound
             If the folder has no regular file of that name.
         """
-        path = self._path_in_folder(f"{session_name}.mcap")
-        if not path.is_file():
+        session_file = self._path_in_folder(f"{session_name}.mcap")
+        if not session_file.is_file():
             raise web.HTTPNotFound(reason="There is no such session.")
-        return path
+        return session_file
 
     def _path_in_folder(self, file_name: str) -> Path:
         """Return the path of a file or folder in the sessions' folder by its name.

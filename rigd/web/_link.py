@@ -123,11 +123,11 @@ class DaemonLink:
                 self._release_control()
             try:
                 if self._control_connection is None:
-                    reply = await self._send_on_new_connection(request)
+                    daemon_reply = await self._send_on_new_connection(request)
                 else:
-                    reply = await _send_and_receive(self._control_connection, request)
-                if request.get("command") == "start" and reply.get("ok"):
-                    self._controlled_series = reply["series"]
+                    daemon_reply = await _send_and_receive(self._control_connection, request)
+                if request.get("command") == "start" and daemon_reply.get("ok"):
+                    self._controlled_series = daemon_reply["series"]
             except DaemonError:
                 # Not sent again, because it may have been executed.
                 self._release_control()
@@ -135,7 +135,7 @@ class DaemonLink:
             finally:
                 if self._controlled_series <= self._last_ended_series:
                     self._release_control()
-            return reply
+            return daemon_reply
 
     async def _send_on_new_connection(self, request: Document) -> Document:
         """Send a request on a new connection, and return the reply.
@@ -153,20 +153,20 @@ class DaemonLink:
             try:
                 if self._stop_count != stop_count and request.get("command") != "predict":
                     raise BusyError("It was stopped before it began.")
-                reply = await _send_and_receive(connection, request)
-                if request.get("command") == "start" and reply.get("ok"):
+                daemon_reply = await _send_and_receive(connection, request)
+                if request.get("command") == "start" and daemon_reply.get("ok"):
                     self._control_connection = connection
             finally:
                 if self._control_connection is not connection:
                     connection[1].close()
-            if not reply.get("crowded"):
+            if not daemon_reply.get("crowded"):
                 break
-        return reply
+        return daemon_reply
 
     async def _connect(self) -> _Connection:
         """Open a connection to the daemon's socket."""
-        connecting = asyncio.open_unix_connection(self._path, limit=_MAX_LINE_BYTES)
-        return await asyncio.wait_for(connecting, _CONNECT_TIMEOUT_S)
+        opening_task = asyncio.open_unix_connection(self._path, limit=_MAX_LINE_BYTES)
+        return await asyncio.wait_for(opening_task, _CONNECT_TIMEOUT_S)
 
     async def _receive_messages(self) -> None:
         """Receive the messages of one connection until it ends."""

@@ -171,17 +171,19 @@ class OperatorPageServer:
             )
         try:
             if command == "stop":
-                reply = await self._stop()
+                daemon_reply = await self._stop()
             else:
-                reply = await self._link.send_request(request_object)
+                daemon_reply = await self._link.send_request(request_object)
         except (DaemonError, DaemonGoneError) as error:
             return refusal_response(503, str(error))
         except (BusyError, RefusedByDaemonError) as error:
             return refusal_response(409, str(error))
         finally:
             self._link.request_status()
-        http_status = 200 if reply.get("ok") else 400 if reply.get("wrong_use") else 409
-        return web.json_response(reply, status=http_status)
+        http_status = (
+            200 if daemon_reply.get("ok") else 400 if daemon_reply.get("wrong_use") else 409
+        )
+        return web.json_response(daemon_reply, status=http_status)
 
     async def _stop(self) -> Document:
         """Stop the daemon's session, if necessary by a signal, and return the reply."""
@@ -240,7 +242,7 @@ class OperatorPageServer:
         self._session = session_path
         self.pages.send(self._status)
 
-    def _prepare_session(self, path: str, session_series: Document) -> None:
+    def _prepare_session(self, session_path: str, session_series: Document) -> None:
         """Prepare the frequency responses that the pages show during a new session."""
         session_plan, rate_hz = session_series["plan"], self._job["rate_hz"]
         self._nominal_response = self._nominal_message(session_plan)
@@ -250,7 +252,7 @@ class OperatorPageServer:
         if session_series["excitation"] != "hold":
             self._response = SessionResponse(
                 Subject(
-                    Path(path).stem,
+                    Path(session_path).stem,
                     rate_hz,
                     round(session_plan["record_s"] * rate_hz),
                     (sweep_begin, sweep_end),
@@ -263,7 +265,7 @@ class OperatorPageServer:
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen_name = str(session_series["notes"].get("specimen", ""))
-        self._start_search(self._find_last(specimen_name, Path(path).stem))
+        self._start_search(self._find_last(specimen_name, Path(session_path).stem))
 
     def _nominal_message(self, beam_document: Document) -> Document:
         """Return the message with the nominal frequency response of a job's or plan's beam."""

@@ -90,20 +90,20 @@ class SignalEnvelopes:
         self._next_tick = 0
         """Tick that is expected next."""
 
-    def feed(self, block: PageSignalBlock) -> Document | None:
+    def feed(self, signal_block: PageSignalBlock) -> Document | None:
         """Add a block; return the message with the envelope points it completes, or None."""
-        ticks_per_point = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
-        signal_values = block.values
-        missing_ticks = block.first_tick - self._next_tick
-        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * block.rate_hz:
+        ticks_per_point = max(1, round(ENVELOPE_POINT_S * signal_block.rate_hz))
+        signal_values = signal_block.values
+        missing_ticks = signal_block.first_tick - self._next_tick
+        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * signal_block.rate_hz:
             self._points.clear()
-            self._next_point = block.first_tick // ticks_per_point
+            self._next_point = signal_block.first_tick // ticks_per_point
             self._incomplete_point = []
-            missing_ticks = block.first_tick - self._next_point * ticks_per_point
+            missing_ticks = signal_block.first_tick - self._next_point * ticks_per_point
         if missing_ticks:
             self._incomplete_point.append(np.full((3, missing_ticks), np.nan))
         self._incomplete_point.append(signal_values)
-        self._next_tick = block.first_tick + signal_values.shape[1]
+        self._next_tick = signal_block.first_tick + signal_values.shape[1]
         pending_values = np.concatenate(self._incomplete_point, axis=1)
         point_count = pending_values.shape[1] // ticks_per_point
         self._incomplete_point = [pending_values[:, point_count * ticks_per_point :]]
@@ -136,14 +136,14 @@ def _envelope_message(first_index: int, points: list[tuple[float | None, ...]]) 
         *("angle_min", "angle_max", "reference_min", "reference_max"),
         *("torque_min", "torque_max"),
     )
-    columns = zip(*points, strict=True)
+    point_columns = zip(*points, strict=True)
     return {
         "type": "strip",
         "t0_s": round(first_index * ENVELOPE_POINT_S, 3),
         "dt_s": ENVELOPE_POINT_S,
         **{
             column_name: list(column_values)
-            for column_name, column_values in zip(column_names, columns, strict=True)
+            for column_name, column_values in zip(column_names, point_columns, strict=True)
         },
     }
 
@@ -173,9 +173,9 @@ class SessionResponse:
         self._has_new_data = False
         self._reached_hz = 0.0
 
-    def feed(self, block: PageSignalBlock) -> None:
+    def feed(self, signal_block: PageSignalBlock) -> None:
         """Add a block of signals; its unknown values are ignored."""
-        self._queued_blocks.append(block)
+        self._queued_blocks.append(signal_block)
         if len(self._queued_blocks) >= _BLOCKS_PER_UPDATE:
             self._feed_sweep()
 
