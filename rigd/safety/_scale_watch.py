@@ -51,7 +51,7 @@ class ScaleWatch:
     ----------
     inertia_kg_m2
         Inertia of the motor.
-    limit
+    ratio_limit
         Ratio, or inverse ratio, above which there is a fault; infinite to check nothing.
     """
 

@@ -286,7 +286,7 @@ def contradiction(
     """
     description = _motion_contradiction(rig, end)
     if not description and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
-        description = _coupling_contradiction(estimate, tells_motor=motor)
+        description = _coupling_contradiction(estimate, with_motor=motor)
     if not description and motor:
         description = _motor_contradiction(estimate)
     if not description and end is ProbeEnd.AWAY and motor:
@@ -348,7 +348,7 @@ def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
     return ""
 
 
-def _coupling_contradiction(estimate: ProbeEstimate, *, tells_motor: bool) -> str:
+def _coupling_contradiction(estimate: ProbeEstimate, *, with_motor: bool) -> str:
     """Describe a coupling torque that contradicts the profile's beam, or return ""."""
     coupling_ratio, std = estimate.coupling_ratio, estimate.coupling_std
     if coupling_ratio is None or std is None:
@@ -356,7 +356,7 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, tells_motor: bool) -> st
             f"the coupling torque is not the beam's at the measured angle ({_COUPLING_RATIO_KEYS})."
         )
     if abs(coupling_ratio) < _NO_TORQUE_RATIO:
-        if not tells_motor:
+        if not with_motor:
             return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
             f"the coupling torque is {coupling_ratio:.2f} times that of the profile's beam "
@@ -364,7 +364,7 @@ def _coupling_contradiction(estimate: ProbeEstimate, *, tells_motor: bool) -> st
             "angle. Check that the antenna is mounted and the sensor works, and "
             "encoder.resolution_rad."
         )
-    if not tells_motor and 0.0 < coupling_ratio < 1.0:
+    if not with_motor and 0.0 < coupling_ratio < 1.0:
         return ""  # the shaft moves less than the encoder shows: its bounds hold
     ratio_text = f"{coupling_ratio:.2g} ± {std:.1g}"
     if coupling_ratio < 0.0:
