@@ -114,7 +114,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         "with" if live else "without",
         RATE_HZ,
         samples,
-        scheduled=excitation.reference_rad.size,
+        scheduled_ticks=excitation.reference_rad.size,
         cpu_percent=None,
         page_faults=None,
     )

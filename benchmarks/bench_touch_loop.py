@@ -82,7 +82,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         name,
         RATE_HZ,
         samples,
-        scheduled=excitation.reference_rad.size,
+        scheduled_ticks=excitation.reference_rad.size,
         cpu_percent=meter.cpu_percent,
         page_faults=meter.page_faults,
     )

@@ -48,8 +48,8 @@ def read_text(path: Path, most_bytes: int = MAX_TOML_BYTES) -> str:
         If the file cannot be read, is not a regular file, is too large, or is not text.
     """
     try:
-        with open_plain_file(path, most_bytes) as file:
-            return decode_text(file.buffer.read())
+        with open_plain_file(path, most_bytes) as text_file:
+            return decode_text(text_file.buffer.read())
     except OSError as error:
         raise DocumentError(f"cannot be read ({error.strerror})") from error
     except UnicodeDecodeError as error:
@@ -72,7 +72,7 @@ def parse_toml(text: str) -> dict[str, Any]:
     """
     if len(text) > MAX_TOML_BYTES:
         raise DocumentError(f"has more than {MAX_TOML_BYTES} characters; shorten it")
-    if any(len(line) > _MAX_LINE_CHARACTERS for line in text.splitlines()):
+    if any(len(message_line) > _MAX_LINE_CHARACTERS for message_line in text.splitlines()):
         raise DocumentError(
             f"has a line of more than {_MAX_LINE_CHARACTERS} characters; shorten it"
         )
@@ -103,9 +103,9 @@ def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN
     DocumentError
         If the file cannot be read, is not a regular file, is too large, or is not JSON.
     """
-    text = read_text(path, most_bytes)
+    json_text = read_text(path, most_bytes)
     try:
-        return json.loads(text)
+        return json.loads(json_text)
     except RecursionError as error:
         raise DocumentError("is not a JSON document: it is nested too deeply") from error
     except ValueError as error:
@@ -114,14 +114,14 @@ def read_json(path: Path, most_bytes: int = MAX_JSON_BYTES) -> Any:  # noqa: ANN
 
 def _require_small_document(document: Mapping[str, Any]) -> None:
     """Raise DocumentError if a document has too many entries or is nested too deeply."""
-    entries = 0
-    level: list[Any] = [document]
+    entry_count = 0
+    nesting_level: list[Any] = [document]
     for _ in range(_MAX_DEPTH):
-        level = [each for parent in level for each in _children(parent)]
-        entries += len(level)
-        if entries > _MAX_ENTRIES:
+        nesting_level = [child for parent in nesting_level for child in _children(parent)]
+        entry_count += len(nesting_level)
+        if entry_count > _MAX_ENTRIES:
             raise DocumentError(f"has more than {_MAX_ENTRIES} keys and numbers; shorten it")
-    if any(_children(each) for each in level):
+    if any(_children(child) for child in nesting_level):
         raise DocumentError(f"has tables nested deeper than {_MAX_DEPTH} levels; flatten it")
 
 

@@ -183,23 +183,23 @@ class IdentifiedBeam:
             self.stiffness_offsets,
         )
 
-    def pole_uncertainty(self, modes: int) -> tuple[float, ...]:
+    def pole_uncertainty(self, mode_count: int) -> tuple[float, ...]:
         """Return the relative standard uncertainty of the poles of the first modes.
 
         Parameters
         ----------
-        modes
+        mode_count
             Number of modes, from the first on. For a mode that is not in the document it is the
             largest uncertainty of the modes in the document.
         """
-        from_density = (
+        density_uncertainty = (
             0.5 * self.std.get(_REQUIRED_PARAMETERS[0], 0.0) / self.beam.density_over_stiffness
         )
-        other_modes = max(self.mode_uncertainty, default=from_density)
-        return (*self.mode_uncertainty, *(other_modes,) * modes)[:modes]
+        largest_uncertainty = max(self.mode_uncertainty, default=density_uncertainty)
+        return (*self.mode_uncertainty, *(largest_uncertainty,) * mode_count)[:mode_count]
 
 
-def read_identified_beam(path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
+def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
     It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
@@ -209,7 +209,7 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
 
     Parameters
     ----------
-    path
+    document_path
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
     length_m
@@ -228,111 +228,126 @@ def read_identified_beam(path: str | Path, length_m: float, use: Use) -> Identif
         If the file cannot be read or lacks parameters, if it has an effect or a finding that this
         use does not take into account, or if a required number is flagged.
     """
-    path = Path(path)
-    label, headline, refused = _read_headline(path)
-    if refused and not use.modes:
+    document_path = Path(document_path)
+    headline_label, headline, refusal = _read_headline(document_path)
+    if refusal and not use.modes:
         raise IdentifiedBeamError(
-            f"{label}.validity.uniform_beam: {refused}, and {use.name} relies on a uniform beam; "
+            f"{headline_label}.validity.uniform_beam: {refusal}, and {use.name} relies on a "
+            "uniform beam; "
             "remove what makes it differ (a mass, a soft clamp, an axis that is not plumb), and "
             "record and analyze again, or leave out --model."
         )
-    _require_known_findings(label, headline.get("named"), use)
-    source = headline
-    if not refused and isinstance(exact := headline.get("exact_geometry"), dict):
-        label, source = f"{label}.exact_geometry", exact
-    parameters = source.get("parameters")
+    _require_known_findings(headline_label, headline.get("named"), use)
+    parameter_object = headline
+    if not refusal and isinstance(exact_geometry := headline.get("exact_geometry"), dict):
+        headline_label, parameter_object = f"{headline_label}.exact_geometry", exact_geometry
+    parameters = parameter_object.get("parameters")
     if not isinstance(parameters, dict):
-        raise IdentifiedBeamError(f"{label}.parameters is missing; {_ADVICE}.")
-    values = parameter_values(label, parameters)
-    if refused:
+        raise IdentifiedBeamError(f"{headline_label}.parameters is missing; {_ADVICE}.")
+    values_by_name = parameter_values(headline_label, parameters)
+    if refusal:
         # Effective values of a uniform beam do not describe the rig: the modes replace them.
-        values = {
+        values_by_name = {
             n: v
-            for n, v in values.items()
+            for n, v in values_by_name.items()
             if _parameter_key(n) not in (_OFFSET_PREFIX, *_END_PARAMETERS)
         }
-    _require_known_effects(label, values, use)
+    _require_known_effects(headline_label, values_by_name, use)
     std = {}
-    for name in values:
-        deviation = (
-            _standard_deviation(parameters[name])
-            if refused
-            else _required_deviation(label, name, parameters[name], use)
+    for parameter_name in values_by_name:
+        parameter_std = (
+            _standard_deviation(parameters[parameter_name])
+            if refusal
+            else _required_deviation(
+                headline_label, parameter_name, parameters[parameter_name], use
+            )
         )
-        if deviation is not None:
-            std[name] = deviation
-    density_over_stiffness, stiffness = (values[name] for name in _REQUIRED_PARAMETERS)
-    identified = IdentifiedBeam(
-        beam=Beam(length_m, density_over_stiffness * stiffness, stiffness),
+        if parameter_std is not None:
+            std[parameter_name] = parameter_std
+    density_over_stiffness, stiffness_n_m2 = (
+        values_by_name[parameter_name] for parameter_name in _REQUIRED_PARAMETERS
+    )
+    identified_beam = IdentifiedBeam(
+        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
         damping=Damping(
-            zeta=values.get("zeta", 0.0),
-            alpha=values.get("alpha", 1.0),
-            gamma=values.get("gamma", 0.0),
-            lambda_=values.get("lambda", 1.0),
+            zeta=values_by_name.get("zeta", 0.0),
+            alpha=values_by_name.get("alpha", 1.0),
+            gamma=values_by_name.get("gamma", 0.0),
+            lambda_=values_by_name.get("lambda", 1.0),
         ),
-        tool_inertia_kg_m2=values.get("tool_inertia_kg_m2"),
-        delay_s=values.get("delay_s"),
+        tool_inertia_kg_m2=values_by_name.get("tool_inertia_kg_m2"),
+        delay_s=values_by_name.get("delay_s"),
         std=std,
-        tip_mass_kg=values.get("tip_mass_kg", 0.0),
-        root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_stiffness_offsets(label, values),
-        mode_uncertainty=_mode_uncertainty(label, source.get("modes")),
+        tip_mass_kg=values_by_name.get("tip_mass_kg", 0.0),
+        root_compliance_rad_per_nm=values_by_name.get("root_compliance_rad_per_nm", 0.0),
+        stiffness_offsets=_stiffness_offsets(headline_label, values_by_name),
+        mode_uncertainty=_mode_uncertainty(headline_label, parameter_object.get("modes")),
     )
     return (
-        _with_observed_modes(label, identified, headline.get("modes"), refused)
-        if refused
-        else identified
+        _with_observed_modes(headline_label, identified_beam, headline.get("modes"), refusal)
+        if refusal
+        else identified_beam
     )
 
 
 def _with_observed_modes(
-    label: str, found: IdentifiedBeam, modes: object, refused: str
+    label: str, identified_beam: IdentifiedBeam, modes: object, refusal: str
 ) -> IdentifiedBeam:
     """Return the beam after its modes are replaced by the observed ones.
 
     Stiffness offsets give it the observed frequencies, and its inertia follows from the first
-    mode's participation. `refused` is the reason why no uniform beam can be used.
+    mode's participation. `refusal` is the reason why no uniform beam can be used.
     """
-    observed: list[tuple[float, float, float | None]] = []
+    observed_modes: list[tuple[float, float, float | None]] = []
     for entry in modes if isinstance(modes, list) else []:
         if not isinstance(entry, dict) or not entry.get("shown", True):
             break
-        quantities = [entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")]
-        hz, ratio, inertia = (
-            finite_number(each.get("value")) if isinstance(each, dict) else None
-            for each in quantities
+        mode_quantities = [
+            entry.get(key) for key in ("frequency_hz", "damping_ratio", "participation")
+        ]
+        hz, damping_ratio, mode_inertia = (
+            finite_number(quantity_name.get("value")) if isinstance(quantity_name, dict) else None
+            for quantity_name in mode_quantities
         )
-        flags = [each.get("flag") for each in quantities if isinstance(each, dict)]
-        if not hz or not ratio or hz < 0 or any(flags):
+        quantity_flags = [
+            quantity_name.get("flag")
+            for quantity_name in mode_quantities
+            if isinstance(quantity_name, dict)
+        ]
+        if not hz or not damping_ratio or hz < 0 or any(quantity_flags):
             break
-        observed.append((hz, ratio, inertia))
-    if not observed:
+        observed_modes.append((hz, damping_ratio, mode_inertia))
+    if not observed_modes:
         raise IdentifiedBeamError(
-            f"{label}.modes: {refused}, and no mode is shown without a flag that could take its "
+            f"{label}.modes: {refusal}, and no mode is shown without a flag that could take its "
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        offset_beam = found.loaded_beam.with_frequencies([hz for hz, _, _ in observed])
+        offset_beam = identified_beam.loaded_beam.with_frequencies(
+            [hz for hz, _, _ in observed_modes]
+        )
     except ValueError as error:
         raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
-    beam, inertia = offset_beam.beam, observed[0][2]
-    if inertia and inertia > 0:
-        scale = inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
+    beam, mode_inertia = offset_beam.beam, observed_modes[0][2]
+    if mode_inertia and mode_inertia > 0:
+        mass_scale = mode_inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
             beam,
-            density_kg_per_m=scale * beam.density_kg_per_m,
-            bending_stiffness_n_m2=scale * beam.bending_stiffness_n_m2,
+            density_kg_per_m=mass_scale * beam.density_kg_per_m,
+            bending_stiffness_n_m2=mass_scale * beam.bending_stiffness_n_m2,
         )
-    found = replace(found, beam=beam, stiffness_offsets=offset_beam.stiffness_offsets)
-    poles = found.loaded_beam.poles(clamped_free_eigenvalues(len(observed)))[:, 0]
+    identified_beam = replace(
+        identified_beam, beam=beam, stiffness_offsets=offset_beam.stiffness_offsets
+    )
+    poles = identified_beam.loaded_beam.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
-    uncertainty = (
-        hypot(parameter_std, abs(ratio + pole.real / abs(pole)))
-        for parameter_std, (_, ratio, _), pole in zip(
-            found.mode_uncertainty, observed, poles, strict=False
+    pole_uncertainties = (
+        hypot(parameter_std, abs(damping_ratio + pole.real / abs(pole)))
+        for parameter_std, (_, damping_ratio, _), pole in zip(
+            identified_beam.mode_uncertainty, observed_modes, poles, strict=False
         )
     )
-    return replace(found, mode_uncertainty=tuple(uncertainty))
+    return replace(identified_beam, mode_uncertainty=tuple(pole_uncertainties))
 
 
 def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
@@ -392,18 +407,28 @@ def select_headline(path: Path, document: object) -> tuple[str, Mapping[str, Any
     headlines = document.get("headlines") if isinstance(document, dict) else None
     if not isinstance(headlines, list):
         headlines = []
-    numbered_headlines = [(k, each) for k, each in enumerate(headlines) if isinstance(each, dict)]
-    pooled = [(k, each) for k, each in numbered_headlines if each.get("file", "") is None]
-    index, headline = next(iter(pooled + numbered_headlines), (0, {}))
+    numbered_headlines = [
+        (k, headline_entry)
+        for k, headline_entry in enumerate(headlines)
+        if isinstance(headline_entry, dict)
+    ]
+    pooled_headlines = [
+        (k, headline_entry)
+        for k, headline_entry in numbered_headlines
+        if headline_entry.get("file", "") is None
+    ]
+    headline_index, headline = next(iter(pooled_headlines + numbered_headlines), (0, {}))
     if not isinstance(headline.get("parameters"), dict):
         raise IdentifiedBeamError(f"{path}: has no headlines[0].parameters; {_ADVICE}.")
-    return f"{path}: headlines[{index}]", headline
+    return f"{path}: headlines[{headline_index}]", headline
 
 
 def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
     """Return why a uniform beam does not predict the modes of a record, or "" if it may."""
-    validity = headline.get("validity")
-    uniform_beam_test = validity.get("uniform_beam") if isinstance(validity, dict) else None
+    model_validity = headline.get("validity")
+    uniform_beam_test = (
+        model_validity.get("uniform_beam") if isinstance(model_validity, dict) else None
+    )
     if not isinstance(uniform_beam_test, dict) or uniform_beam_test.get("status") != "refused":
         return ""
     p_value = finite_number(uniform_beam_test.get("p_value"))
@@ -411,29 +436,33 @@ def _uniform_beam_refusal(headline: Mapping[str, Any]) -> str:
     return f"a uniform beam does not predict the modes that the record shows{p}"
 
 
-def parameter_values(label: str, parameters: Mapping[str, Any]) -> dict[str, float]:
+def parameter_values(label: str, parameter_entries: Mapping[str, Any]) -> dict[str, float]:
     """Return the values of a headline's parameters, after a check of their ranges.
 
     Parameters
     ----------
     label
         Name of the headline in messages.
-    parameters
-        Object ``parameters`` of the headline.
+    parameter_entries
+        Object ``parameter_entries`` of the headline.
 
     Raises
     ------
     IdentifiedBeamError
         If a parameter is unknown or out of range, or a required parameter is missing.
     """
-    values = {name: _parameter_value(label, name, entry) for name, entry in parameters.items()}
-    for name in _REQUIRED_PARAMETERS:
-        if name not in values:
+    values_by_name = {
+        parameter_name: _parameter_value(label, parameter_name, parameter_entry)
+        for parameter_name, parameter_entry in parameter_entries.items()
+    }
+    for parameter_name in _REQUIRED_PARAMETERS:
+        if parameter_name not in values_by_name:
             raise IdentifiedBeamError(
-                f"{label}.parameters.{name} is missing; take the document of an analysis that "
+                f"{label}.parameters.{parameter_name} is missing; take the document of an "
+                "analysis that "
                 "found it (analyze session.mcap --json model.json)."
             )
-    return values
+    return values_by_name
 
 
 def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
@@ -447,21 +476,27 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     named
         List ``named`` of a headline.
     """
-    findings = []
-    for number, entry in enumerate(named if isinstance(named, list) else []):
-        finding = entry if isinstance(entry, dict) else {}
-        kind = finding.get("what")
-        if kind not in _FINDINGS_IN_ESTIMATES and kind not in _FINDINGS_IN_PARAMETERS:
-            findings.append((number, str(kind)[:60], str(finding.get("sentence"))[:200]))
-    return findings
+    unmodelled_findings = []
+    for finding_index, finding_entry in enumerate(named if isinstance(named, list) else []):
+        finding = finding_entry if isinstance(finding_entry, dict) else {}
+        finding_kind = finding.get("what")
+        if (
+            finding_kind not in _FINDINGS_IN_ESTIMATES
+            and finding_kind not in _FINDINGS_IN_PARAMETERS
+        ):
+            unmodelled_findings.append(
+                (finding_index, str(finding_kind)[:60], str(finding.get("sentence"))[:200])
+            )
+    return unmodelled_findings
 
 
-def _parameter_key(name: str) -> str:
+def _parameter_key(parameter_name: str) -> str:
     """Return the key of a parameter in `_PARAMETERS`; that of an offset lacks the mode's number."""
     return (
         _OFFSET_PREFIX
-        if name.startswith(_OFFSET_PREFIX) and name[len(_OFFSET_PREFIX) :].isdecimal()
-        else name
+        if parameter_name.startswith(_OFFSET_PREFIX)
+        and parameter_name[len(_OFFSET_PREFIX) :].isdecimal()
+        else parameter_name
     )
 
 
@@ -474,45 +509,54 @@ def _parameter_value(label: str, name: str, entry: object) -> float:
             "cannot be taken into account; update rigd, or do without this document."
         )
     stated_value = entry.get("value") if isinstance(entry, dict) else None
-    value = finite_number(stated_value)
+    finite_value = finite_number(stated_value)
     in_range = (
-        value is not None
-        and definition.lower_limit <= value < definition.upper_limit
-        and is_usable_size(value)
+        finite_value is not None
+        and definition.lower_limit <= finite_value < definition.upper_limit
+        and is_usable_size(finite_value)
     )
-    if value is not None and in_range and (value > 0.0 or name not in _REQUIRED_PARAMETERS):
-        return value
-    bound = "any size"
+    if (
+        finite_value is not None
+        and in_range
+        and (finite_value > 0.0 or name not in _REQUIRED_PARAMETERS)
+    ):
+        return finite_value
+    bound_text = "any size"
     if definition.lower_limit > -inf:
-        bound = (
+        bound_text = (
             "more than 0" if name in _REQUIRED_PARAMETERS else f"{definition.lower_limit:g} or more"
         )
     if definition.upper_limit < inf:
-        bound += f" below {definition.upper_limit:g}"
-    unit = f" {definition.unit}" if definition.unit else ""
+        bound_text += f" below {definition.upper_limit:g}"
+    unit_text = f" {definition.unit}" if definition.unit else ""
     raise IdentifiedBeamError(
         f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
-        f"must be a number of {bound}{unit}; {_ADVICE}."
+        f"must be a number of {bound_text}{unit_text}; {_ADVICE}."
     )
 
 
-def _require_known_effects(label: str, values: Mapping[str, float], use: Use) -> None:
-    """Raise if the analysis found an effect that the use does not take into account."""
-    for name, value in values.items():
-        definition = _PARAMETERS[_parameter_key(name)]
-        if not definition.effect or not value or _parameter_key(name) in use.effects:
+def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
+    """Raise IdentifiedBeamError if the analysis found an effect that the use cannot include."""
+    for parameter_name, parameter_value in values_by_name.items():
+        definition = _PARAMETERS[_parameter_key(parameter_name)]
+        if (
+            not definition.effect
+            or not parameter_value
+            or _parameter_key(parameter_name) in use.effects
+        ):
             continue
-        corner_hz = 0.0 if "filter" not in name else 1.0 / (2.0 * pi * value)
-        remedy = definition.remedy.format(
-            corner_hz=corner_hz, order=2 if name.startswith("second") else 1
+        corner_hz = 0.0 if "filter" not in parameter_name else 1.0 / (2.0 * pi * parameter_value)
+        remedy_text = definition.remedy.format(
+            corner_hz=corner_hz, order=2 if parameter_name.startswith("second") else 1
         )
-        unit = f" {definition.unit}" if definition.unit else ""
+        unit_text = f" {definition.unit}" if definition.unit else ""
         raise IdentifiedBeamError(
-            f"{label}.parameters.{name}.value = {value:.4g}{unit}: the analysis found "
-            f"{definition.effect}, which {use.name} does not take into account; {remedy}."
+            f"{label}.parameters.{parameter_name}.value = {parameter_value:.4g}{unit_text}: "
+            "the analysis found "
+            f"{definition.effect}, which {use.name} does not take into account; {remedy_text}."
         )
-    if values.get("tip_mass_kg") and any(
-        values[n] for n in values if _parameter_key(n) == _OFFSET_PREFIX
+    if values_by_name.get("tip_mass_kg") and any(
+        values_by_name[n] for n in values_by_name if _parameter_key(n) == _OFFSET_PREFIX
     ):
         raise IdentifiedBeamError(
             f"{label}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
@@ -521,10 +565,10 @@ def _require_known_effects(label: str, values: Mapping[str, float], use: Use) ->
 
 
 def _require_known_findings(label: str, named: object, use: Use) -> None:
-    """Raise if the analysis has a finding whose effect no parameter describes."""
-    for number, kind, sentence in findings_without_parameter(named):
+    """Raise IdentifiedBeamError if no parameter describes a finding of the analysis."""
+    for finding_index, finding_kind, sentence in findings_without_parameter(named):
         raise IdentifiedBeamError(
-            f"{label}.named[{number}]: {kind}, which {use.name} does not take into "
+            f"{label}.named[{finding_index}]: {finding_kind}, which {use.name} does not take into "
             f"account ({sentence}); remove its cause, and record and analyze again, or "
             "leave out --model."
         )
@@ -535,20 +579,21 @@ def _required_deviation(label: str, name: str, entry: Mapping[str, Any], use: Us
 
     Raises if the parameter is flagged and the use relies on it.
     """
-    flag = entry.get("flag")
-    if flag is None:
+    entry_flag = entry.get("flag")
+    if entry_flag is None:
         return _standard_deviation(entry)
     # From analyses with other model variants: the deviation over all of them.
     std_any_rig = finite_number(entry.get("std_any_rig"))
     if std_any_rig is not None and std_any_rig > 0:
         return std_any_rig
-    deviation = _standard_deviation(entry)
+    parameter_std = _standard_deviation(entry)
     # For a move the uncertainty of the modes includes the damping.
     covered_by_modes = use is MOVE and not _PARAMETERS[_parameter_key(name)].effect
-    if _parameter_key(name) not in use.certain and (deviation is not None or covered_by_modes):
-        return deviation
+    if _parameter_key(name) not in use.certain and (parameter_std is not None or covered_by_modes):
+        return parameter_std
     raise IdentifiedBeamError(
-        f"{label}.parameters.{name} is flagged ({str(flag)[:100]}), and {use.name} relies on it; "
+        f"{label}.parameters.{name} is flagged ({str(entry_flag)[:100]}), and {use.name} "
+        "relies on it; "
         "record a session that shows more modes or is longer and analyze it, or leave out --model."
     )
 
@@ -558,47 +603,47 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
 
     It follows from the 95 % interval, which is valid for all structures, if there is one.
     """
-    interval, std = entry.get("interval_95"), finite_number(entry.get("std"))
-    if isinstance(interval, list) and len(interval) == 2:
-        low, high = map(finite_number, interval)
-        if low is not None and high is not None:
-            return abs(high - low) / (2 * _HALF_WIDTH_95_STDS)
+    interval_95, std = entry.get("interval_95"), finite_number(entry.get("std"))
+    if isinstance(interval_95, list) and len(interval_95) == 2:
+        low, upper_end = map(finite_number, interval_95)
+        if low is not None and upper_end is not None:
+            return abs(upper_end - low) / (2 * _HALF_WIDTH_95_STDS)
     return std if std is not None and std > 0 else None
 
 
-def _stiffness_offsets(label: str, values: Mapping[str, float]) -> tuple[float, ...]:
+def _stiffness_offsets(label: str, values_by_name: Mapping[str, float]) -> tuple[float, ...]:
     """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
     offset_by_mode = {
-        int(n[len(_OFFSET_PREFIX) :]): value
-        for n, value in values.items()
+        int(n[len(_OFFSET_PREFIX) :]): offset_value
+        for n, offset_value in values_by_name.items()
         if _parameter_key(n) == _OFFSET_PREFIX
     }
-    modes = range(2, 2 + len(offset_by_mode))
-    if sorted(offset_by_mode) != list(modes):
+    mode_numbers = range(2, 2 + len(offset_by_mode))
+    if sorted(offset_by_mode) != list(mode_numbers):
         given_modes = ", ".join(map(str, sorted(offset_by_mode)))
         raise IdentifiedBeamError(
             f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given_modes}, but must be "
-            f"those of modes 2 to {modes[-1]}; {_ADVICE}."
+            f"those of modes 2 to {mode_numbers[-1]}; {_ADVICE}."
         )
-    return tuple(offset_by_mode[mode] for mode in modes)
+    return tuple(offset_by_mode[mode_number] for mode_number in mode_numbers)
 
 
 def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:
     """Return the relative standard uncertainty of the pole of each mode in the document."""
     uncertainties: list[float] = []
-    for number, entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
-        mode_object = entry if isinstance(entry, dict) else {}
-        hz, ratio = (
-            of if isinstance(of := mode_object.get(name), dict) else {}
-            for name in ("frequency_hz", "damping_ratio")
+    for mode_index, mode_entry in enumerate(modes if isinstance(modes, Sequence) else [], start=1):
+        mode_object = mode_entry if isinstance(mode_entry, dict) else {}
+        hz, damping_ratio = (
+            of if isinstance(of := mode_object.get(quantity_name), dict) else {}
+            for quantity_name in ("frequency_hz", "damping_ratio")
         )
         value_hz = finite_number(hz.get("value"))
-        if not value_hz or not ratio or mode_object.get("mode") != number:
+        if not value_hz or not damping_ratio or mode_object.get("mode") != mode_index:
             raise IdentifiedBeamError(
-                f"{label}.modes[{number - 1}] is not mode {number} with frequency_hz and "
+                f"{label}.modes[{mode_index - 1}] is not mode {mode_index} with frequency_hz and "
                 f"damping_ratio; {_ADVICE}."
             )
-        uncertainties.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(ratio)))
+        uncertainties.append(hypot(_mode_deviation(hz) / value_hz, _mode_deviation(damping_ratio)))
     return tuple(uncertainties)
 
 

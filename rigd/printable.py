@@ -37,10 +37,10 @@ def printable(text: str, max_characters: int | None = None) -> str:
     max_characters
         Largest number of characters, or None for all; an ellipsis replaces the others.
     """
-    shown = text[:max_characters]
-    if not shown.isprintable():
-        shown = "".join(c if c.isprintable() else UNPRINTABLE for c in shown)
-    return shown if len(shown) == len(text) else f"{shown}…"
+    shown_text = text[:max_characters]
+    if not shown_text.isprintable():
+        shown_text = "".join(c if c.isprintable() else UNPRINTABLE for c in shown_text)
+    return shown_text if len(shown_text) == len(text) else f"{shown_text}…"
 
 
 def readable_message(message: str) -> str:
@@ -61,11 +61,11 @@ def readable_message(message: str) -> str:
     a.toml: x = ?[2J is unknown.
     """
     # A line break of a quotation and one of the message are indistinguishable and both harmless.
-    lines = message.split("\n", _MAX_LINES)
-    shown = [_readable_line(line) for line in lines[:_MAX_LINES]]
-    if len(lines) > _MAX_LINES:
-        shown.append(f"… and {grouped(lines[-1].count(chr(10)) + 1)} more lines.")
-    return "\n".join(shown)
+    message_lines = message.split("\n", _MAX_LINES)
+    shown_lines = [_readable_line(message_line) for message_line in message_lines[:_MAX_LINES]]
+    if len(message_lines) > _MAX_LINES:
+        shown_lines.append(f"… and {grouped(message_lines[-1].count(chr(10)) + 1)} more lines.")
+    return "\n".join(shown_lines)
 
 
 def _readable_line(line: str) -> str:
@@ -99,12 +99,12 @@ def grouped(count: int) -> str:
     return f"{count:,}".replace(",", " ") if count >= _MIN_GROUPED_NUMBER else str(count)
 
 
-def listed(parts: Sequence[str]) -> str:
+def listed(texts: Sequence[str]) -> str:
     """Join texts with commas and a final "and".
 
     Parameters
     ----------
-    parts
+    texts
         At least one text.
 
     Examples
@@ -113,8 +113,8 @@ def listed(parts: Sequence[str]) -> str:
     >>> print(listed(["alpha"]), listed(["1", "2", "3"]), sep="; ")
     alpha; 1, 2 and 3
     """
-    *others, last = parts
-    return f"{', '.join(others)} and {last}" if others else last
+    *other_texts, last_text = texts
+    return f"{', '.join(other_texts)} and {last_text}" if other_texts else last_text
 
 
 def counts_text(counts: Mapping[str, Any]) -> str:
@@ -134,16 +134,16 @@ def counts_text(counts: Mapping[str, Any]) -> str:
     11 998 of 12 000 samples, 2 missed, 5 late
     """
     names_if_nonzero = ("lost", "stale_angles", "stale_wrenches")
-    phrases = [
+    count_phrases = [
         f"{_count_text(counts['recorded'])} of {_count_text(counts['scheduled'])} samples",
-        *(f"{_count_text(counts[name])} {name}" for name in ("missed", "late")),
+        *(f"{_count_text(counts[count_name])} {count_name}" for count_name in ("missed", "late")),
         *(
-            f"{_count_text(counts[name])} {name.replace('_', ' ')}"
-            for name in names_if_nonzero
-            if name in counts and (counts[name] is None or int(counts[name]))
+            f"{_count_text(counts[count_name])} {count_name.replace('_', ' ')}"
+            for count_name in names_if_nonzero
+            if count_name in counts and (counts[count_name] is None or int(counts[count_name]))
         ),
     ]
-    return ", ".join(phrases)
+    return ", ".join(count_phrases)
 
 
 def _count_text(count: int | str | None) -> str:

@@ -51,7 +51,7 @@ def suffix_of(key: str) -> str:
     >>> suffix_of("beam.bending_stiffness_n_m2")
     '_n_m2'
     """
-    return next((suffix for suffix in UNITS if key.endswith(suffix)), "")
+    return next((unit_suffix for unit_suffix in UNITS if key.endswith(unit_suffix)), "")
 
 
 def unit_of(key: str) -> str:
@@ -82,20 +82,20 @@ def with_half_width(value: float, interval: Sequence[float] | None, scale: float
     >>> print(with_half_width(2.56987, (2.56980, 2.56994)), with_half_width(0.0091, None, 100.0))
     2.569870 ± 0.000070 0.91
     """
-    half = 0.0 if interval is None else (interval[1] - interval[0]) / 2
-    if not 0 < scale * half < inf:
+    half_width = 0.0 if interval is None else (interval[1] - interval[0]) / 2
+    if not 0 < scale * half_width < inf:
         return f"{scale * value:.5g}"
-    return " ± ".join(to_uncertainty((value, half), half, scale))
+    return " ± ".join(to_uncertainty((value, half_width), half_width, scale))
 
 
 def to_uncertainty(
-    values: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
+    numbers: Sequence[float], uncertainty: float, scale: float = 1.0, sign: str = ""
 ) -> tuple[str, ...]:
     """Format numbers, rounded to two digits of their uncertainty.
 
     Parameters
     ----------
-    values
+    numbers
         Numbers to format.
     uncertainty
         Standard deviation or half-width of an interval. If it is 0 or not finite, five significant
@@ -112,15 +112,17 @@ def to_uncertainty(
     >>> to_uncertainty((1.23456e-12,), 1e-15)
     ('1.2346e-12',)
     """
-    size = scale * uncertainty
-    if not 0 < size < inf:
-        return tuple(f"{scale * value:{sign}.5g}" for value in values)
-    digits = decimals(size)
-    if digits <= _MAX_DECIMALS:
-        return tuple(f"{scale * value:{sign}.{digits}f}" for value in values)
-    largest = max((abs(scale * value) for value in values), default=0.0) or size
-    power = digits + floor(log10(largest))
-    return tuple(f"{scale * value:{sign}.{max(power, 1) + 1}g}" for value in values)
+    scaled_uncertainty = scale * uncertainty
+    if not 0 < scaled_uncertainty < inf:
+        return tuple(f"{scale * number:{sign}.5g}" for number in numbers)
+    decimal_count = decimals(scaled_uncertainty)
+    if decimal_count <= _MAX_DECIMALS:
+        return tuple(f"{scale * number:{sign}.{decimal_count}f}" for number in numbers)
+    largest_size = (
+        max((abs(scale * number) for number in numbers), default=0.0) or scaled_uncertainty
+    )
+    power = decimal_count + floor(log10(largest_size))
+    return tuple(f"{scale * number:{sign}.{max(power, 1) + 1}g}" for number in numbers)
 
 
 def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "") -> str:
@@ -140,8 +142,8 @@ def interval_text(interval: Sequence[float], scale: float = 1.0, sign: str = "")
     >>> interval_text((-0.169132, -0.169084), 100.0, "+")
     '-16.9132 to -16.9084'
     """
-    half = (interval[1] - interval[0]) / 2
-    return " to ".join(to_uncertainty(interval, half, scale, sign))
+    half_width = (interval[1] - interval[0]) / 2
+    return " to ".join(to_uncertainty(interval, half_width, scale, sign))
 
 
 def with_percentage(std: float, value: float) -> str:
@@ -201,7 +203,7 @@ def finite_number(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, int | float):
         return None
     try:
-        number = float(value)
+        float_value = float(value)
     except OverflowError:
         return None
-    return number if isfinite(number) else None
+    return float_value if isfinite(float_value) else None

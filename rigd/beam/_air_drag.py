@@ -57,29 +57,29 @@ class DragGrid:
             Number of points of the Gauss-Legendre rule. The force is smooth except for kinks where
             the speed changes its sign along the beam.
         """
-        nodes, weight = np.polynomial.legendre.leggauss(points)
+        nodes, point_weights = np.polynomial.legendre.leggauss(points)
         x = 0.5 * (nodes + 1)
-        numbers = np.arange(1, modes + 1)
+        mode_numbers = np.arange(1, modes + 1)
         z = clamped_free_eigenvalues(modes)
         return cls(
             x_m=beam.length_m * x,
-            weight_m=0.5 * beam.length_m * weight,
-            shapes=np.array([mode_shape(int(number), x) for number in numbers]),
-            leverage_m=2 * beam.length_m * (-1.0) ** (numbers - 1) / z**2,
+            weight_m=0.5 * beam.length_m * point_weights,
+            shapes=np.array([mode_shape(int(mode_number), x) for mode_number in mode_numbers]),
+            leverage_m=2 * beam.length_m * (-1.0) ** (mode_numbers - 1) / z**2,
         )
 
     @property
     def to_modes(self) -> Real:
         """Matrix that converts force per metre at the points into modal forces, shape (n, g)."""
         length_m = self.weight_m.sum()
-        projection: Real = self.shapes * self.weight_m / length_m
-        return projection
+        modal_projection: Real = self.shapes * self.weight_m / length_m
+        return modal_projection
 
     @property
     def to_moment(self) -> Real:
-        """Row in m², shape (g,), that converts force per metre at the points into a moment.
+        """Weights in m², shape (g,), that turn the force per metre at the points into a moment.
 
         The moment is about the motor's axis.
         """
-        moment: Real = self.x_m * self.weight_m
-        return moment
+        moment_row: Real = self.x_m * self.weight_m
+        return moment_row

@@ -84,24 +84,26 @@ class DeflectionFilter:
     ) -> None:
         self.x_m: Real = np.linspace(0.0, beam.length_m, points)
         z = clamped_free_eigenvalues(modes + 1)
-        pairs = poles_for_eigenvalues(z, beam, damping)
-        mode_count = _usable_mode_count(pairs, rate_hz)
-        pairs, z = pairs[:mode_count], z[:mode_count]
+        pole_pairs = poles_for_eigenvalues(z, beam, damping)
+        mode_count = _usable_mode_count(pole_pairs, rate_hz)
+        pole_pairs, z = pole_pairs[:mode_count], z[:mode_count]
 
         real_poles = _branch_cut_poles(damping, rate_hz)
-        pole_factors: Complex = np.exp(np.concatenate([pairs.ravel(), real_poles]) / rate_hz)
+        pole_factors: Complex = np.exp(np.concatenate([pole_pairs.ravel(), real_poles]) / rate_hz)
         # Row per mode, column per pole: weight of the pole in the mode.
-        weights = np.zeros((z.size, pole_factors.size), dtype=np.complex128)
-        for i, residues in enumerate(_mode_residues(z, pairs, beam, damping)):
-            weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
+        pole_weights = np.zeros((z.size, pole_factors.size), dtype=np.complex128)
+        for i, residues in enumerate(_mode_residues(z, pole_pairs, beam, damping)):
+            pole_weights[i, 2 * i : 2 * i + 2] = residues / rate_hz
         if real_poles.size:
-            weights[:, pairs.size :] = _branch_cut_weights(
-                z, beam, damping, rate_hz, pole_factors, weights
+            pole_weights[:, pole_pairs.size :] = _branch_cut_weights(
+                z, beam, damping, rate_hz, pole_factors, pole_weights
             )
 
         # Powers of the poles, the highest first: effect of each sample of a chunk at its end.
         self._powers: Complex = pole_factors[:, None] ** np.arange(_CHUNK, -1, -1)
-        self._scaled_shapes: Complex = -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ weights
+        self._scaled_shapes: Complex = (
+            -_scaled_shapes(beam, self.x_m / beam.length_m, z) @ pole_weights
+        )
         self._direct: Real = -(self._scaled_shapes @ _steady_states(pole_factors)).real
         self._state: Complex = np.zeros(pole_factors.size, dtype=np.complex128)
         self._start_rad: float | None = None
@@ -126,23 +128,23 @@ class DeflectionFilter:
         if self._start_rad is None:
             self._start_rad = float(angle_rad[0])
         turned_rad = angle_rad - self._start_rad
-        for start in range(0, turned_rad.size, _CHUNK):
-            chunk = turned_rad[start : start + _CHUNK]
-            powers = self._powers[:, _CHUNK - chunk.size :]
-            self._state = powers[:, 0] * self._state + powers[:, 1:] @ chunk
+        for chunk_start in range(0, turned_rad.size, _CHUNK):
+            chunk_rad = turned_rad[chunk_start : chunk_start + _CHUNK]
+            chunk_powers = self._powers[:, _CHUNK - chunk_rad.size :]
+            self._state = chunk_powers[:, 0] * self._state + chunk_powers[:, 1:] @ chunk_rad
         deflection: Real = (self._scaled_shapes @ self._state).real + self._direct * turned_rad[-1]
         return deflection
 
 
-def _usable_mode_count(pairs: Complex, rate_hz: float) -> int:
+def _usable_mode_count(pole_pairs: Complex, rate_hz: float) -> int:
     """Return the number of modes, from the first on, slow enough for the sampling rate."""
-    below_limit = np.abs(pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_FRACTION * rate_hz
-    usable = below_limit & ~np.isnan(pairs[:, 0])
-    return usable.size if usable.all() else int(np.argmin(usable))
+    below_limit = np.abs(pole_pairs[:, 0].imag) < 2 * np.pi * _MAX_FREQUENCY_FRACTION * rate_hz
+    is_usable = below_limit & ~np.isnan(pole_pairs[:, 0])
+    return is_usable.size if is_usable.all() else int(np.argmin(is_usable))
 
 
 def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
-    """Return real poles in rad/s for the branch cut, or an empty array if there is no cut."""
+    """Return real poles in rad/s that stand for the branch cut, or none without a cut."""
     internal_integer = damping.zeta == 0 or damping.alpha in (0, 1)
     external_integer = damping.gamma == 0 or damping.lambda_ in (0, 1)
     if internal_integer and external_integer:
@@ -153,52 +155,60 @@ def _branch_cut_poles(damping: Damping, rate_hz: float) -> Real:
 
 def _steady_states(pole_factors: Complex) -> Complex:
     """Return the steady states of the discrete poles `pole_factors` for a constant angle of 1."""
-    state: Complex = 1 / (1 - pole_factors)
-    return state
+    steady_states: Complex = 1 / (1 - pole_factors)
+    return steady_states
 
 
 def _modal_stiffness_terms(
     s: Complex, z: Real, beam: Beam, damping: Damping
 ) -> tuple[Complex, Complex, Complex]:
-    """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for modes at `s` (rad/s)."""
+    """Return ``P / EI``, ``Q k⁴ / EI`` and ``s d/ds`` of their sum for each mode at `s` (rad/s)."""
     inertial = beam.density_over_stiffness * s * s
     external = damping.gamma * s**damping.lambda_
     internal = damping.zeta * s**damping.alpha
     k_fourth = (z / beam.length_m) ** 4
-    slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal * k_fourth
-    return inertial + external, (1 + internal) * k_fourth, slope
+    log_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal * k_fourth
+    return inertial + external, (1 + internal) * k_fourth, log_slope
 
 
-def _mode_residues(z: Real, pairs: Complex, beam: Beam, damping: Damping) -> Complex:
-    """Return the residues of each H_i at its mode's two poles, shape (modes, 2), in rad/s."""
-    load, _, slope = _modal_stiffness_terms(pairs, z[:, None], beam, damping)
-    residues: Complex = load * pairs / slope
+def _mode_residues(z: Real, pole_pairs: Complex, beam: Beam, damping: Damping) -> Complex:
+    """Return the residues in rad/s of each mode's response at its two poles, shape (modes, 2)."""
+    inertial_load, _, log_slope = _modal_stiffness_terms(pole_pairs, z[:, None], beam, damping)
+    residues: Complex = inertial_load * pole_pairs / log_slope
     return residues
 
 
 def _branch_cut_weights(
-    z: Real, beam: Beam, damping: Damping, rate_hz: float, pole_factors: Complex, weights: Complex
+    z: Real,
+    beam: Beam,
+    damping: Damping,
+    rate_hz: float,
+    pole_factors: Complex,
+    pair_weights: Complex,
 ) -> Real:
     """Return the weight of each real pole in each mode, shape (modes, real poles).
 
-    They are fitted to the difference between the exact H_i and its pole pairs, whose `weights` are
-    given.
+    They are fitted to the difference between each mode's exact response H_i and that of the pole
+    pairs with the given `pair_weights`.
     """
     frequency_hz = np.geomspace(
         _FIT_FROM_HZ, max(_FIT_TO_FRACTION * rate_hz, 2 * _FIT_FROM_HZ), 200
     )
     s = 2j * np.pi * frequency_hz[:, None]
-    load, spring, _ = _modal_stiffness_terms(s, z, beam, damping)
-    exact = load / (spring + load)
-    columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
-    residual = exact - columns @ weights.T
+    inertial_load, spring_term, _ = _modal_stiffness_terms(s, z, beam, damping)
+    exact_response = inertial_load / (spring_term + inertial_load)
+    pole_columns = 1 / (1 - pole_factors * np.exp(-s / rate_hz)) - _steady_states(pole_factors)
+    fit_residual = exact_response - pole_columns @ pair_weights.T
     cut = np.empty((z.size, _REAL_POLES))
     for i in range(z.size):
-        weight = 1 / (np.abs(exact[:, i, None]) + _SMALL_RESPONSE)
-        matrix, target = columns[:, -_REAL_POLES:] * weight, residual[:, i, None] * weight
+        point_weight = 1 / (np.abs(exact_response[:, i, None]) + _SMALL_RESPONSE)
+        equation_matrix, equation_target = (
+            pole_columns[:, -_REAL_POLES:] * point_weight,
+            fit_residual[:, i, None] * point_weight,
+        )
         cut[i] = np.linalg.lstsq(
-            np.concatenate([matrix.real, matrix.imag]),
-            np.concatenate([target.real, target.imag])[:, 0],
+            np.concatenate([equation_matrix.real, equation_matrix.imag]),
+            np.concatenate([equation_target.real, equation_target.imag])[:, 0],
         )[0]
     return cut
 
@@ -209,13 +219,13 @@ def _scaled_shapes(beam: Beam, x: Real, z: Real) -> Real:
     The last one includes all later modes by their low-frequency sum: the ``b_i phi_i / k_i⁴`` of
     all modes add up to the bend under a load that grows like x.
     """
-    numbers = np.arange(1, z.size + 1)
-    factors = 2 * (-1.0) ** (numbers - 1) / z**2
+    mode_numbers = np.arange(1, z.size + 1)
+    shape_factors = 2 * (-1.0) ** (mode_numbers - 1) / z**2
     shapes = np.zeros((x.size, z.size))
-    for i, factor in enumerate(factors):
-        shapes[:, i] = factor * mode_shape(i + 1, x)
+    for i, shape_factor in enumerate(shape_factors):
+        shapes[:, i] = shape_factor * mode_shape(i + 1, x)
     if z.size:
         under_load = x**2 * (x**3 - 10 * x + 20) / 120
         shapes[:, -1] = z[-1] ** 4 * (under_load - shapes[:, :-1] @ z[:-1] ** -4.0)
-    scaled: Real = beam.length_m * shapes
-    return scaled
+    scaled_shapes: Real = beam.length_m * shapes
+    return scaled_shapes

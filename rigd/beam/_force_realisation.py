@@ -129,13 +129,13 @@ def realise_force(
         int(_POINTS_PER_DECADE * np.log10(highest_fit_rad_s / lowest_fit_rad_s)),
     )
     s = s[np.abs(s[:, None] - poles).min(axis=1, initial=np.inf) > 1e-6 * np.abs(s)]
-    tail = np.geomspace(
+    tail_rad_s = np.geomspace(
         highest_fit_rad_s, _TAIL_UP_TO_FACTOR * highest_fit_rad_s, _POINTS_PER_DECADE
     ) * np.exp(0.25j * np.pi)
-    emphasis = np.append(np.ones(s.size), np.full(tail.size, _TAIL_WEIGHT))
-    s = np.append(s, tail)
+    fit_emphasis = np.append(np.ones(s.size), np.full(tail_rad_s.size, _TAIL_WEIGHT))
+    s = np.append(s, tail_rad_s)
     grid = PointForceGrid(s, beam, damping)
-    exact = np.column_stack(
+    exact_response = np.column_stack(
         [
             grid.per_force(output_at_m, np.full_like(output_at_m, force_at_m)),
             grid.torque_per_force(force_at_m),
@@ -152,41 +152,47 @@ def realise_force(
     )
     real_poles = -_SLOWEST_POLE_RAD_S * 10 ** (np.arange(real_pole_count) / _REAL_POLES_PER_DECADE)
     # A ladder's response to a held force is 1, so that the cut-off loses no pole.
-    columns = np.column_stack([-real_poles / (s[:, None] - real_poles), np.ones_like(s)])
-    modal = _modal_response(s, poles, residues)
-    weights = emphasis[:, None] / np.column_stack(
+    pole_columns = np.column_stack([-real_poles / (s[:, None] - real_poles), np.ones_like(s)])
+    modal_response = _modal_response(s, poles, residues)
+    error_weights = fit_emphasis[:, None] / np.column_stack(
         [
-            np.abs(exact[:, :-2]) + _infinite_beam_response(s, beam, damping)[:, None],
-            np.abs(exact[:, -2]) + _SMALL_RESPONSE * force_at_m,
-            np.abs(exact[:, -1]) + _SMALL_RESPONSE,
+            np.abs(exact_response[:, :-2]) + _infinite_beam_response(s, beam, damping)[:, None],
+            np.abs(exact_response[:, -2]) + _SMALL_RESPONSE * force_at_m,
+            np.abs(exact_response[:, -1]) + _SMALL_RESPONSE,
         ]
     )
-    remainder = exact - modal
-    fitted = np.empty((exact.shape[1], columns.shape[1]))
-    for i in range(exact.shape[1]):
-        weighted, target = columns * weights[:, i, None], remainder[:, i] * weights[:, i]
-        fitted[i] = np.linalg.lstsq(
-            np.concatenate([weighted.real, weighted.imag]),
-            np.concatenate([target.real, target.imag]),
+    remainder = exact_response - modal_response
+    fitted_weights = np.empty((exact_response.shape[1], pole_columns.shape[1]))
+    for i in range(exact_response.shape[1]):
+        weighted_columns, fit_target = (
+            pole_columns * error_weights[:, i, None],
+            remainder[:, i] * error_weights[:, i],
+        )
+        fitted_weights[i] = np.linalg.lstsq(
+            np.concatenate([weighted_columns.real, weighted_columns.imag]),
+            np.concatenate([fit_target.real, fit_target.imag]),
             rcond=_SINGULAR_VALUE_CUTOFF,
         )[0]
 
-    pairs = 2 * poles.size
-    n = pairs + real_poles.size
+    pair_states = 2 * poles.size
+    n = pair_states + real_poles.size
     a, b = np.zeros((n, n)), np.ones(n)
-    first_rows = np.arange(0, pairs, 2)
+    first_rows = np.arange(0, pair_states, 2)
     a[first_rows, first_rows] = a[first_rows + 1, first_rows + 1] = poles.real
     a[first_rows, first_rows + 1] = poles.imag
     a[first_rows + 1, first_rows] = -poles.imag
     b[first_rows + 1] = 0.0
-    real_rows = np.arange(pairs, n)
+    real_rows = np.arange(pair_states, n)
     a[real_rows, real_rows] = real_poles
     b[real_rows] = -real_poles
-    rows = np.empty((exact.shape[1], n))
+    output_rows = np.empty((exact_response.shape[1], n))
     # The first of a pair's states is the real part of z, the second minus its imaginary part.
-    rows[:, first_rows], rows[:, first_rows + 1] = 2 * residues.real, 2 * residues.imag
-    rows[:, pairs:] = fitted[:, :-1]
-    return ForceRealisation(a, poles.size, b, rows, fitted[:, -1])
+    output_rows[:, first_rows], output_rows[:, first_rows + 1] = (
+        2 * residues.real,
+        2 * residues.imag,
+    )
+    output_rows[:, pair_states:] = fitted_weights[:, :-1]
+    return ForceRealisation(a, poles.size, b, output_rows, fitted_weights[:, -1])
 
 
 def check_force_damping_order(damping: Damping) -> None:
@@ -202,8 +208,8 @@ def check_force_damping_order(damping: Damping) -> None:
     RealisationError
         If an order of the damping is above 1.5.
     """
-    orders = (damping.alpha if damping.zeta else 0, damping.lambda_ if damping.gamma else 0)
-    if max(orders) > _HIGHEST_ORDER:
+    damping_orders = (damping.alpha if damping.zeta else 0, damping.lambda_ if damping.gamma else 0)
+    if max(damping_orders) > _HIGHEST_ORDER:
         raise RealisationError(
             f"{damping} has an order above {_HIGHEST_ORDER:g}, with which the response to a force "
             "at a point cannot be realised; leave the obstacle out, or choose a lower order."
@@ -219,41 +225,47 @@ def _modal_poles_and_residues(
     """
     z = clamped_free_eigenvalues(_MAX_MODES)
     poles = poles_for_eigenvalues(z, beam, damping)[:, 0]
-    magnitude = np.abs(poles)  # not a number where there is none: then False below
-    selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * magnitude)
-    selected &= magnitude < _MODES_UP_TO_FACTOR * highest_rad_s
-    poles, z = poles[selected], z[selected]
-    numbers = np.flatnonzero(selected) + 1
-    shapes = np.array([mode_shape(int(number), x) for number in numbers]).reshape(-1, x.size)
-    sign = (-1.0) ** (numbers - 1)
-    leverage_m = 2 * beam.length_m * sign / z**2  # ∫ x phi dx / L
-    mean = mode_mean(_MAX_MODES)[selected]
+    pole_magnitude = np.abs(poles)  # not a number where there is none: then False below
+    is_selected = (poles.imag > 0) & (-poles.real < _HEAVY_DAMPING_RATIO * pole_magnitude)
+    is_selected &= pole_magnitude < _MODES_UP_TO_FACTOR * highest_rad_s
+    poles, z = poles[is_selected], z[is_selected]
+    mode_numbers = np.flatnonzero(is_selected) + 1
+    mode_shapes = np.array(
+        [mode_shape(int(mode_number), x) for mode_number in mode_numbers]
+    ).reshape(-1, x.size)
+    shape_sign = (-1.0) ** (mode_numbers - 1)
+    leverage_m = 2 * beam.length_m * shape_sign / z**2  # ∫ x phi dx / L
+    shape_mean = mode_mean(_MAX_MODES)[is_selected]
 
     k_fourth = (z / beam.length_m) ** 4
     inertial = beam.density_over_stiffness * poles**2
     external = damping.gamma * poles**damping.lambda_
     internal = damping.zeta * poles**damping.alpha * k_fourth
-    slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
-    shape_at_force = shapes[:, -1] / slope
+    equation_slope = (2 * inertial + damping.lambda_ * external + damping.alpha * internal) / poles
+    shape_at_force = mode_shapes[:, -1] / equation_slope
     per_length = beam.length_m * beam.bending_stiffness_n_m2
-    root = shape_at_force * (inertial + external)
+    root_residue = shape_at_force * (inertial + external)
     residues: Complex = np.vstack(
-        [shapes[:, :-1].T * shape_at_force / per_length, leverage_m * root, mean * root]
+        [
+            mode_shapes[:, :-1].T * shape_at_force / per_length,
+            leverage_m * root_residue,
+            shape_mean * root_residue,
+        ]
     )
     return poles, residues
 
 
 def _modal_response(s: Complex, poles: Complex, residues: Complex) -> Complex:
-    """Return the outputs' response of the modes' conjugate pole pairs, shape (s, outputs)."""
-    upper, lower = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
-    response: Complex = upper @ residues.T + lower @ residues.conj().T
-    return response
+    """Return each output's sum over the modes' conjugate pole pairs at `s`, shape (s, outputs)."""
+    upper_terms, lower_terms = 1 / (s[:, None] - poles), 1 / (s[:, None] - poles.conj())
+    modal_outputs: Complex = upper_terms @ residues.T + lower_terms @ residues.conj().T
+    return modal_outputs
 
 
 def _infinite_beam_response(s: Complex, beam: Beam, damping: Damping) -> Real:
     """Return the magnitude in m/N of an infinitely long beam's displacement under the force."""
     stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
-    load = beam.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
-    load = load * beam.bending_stiffness_n_m2
-    size: Real = np.sqrt(0.125) / np.abs(load**0.75 * stiffness**0.25)
-    return size
+    inertial_load = beam.density_over_stiffness * s**2 + damping.gamma * s**damping.lambda_
+    inertial_load = inertial_load * beam.bending_stiffness_n_m2
+    response_m_per_n: Real = np.sqrt(0.125) / np.abs(inertial_load**0.75 * stiffness**0.25)
+    return response_m_per_n

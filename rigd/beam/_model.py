@@ -127,17 +127,17 @@ class TransferGrid:
     __slots__ = ("_is_zero", "_log_magnitude", "_log_s", "_parts", "_s_squared", "shape")
 
     def __init__(self, s: ArrayLike) -> None:
-        points = np.asarray(s, dtype=np.complex128)
-        self.shape = points.shape
-        points = points.ravel()
-        self._is_zero = points == 0
-        nonzero = np.where(self._is_zero, 1.0, points)
-        self._s_squared = points * points
-        self._log_s = np.log(nonzero)
+        s_points = np.asarray(s, dtype=np.complex128)
+        self.shape = s_points.shape
+        s_points = s_points.ravel()
+        self._is_zero = s_points == 0
+        nonzero_s = np.where(self._is_zero, 1.0, s_points)
+        self._s_squared = s_points * s_points
+        self._log_s = np.log(nonzero_s)
         # On the imaginary axis, where fits live, s^order is a real power times one constant phase.
-        on_axis = bool(np.all((nonzero.real == 0) & (nonzero.imag > 0)))
-        self._log_magnitude = np.log(nonzero.imag) if on_axis else None
-        self._parts = [slice(i, i + _BLOCK_POINTS) for i in range(0, points.size, _BLOCK_POINTS)]
+        on_axis = bool(np.all((nonzero_s.real == 0) & (nonzero_s.imag > 0)))
+        self._log_magnitude = np.log(nonzero_s.imag) if on_axis else None
+        self._parts = [slice(i, i + _BLOCK_POINTS) for i in range(0, s_points.size, _BLOCK_POINTS)]
 
     def evaluate(self, beam: Beam, damping: Damping) -> Complex:
         """Return the coupling torque per motor angle in N·m/rad at all s of the grid.
@@ -148,11 +148,11 @@ class TransferGrid:
             Parameters of the exact model.
         """
         g = np.empty(self._s_squared.size, dtype=np.complex128)
-        for part in self._parts:
-            c = 1 + damping.zeta * self._power_of_s(damping.alpha, part)
-            s_lambda = self._power_of_s(damping.lambda_, part)
-            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, part))
-            np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[part])
+        for grid_slice in self._parts:
+            c = 1 + damping.zeta * self._power_of_s(damping.alpha, grid_slice)
+            s_lambda = self._power_of_s(damping.lambda_, grid_slice)
+            f = _evaluate_f(self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice))
+            np.multiply((-beam.bending_stiffness_n_m2 / beam.length_m) * c, f, out=g[grid_slice])
         return g.reshape(self.shape)
 
     def evaluate_with_gradient(
@@ -180,57 +180,57 @@ class TransferGrid:
         ValueError
             If a name is not one of `PARAMETERS`.
         """
-        unknown = set(wrt) - set(PARAMETERS)
-        if unknown:
+        unknown_names = set(wrt) - set(PARAMETERS)
+        if unknown_names:
             raise ValueError(
-                f"{sorted(unknown)} are not parameters of G: choose from {PARAMETERS}."
+                f"{sorted(unknown_names)} are not parameters of G: choose from {PARAMETERS}."
             )
         per_length = -beam.bending_stiffness_n_m2 / beam.length_m
         stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
         g = np.empty(self._s_squared.size, dtype=np.complex128)
         gradient = np.empty((len(wrt), g.size), dtype=np.complex128)
-        for part in self._parts:
-            s_alpha = self._power_of_s(damping.alpha, part)
-            s_lambda = self._power_of_s(damping.lambda_, part)
+        for grid_slice in self._parts:
+            s_alpha = self._power_of_s(damping.alpha, grid_slice)
+            s_lambda = self._power_of_s(damping.lambda_, grid_slice)
             c = 1 + damping.zeta * s_alpha
-            q = self._fourth_power_of_z(beam, damping, c, s_lambda, part)
-            f, slope, remainder = _f_with_slope(q)
-            np.multiply(per_length * c, f, out=g[part])
+            q = self._fourth_power_of_z(beam, damping, c, s_lambda, grid_slice)
+            f, f_slope, remainder = _f_with_slope(q)
+            np.multiply(per_length * c, f, out=g[grid_slice])
             internal = (per_length * s_alpha) * remainder
-            slope *= stiffness_volume
-            external = s_lambda * slope
-            for row, name in zip(gradient[:, part], wrt, strict=True):
-                match name:
+            f_slope *= stiffness_volume
+            external = s_lambda * f_slope
+            for row, parameter_name in zip(gradient[:, grid_slice], wrt, strict=True):
+                match parameter_name:
                     case "zeta":
                         row[:] = internal
                     case "alpha":
-                        np.multiply(damping.zeta * self._log_s[part], internal, out=row)
+                        np.multiply(damping.zeta * self._log_s[grid_slice], internal, out=row)
                     case "gamma":
                         row[:] = external
                     case "lambda":
-                        np.multiply(damping.gamma * self._log_s[part], external, out=row)
+                        np.multiply(damping.gamma * self._log_s[grid_slice], external, out=row)
                     case "ln_density_over_stiffness":
-                        inertial = beam.density_over_stiffness * self._s_squared[part]
-                        np.multiply(inertial, slope, out=row)
+                        inertial = beam.density_over_stiffness * self._s_squared[grid_slice]
+                        np.multiply(inertial, f_slope, out=row)
                     case "ln_stiffness":
-                        row[:] = g[part]
+                        row[:] = g[grid_slice]
         return g.reshape(self.shape), gradient.reshape(len(wrt), *self.shape)
 
-    def _power_of_s(self, order: float, part: slice) -> Complex:
-        """Return ``s^order`` on a part of the grid."""
+    def _power_of_s(self, order: float, grid_slice: slice) -> Complex:
+        """Return ``s^order`` at the points of s in a slice of the grid."""
         if self._log_magnitude is None:
-            power = np.exp(order * self._log_s[part])
+            power = np.exp(order * self._log_s[grid_slice])
         else:
             phase = complex(np.exp(0.5j * np.pi * order))
-            power = np.exp(order * self._log_magnitude[part]) * phase
-        power[self._is_zero[part]] = 0.0 if order > 0 else 1.0
+            power = np.exp(order * self._log_magnitude[grid_slice]) * phase
+        power[self._is_zero[grid_slice]] = 0.0 if order > 0 else 1.0
         return power
 
     def _fourth_power_of_z(
-        self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, part: slice
+        self, beam: Beam, damping: Damping, c: Complex, s_lambda: Complex, grid_slice: slice
     ) -> Complex:
-        """Return ``q = z⁴`` on a part of the grid."""
-        inertial = beam.density_over_stiffness * self._s_squared[part]
+        """Return ``q = z⁴``, with z the wave number times L, in a slice of the grid."""
+        inertial = beam.density_over_stiffness * self._s_squared[grid_slice]
         q: Complex = (inertial + damping.gamma * s_lambda) / c
         q *= -(beam.length_m**4)
         return q
@@ -310,15 +310,15 @@ def transfer_and_gradient(
 
 def _polynomial(coefficients: Real, x: Complex) -> Complex:
     """Return the polynomial's value at `x`; `coefficients` start with the lowest power."""
-    total = np.full_like(x, coefficients[-1])
+    polynomial_sum = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
-        total *= x
-        total += coefficient
-    return total
+        polynomial_sum *= x
+        polynomial_sum += coefficient
+    return polynomial_sum
 
 
 def _scaled_form(q: Complex) -> tuple[Complex, Complex]:
-    """Return F(q) and ``2 z² sin z sinh z / (1 + cos z cosh z)`` for large q.
+    """Return F(q) and ``2 z² sin z sinh z / (1 + cos z cosh z)`` at large ``q = z⁴``.
 
     Only decaying exponentials are used, so nothing overflows.
     """
@@ -350,18 +350,18 @@ def _root_in_first_quadrant(real: Real, imag: Real) -> Complex:
 
     It is as accurate as numpy's and three times as fast.
     """
-    root = np.empty(real.shape, dtype=np.complex128)
-    root.real, root.imag = real, imag
-    larger = np.sqrt(0.5 * (np.abs(root) + np.abs(real)))
-    smaller = 0.5 * imag / larger
+    complex_root = np.empty(real.shape, dtype=np.complex128)
+    complex_root.real, complex_root.imag = real, imag
+    larger_part = np.sqrt(0.5 * (np.abs(complex_root) + np.abs(real)))
+    smaller_part = 0.5 * imag / larger_part
     positive_real = real >= 0
-    root.real = np.where(positive_real, larger, smaller)
-    root.imag = np.where(positive_real, smaller, larger)
-    return root
+    complex_root.real = np.where(positive_real, larger_part, smaller_part)
+    complex_root.imag = np.where(positive_real, smaller_part, larger_part)
+    return complex_root
 
 
 def _evaluate_f(q: Complex) -> Complex:
-    """Return the function F(q) of the module's docstring."""
+    """Return the beam's dimensionless response function F(q) at ``q = z⁴``."""
     f = np.empty_like(q)
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
@@ -377,8 +377,8 @@ def _evaluate_f(q: Complex) -> Complex:
 
 
 def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
-    """Return F(q), its derivative dF/dq, and ``F - q dF/dq``, computed without cancellation."""
-    f, slope, remainder = np.empty((3, q.size), dtype=np.complex128)
+    """Return the beam's response function F(q), dF/dq and ``F - q dF/dq``, without cancellation."""
+    f, f_slope, remainder = np.empty((3, q.size), dtype=np.complex128)
     is_small = np.abs(q) < _SERIES_LIMIT
     if is_small.any():
         small_q = q[is_small]
@@ -389,13 +389,13 @@ def _f_with_slope(q: Complex) -> tuple[Complex, Complex, Complex]:
         )
         d_squared = d * d
         f[is_small] = small_q * n / d
-        slope[is_small] = (n * d - small_q * wronskian) / d_squared
+        f_slope[is_small] = (n * d - small_q * wronskian) / d_squared
         remainder[is_small] = small_q * small_q * wronskian / d_squared
     is_large = ~is_small
     large_q = q[is_large]
     f_high, s_high = _scaled_form(large_q)
     q_slope = 0.25 * (f_high * (1 + f_high) + s_high)
     f[is_large] = f_high
-    slope[is_large] = q_slope / large_q
+    f_slope[is_large] = q_slope / large_q
     remainder[is_large] = f_high - q_slope
-    return f, slope, remainder
+    return f, f_slope, remainder

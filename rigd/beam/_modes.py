@@ -103,11 +103,11 @@ def undamped_frequencies_rad_s(beam: Beam, n: int) -> Real:
     [ 2.554 16.005 44.816]
     """
     z = clamped_free_eigenvalues(n)
-    frequencies: Real = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
-    return frequencies
+    frequencies_rad_s: Real = z * z / (beam.length_m**2 * np.sqrt(beam.density_over_stiffness))
+    return frequencies_rad_s
 
 
-def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
+def mode_shape(mode_number: int, x_over_length: ArrayLike) -> Real:
     """Return a mode shape of the clamped–free beam, normalised to the mean square 1.
 
     Its value at the tip is 2. It is computed without growing exponentials, so high modes are as
@@ -115,7 +115,7 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
 
     Parameters
     ----------
-    number
+    mode_number
         Number of the mode, from 1.
     x_over_length
         Positions along the beam, 0 (axis) to 1 (tip), of any shape.
@@ -130,15 +130,17 @@ def mode_shape(number: int, x_over_length: ArrayLike) -> Real:
     >>> print(mode_shape(2, [0.25, 0.5, 1.0]).round(4))
     [-0.8345 -1.4273  2.    ]
     """
-    z = float(clamped_free_eigenvalues(number)[-1])
+    z = float(clamped_free_eigenvalues(mode_number)[-1])
     x = z * np.asarray(x_over_length, dtype=np.float64)
     cosine, sine, decay = np.cos(z), np.sin(z), np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * sine  # (sinh z + sin z) 2 exp(-z)
     one_minus_sigma = 2 * decay * (sine - cosine - decay) / sum_
     growing_part = (np.exp(x - z) - np.exp(-x - z)) * (sine - cosine - decay) / sum_
-    sign = 1.0 if number % 2 == 1 else -1.0
-    shape: Real = sign * (np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part)
-    return shape
+    shape_sign = 1.0 if mode_number % 2 == 1 else -1.0
+    mode_values: Real = shape_sign * (
+        np.exp(-x) - np.cos(x) + (1 - one_minus_sigma) * np.sin(x) + growing_part
+    )
+    return mode_values
 
 
 def mode_mean(n: int) -> Real:
@@ -155,8 +157,10 @@ def mode_mean(n: int) -> Real:
     >>> print(mode_mean(3).round(4))
     [ 0.783  -0.4339  0.2544]
     """
-    mean: Real = 2 * (-1.0) ** np.arange(n) * root_shear_ratio(n) / clamped_free_eigenvalues(n)
-    return mean
+    shape_means: Real = (
+        2 * (-1.0) ** np.arange(n) * root_shear_ratio(n) / clamped_free_eigenvalues(n)
+    )
+    return shape_means
 
 
 def root_shear_ratio(n: int) -> Real:
@@ -179,8 +183,8 @@ def root_shear_ratio(n: int) -> Real:
     z = clamped_free_eigenvalues(n)
     decay = np.exp(-z)
     sum_ = 1 - decay * decay + 2 * decay * np.sin(z)  # (sinh z + sin z) 2 exp(-z)
-    ratio: Real = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
-    return ratio
+    shear_ratios: Real = (1 + decay * decay + 2 * decay * np.cos(z)) / sum_
+    return shear_ratios
 
 
 def participation(beam: Beam, n: int) -> Real:
@@ -204,8 +208,8 @@ def participation(beam: Beam, n: int) -> Real:
     >>> print(fraction.round(4))
     [0.9707 0.0247 0.0032]
     """
-    factors: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
-    return factors
+    factors_m3: Real = 4 * beam.length_m**3 / clamped_free_eigenvalues(n) ** 4
+    return factors_m3
 
 
 def poles(beam: Beam, damping: Damping, n: int) -> Complex:
@@ -236,10 +240,10 @@ def poles(beam: Beam, damping: Damping, n: int) -> Complex:
      [-0.506+100.563j -0.506-100.563j]]
     """
     pole_pairs = poles_for_eigenvalues(clamped_free_eigenvalues(n), beam, damping)
-    without_pole = np.flatnonzero(np.isnan(pole_pairs[:, 0]))
-    if without_pole.size:
+    modes_without_pole = np.flatnonzero(np.isnan(pole_pairs[:, 0]))
+    if modes_without_pole.size:
         raise ArithmeticError(
-            f"Mode {without_pole[0] + 1} has no pole on the principal sheet with {damping}."
+            f"Mode {modes_without_pole[0] + 1} has no pole on the principal sheet with {damping}."
         )
     return pole_pairs
 
@@ -273,21 +277,23 @@ def poles_for_eigenvalues(
             omega_squared, external_coefficient + damping.zeta * omega_squared
         )
     if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-        start = np.log(near_rad_s)
-        log_poles = _newton_roots(start, omega_squared, external_coefficient, damping.zeta, damping)
-        if bool((np.abs(log_poles - start) < SAME_ROOT_TOLERANCE).all()):
-            upper = np.exp(log_poles)
-            return np.stack([upper, upper.conj()], axis=1)
+        start_log_poles = np.log(near_rad_s)
+        log_poles = _newton_roots(
+            start_log_poles, omega_squared, external_coefficient, damping.zeta, damping
+        )
+        if bool((np.abs(log_poles - start_log_poles) < SAME_ROOT_TOLERANCE).all()):
+            upper_poles = np.exp(log_poles)
+            return np.stack([upper_poles, upper_poles.conj()], axis=1)
     for steps in _HOMOTOPY_STEP_COUNTS:
-        upper = _poles_by_continuation(omega_squared, external_coefficient, damping, steps)
-        has_no_pole = np.isnan(upper)
+        upper_poles = _poles_by_continuation(omega_squared, external_coefficient, damping, steps)
+        has_no_pole = np.isnan(upper_poles)
         if not has_no_pole.any():
             break
     else:
-        upper[has_no_pole] = _poles_by_search(
+        upper_poles[has_no_pole] = _poles_by_search(
             omega_squared[has_no_pole], external_coefficient, damping
         )
-    return np.stack([upper, upper.conj()], axis=1)
+    return np.stack([upper_poles, upper_poles.conj()], axis=1)
 
 
 def pole_gradient(
@@ -319,12 +325,12 @@ def pole_gradient(
     >>> print(pole_gradient(pole, k4, beam, damping, ["ln_density_over_stiffness"]).round(3))
     [0.013-8.023j]
     """
-    s, ratio = complex(pole_rad_s), beam.density_over_stiffness
+    s, density_ratio = complex(pole_rad_s), beam.density_over_stiffness
     log_s = np.log(s)
     internal = k4_per_m4 * np.exp(damping.alpha * log_s)
     external = np.exp(damping.lambda_ * log_s)
-    slope = (
-        2 * ratio * s
+    equation_slope = (
+        2 * density_ratio * s
         + damping.gamma * damping.lambda_ * external / s
         + damping.zeta * damping.alpha * internal / s
     )
@@ -333,9 +339,12 @@ def pole_gradient(
         "alpha": damping.zeta * log_s * internal,
         "gamma": external,
         "lambda": damping.gamma * log_s * external,
-        "ln_density_over_stiffness": ratio * s * s,
+        "ln_density_over_stiffness": density_ratio * s * s,
     }
-    return np.array([-by.get(name, 0.0) / slope for name in wrt], dtype=np.complex128)
+    return np.array(
+        [-by.get(parameter_name, 0.0) / equation_slope for parameter_name in wrt],
+        dtype=np.complex128,
+    )
 
 
 def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
@@ -363,30 +372,36 @@ def modes(beam: Beam, damping: Damping, n: int) -> tuple[Mode, ...]:
     16.011 Hz, damping ratio 0.22%
     """
     mode_list = []
-    for i, (first, second) in enumerate(poles(beam, damping, n)):
-        natural = float(np.sqrt((first * second).real))
+    for i, (first_pole, second_pole) in enumerate(poles(beam, damping, n)):
+        natural_rad_s = float(np.sqrt((first_pole * second_pole).real))
         mode_list.append(
             Mode(
                 number=i + 1,
-                poles_rad_s=(complex(first), complex(second)),
-                frequency_hz=float(abs(first.imag) / (2 * np.pi)),
-                natural_frequency_rad_s=natural,
-                damping_ratio=float((-first - second).real / (2 * natural)),
+                poles_rad_s=(complex(first_pole), complex(second_pole)),
+                frequency_hz=float(abs(first_pole.imag) / (2 * np.pi)),
+                natural_frequency_rad_s=natural_rad_s,
+                damping_ratio=float((-first_pole - second_pole).real / (2 * natural_rad_s)),
             )
         )
     return tuple(mode_list)
 
 
-def _second_order_poles(omega_squared: Real, rate: Real) -> Complex:
-    """Return the roots of ``s² + rate s + omega_squared``, shape (n, 2)."""
-    half = -0.5 * rate
-    first = half + np.sqrt((half * half - omega_squared).astype(np.complex128))
-    second = first.conj()
-    over_damped = half * half > omega_squared
-    fast_poles = half - np.sqrt(np.maximum(half * half - omega_squared, 0.0))
-    second[over_damped] = fast_poles[over_damped]
-    first[over_damped] = omega_squared[over_damped] / fast_poles[over_damped]  # no cancellation
-    return np.stack([first, second], axis=1)
+def _second_order_poles(omega_squared: Real, damping_rate: Real) -> Complex:
+    """Return the two roots in rad/s of ``s² + damping_rate s + omega_squared``, shape (n, 2)."""
+    minus_half_rate = -0.5 * damping_rate
+    first_roots = minus_half_rate + np.sqrt(
+        (minus_half_rate * minus_half_rate - omega_squared).astype(np.complex128)
+    )
+    second_roots = first_roots.conj()
+    over_damped = minus_half_rate * minus_half_rate > omega_squared
+    fast_poles = minus_half_rate - np.sqrt(
+        np.maximum(minus_half_rate * minus_half_rate - omega_squared, 0.0)
+    )
+    second_roots[over_damped] = fast_poles[over_damped]
+    first_roots[over_damped] = (
+        omega_squared[over_damped] / fast_poles[over_damped]
+    )  # no cancellation
+    return np.stack([first_roots, second_roots], axis=1)
 
 
 def _poles_by_continuation(
@@ -413,15 +428,15 @@ def _poles_by_search(omega_squared: Real, external_coefficient: float, damping: 
     along the cut so sharply that no reasonable step follows it. The result is NaN where no start
     leads to a pole on the principal sheet.
     """
-    angles = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
-    starts: Complex = np.add.outer(1j * angles, np.linspace(-6, 6, 49)).ravel()
-    log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + starts
+    start_angles_rad = np.pi * np.array([0.7, 0.9, 0.98, 0.999])
+    start_offsets: Complex = np.add.outer(1j * start_angles_rad, np.linspace(-6, 6, 49)).ravel()
+    log_s: Complex = 0.5 * np.log(omega_squared)[:, None] + start_offsets
     log_s = _newton_roots(
         log_s, omega_squared[:, None], external_coefficient, damping.zeta, damping
     )
     converged = ~np.isnan(log_s)
-    first = np.argmax(converged, axis=1)[:, None]
-    poles: Complex = np.exp(np.take_along_axis(log_s, first, axis=1)[:, 0])
+    first_converged = np.argmax(converged, axis=1)[:, None]
+    poles: Complex = np.exp(np.take_along_axis(log_s, first_converged, axis=1)[:, 0])
     return poles
 
 
@@ -442,13 +457,13 @@ def _newton_roots(
             inertial = np.exp(2 * log_s)
             external = external_coefficient * np.exp(damping.lambda_ * log_s)
             internal = zeta * omega_squared * np.exp(damping.alpha * log_s)
-            residual = inertial + external + internal + omega_squared
-            slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
-            step = residual / slope
-            log_s = log_s - step
-            if not (np.abs(step) > 1e-12).any():  # nor where one is NaN
+            equation_residual = inertial + external + internal + omega_squared
+            residual_slope = 2 * inertial + damping.lambda_ * external + damping.alpha * internal
+            newton_step = equation_residual / residual_slope
+            log_s = log_s - newton_step
+            if not (np.abs(newton_step) > 1e-12).any():  # nor where one is NaN
                 break
-        scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
+        residual_scale = np.abs(inertial) + np.abs(external) + np.abs(internal) + omega_squared
         on_sheet = (log_s.imag > 0) & (log_s.imag < np.pi + _MAX_ARGUMENT_EXCESS_RAD)
-        is_solution = np.abs(residual) < 1e-9 * scale
+        is_solution = np.abs(equation_residual) < 1e-9 * residual_scale
         return np.where(is_solution & on_sheet, log_s, np.nan + 0j)

@@ -71,14 +71,14 @@ class PointForceGrid:
     )
 
     def __init__(self, s: ArrayLike, beam: Beam, damping: Damping) -> None:
-        points = np.asarray(s, dtype=np.complex128)
-        self._shape = points.shape
-        points = points.ravel()
-        inertial = beam.density_over_stiffness * points * points
-        internal = 1 + damping.zeta * points**damping.alpha
+        s_points = np.asarray(s, dtype=np.complex128)
+        self._shape = s_points.shape
+        s_points = s_points.ravel()
+        inertial = beam.density_over_stiffness * s_points * s_points
+        internal = 1 + damping.zeta * s_points**damping.alpha
         self._length_m = beam.length_m
         self._q_stiffness: Complex = beam.bending_stiffness_n_m2 * internal
-        self._b4: Complex = -(inertial + damping.gamma * points**damping.lambda_) / internal
+        self._b4: Complex = -(inertial + damping.gamma * s_points**damping.lambda_) / internal
         is_small = np.abs(self._b4) * beam.length_m**4 < _SERIES_LIMIT
         self._small_q_indices, self._large_q_indices = (
             np.flatnonzero(is_small),
@@ -86,14 +86,14 @@ class PointForceGrid:
         )
         self._exponentials = _ExponentialSolution(self._b4[self._large_q_indices], beam.length_m)
 
-    def per_angle(self, x_m: ArrayLike, order: int = 0) -> Complex:
+    def per_angle(self, x_m: ArrayLike, derivative_order: int = 0) -> Complex:
         """Return the displacement of the beam per angle of its root, or its derivative by x.
 
         Parameters
         ----------
         x_m
             Distance from the motor's axis, any shape.
-        order
+        derivative_order
             Order of the derivative with respect to x, 0 to 3.
 
         Returns
@@ -108,14 +108,18 @@ class PointForceGrid:
             b4, b4 * self._series_at_tip(3), b4 * self._series_at_tip(2)
         )
         out[self._small_q_indices] = (
-            _power_series(b4, x.ravel(), 1, order)
-            + moment * _power_series(b4, x.ravel(), 2, order)
-            + shear * _power_series(b4, x.ravel(), 3, order)
+            _power_series(b4, x.ravel(), 1, derivative_order)
+            + moment * _power_series(b4, x.ravel(), 2, derivative_order)
+            + shear * _power_series(b4, x.ravel(), 3, derivative_order)
         )
-        out[self._large_q_indices] = self._exponentials.response_per_angle(x.ravel(), order)
+        out[self._large_q_indices] = self._exponentials.response_per_angle(
+            x.ravel(), derivative_order
+        )
         return out.reshape((*self._shape, *x.shape))
 
-    def per_force(self, x_m: ArrayLike, force_at_m: ArrayLike, order: int = 0) -> Complex:
+    def per_force(
+        self, x_m: ArrayLike, force_at_m: ArrayLike, derivative_order: int = 0
+    ) -> Complex:
         """Return the displacement of the beam per point force, or its derivative by x.
 
         The motor holds the root at angle zero.
@@ -125,7 +129,7 @@ class PointForceGrid:
         x_m, force_at_m
             Positions of displacement and force, as distances from the motor's axis; broadcast
             against each other.
-        order
+        derivative_order
             Order of the derivative with respect to `x_m`, 0 to 3; the third jumps at the force,
             where its value on the root's side is returned.
 
@@ -146,14 +150,16 @@ class PointForceGrid:
         moment, shear = self._root_derivatives(
             b4, _power_series(b4, distance_to_tip, 1), _power_series(b4, distance_to_tip, 0)
         )
-        beyond_force = np.where(x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, order), 0.0)
+        beyond_force = np.where(
+            x > at, _power_series(b4, np.maximum(x - at, 0.0), 3, derivative_order), 0.0
+        )
         out[self._small_q_indices] = (
-            moment * _power_series(b4, x, 2, order)
-            + shear * _power_series(b4, x, 3, order)
+            moment * _power_series(b4, x, 2, derivative_order)
+            + shear * _power_series(b4, x, 3, derivative_order)
             + beyond_force
         ) / stiffness
         out[self._large_q_indices] = (
-            self._exponentials.response_per_force_over_stiffness(x, at, order)
+            self._exponentials.response_per_force_over_stiffness(x, at, derivative_order)
             / self._q_stiffness[self._large_q_indices, None]
         )
         return out.reshape((*self._shape, *shape))
@@ -196,17 +202,17 @@ class PointForceGrid:
         return self._bending_stiffness(at.ndim) * self.per_force(np.zeros_like(at), at, 3)
 
     def _bending_stiffness(self, axes: int = 0) -> Complex:
-        """Return Q in N·m² in the shape of s, followed by `axes` axes of length 1."""
+        """Return the complex bending stiffness Q in N·m²; `axes` axes of length 1 are appended."""
         return self._q_stiffness.reshape(self._shape + (1,) * axes)
 
     def _series_at_tip(self, n: int) -> Complex:
-        """Return the series ``K_n`` at the tip for the s with small q, shape (low, 1)."""
+        """Return the power series ``K_n`` at the tip at the s with small q, shape (low, 1)."""
         return _power_series(self._b4[self._small_q_indices, None], np.array([self._length_m]), n)
 
     def _root_derivatives(
         self, b4: Complex, tip_moment: Complex, tip_shear: Complex
     ) -> tuple[Complex, Complex]:
-        """Return the y''(0) and y'''(0) that make moment and shear force at the tip zero.
+        """Return y''(0) and y'''(0) of the beam whose moment and shear force at the tip are zero.
 
         `tip_moment` and `tip_shear` are the derivatives y''(L) and y'''(L) of the other terms.
         """
@@ -217,20 +223,20 @@ class PointForceGrid:
         return moment, shear
 
 
-def _power_series(b4: Complex, x: Real, n: int, order: int = 0) -> Complex:
-    """Return the series ``K_n`` or its derivative at the points x, shape (s, m).
+def _power_series(b4: Complex, x: Real, n: int, derivative_order: int = 0) -> Complex:
+    """Return the power series ``K_n``, or a derivative of it, at the points x, shape (s, m).
 
     `b4` is ``-P/Q``, shape (s, 1); x has the shape (m,).
     """
-    n -= order
+    n -= derivative_order
     if n < 0:
         return b4 * _power_series(b4, x, n + 4)
-    argument = b4 * x**4
-    total = np.full_like(argument, 1 / factorial(4 * (_SERIES_TERMS - 1) + n))
+    series_argument = b4 * x**4
+    series_sum = np.full_like(series_argument, 1 / factorial(4 * (_SERIES_TERMS - 1) + n))
     for k in range(_SERIES_TERMS - 2, -1, -1):
-        total *= argument
-        total += 1 / factorial(4 * k + n)
-    return total * x**n
+        series_sum *= series_argument
+        series_sum += 1 / factorial(4 * k + n)
+    return series_sum * x**n
 
 
 @dataclass(init=False, slots=True)
@@ -243,30 +249,37 @@ class _ExponentialSolution:
     _inverse: Complex  # (s, 4, 4)
 
     def __init__(self, b4: Complex, length_m: float) -> None:
-        root = b4**0.25
+        wave_number = b4**0.25
         self._length_m = length_m
-        self._b = root[:, None]
-        self._kappa = np.where(root.imag > 0, -1j, 1j)[:, None]  # so that Re c >= 0
-        decay = np.exp(-root * length_m)
-        rotation = np.exp(-root * self._kappa[:, 0] * length_m)
-        ones, kappa = np.ones_like(root), self._kappa[:, 0]
+        self._b = wave_number[:, None]
+        self._kappa = np.where(wave_number.imag > 0, -1j, 1j)[:, None]  # so that Re c >= 0
+        decay = np.exp(-wave_number * length_m)
+        rotation = np.exp(-wave_number * self._kappa[:, 0] * length_m)
+        unit_row, kappa = np.ones_like(wave_number), self._kappa[:, 0]
         # y(0), y'(0)/b, y''(L)/b², y'''(L)/b³ of the four functions: c² = -b².
-        rows = [
-            [ones, decay, ones, rotation],
-            [-ones, decay, -kappa, kappa * rotation],
-            [decay, ones, -rotation, -ones],
-            [-decay, ones, kappa * rotation, -kappa],
+        boundary_rows = [
+            [unit_row, decay, unit_row, rotation],
+            [-unit_row, decay, -kappa, kappa * rotation],
+            [decay, unit_row, -rotation, -unit_row],
+            [-decay, unit_row, kappa * rotation, -kappa],
         ]
-        self._inverse = np.linalg.inv(np.moveaxis(np.array(rows), -1, 0)).astype(np.complex128)
+        self._inverse = np.linalg.inv(np.moveaxis(np.array(boundary_rows), -1, 0)).astype(
+            np.complex128
+        )
 
-    def response_per_angle(self, x: Real, order: int) -> Complex:
-        """Return the displacement per root angle, or a derivative, at x (m,); shape (s, m)."""
-        return self._weighted_sum(self._inverse[:, :, 1, None] / self._b[:, :, None], x, order)
+    def response_per_angle(self, x: Real, derivative_order: int) -> Complex:
+        """Return the displacement per root angle at x, or its derivative by x; shape (s, m)."""
+        return self._weighted_sum(
+            self._inverse[:, :, 1, None] / self._b[:, :, None], x, derivative_order
+        )
 
-    def response_per_force_over_stiffness(self, x: Real, at: Real, order: int) -> Complex:
-        """Return the displacement times Q per point force, or a derivative, shape (s, m).
+    def response_per_force_over_stiffness(
+        self, x: Real, at: Real, derivative_order: int
+    ) -> Complex:
+        """Return displacement times bending stiffness per point force, or its derivative by x.
 
-        Point i of x, shape (m,), is displaced by the force at point i of `at`.
+        Point i of x, shape (m,), is displaced by the force at point i of `at`. The result has the
+        shape (s, m).
         """
         b, c, kappa = self._b, self._kappa * self._b, self._kappa
         decaying_amplitude = -1 / (4 * b**3)  # A, of the decaying wave
@@ -285,26 +298,26 @@ class _ExponentialSolution:
             ],
             axis=1,
         )
-        distance = np.abs(x - at)
+        distance_m = np.abs(x - at)
         derivative_sign = np.where(x > at, -1.0, 1.0)  # the sign of each derivative of exp(-b r)
-        direct = (derivative_sign * b) ** order * decaying_amplitude * np.exp(-b * distance) + (
-            derivative_sign * c
-        ) ** order * other_amplitude * np.exp(-c * distance)
+        direct_response = (derivative_sign * b) ** derivative_order * decaying_amplitude * np.exp(
+            -b * distance_m
+        ) + (derivative_sign * c) ** derivative_order * other_amplitude * np.exp(-c * distance_m)
         coefficients = -self._inverse @ at_ends
-        return direct + self._weighted_sum(coefficients, x, order)
+        return direct_response + self._weighted_sum(coefficients, x, derivative_order)
 
-    def _weighted_sum(self, coefficients: Complex, x: Real, order: int) -> Complex:
-        """Return the sum of the four exponentials weighted by coefficients (s, 4, m or 1)."""
+    def _weighted_sum(self, coefficients: Complex, x: Real, derivative_order: int) -> Complex:
+        """Return the four exponential solutions' weighted sum; weights of shape (s, 4, m or 1)."""
         b, c = self._b, self._kappa * self._b
         from_tip = self._length_m - x
-        functions = (
-            (-b) ** order * np.exp(-b * x),
-            b**order * np.exp(-b * from_tip),
-            (-c) ** order * np.exp(-c * x),
-            c**order * np.exp(-c * from_tip),
+        exponentials = (
+            (-b) ** derivative_order * np.exp(-b * x),
+            b**derivative_order * np.exp(-b * from_tip),
+            (-c) ** derivative_order * np.exp(-c * x),
+            c**derivative_order * np.exp(-c * from_tip),
         )
-        total: Complex = sum(
-            (coefficients[:, i] * function for i, function in enumerate(functions)),
+        weighted_sum: Complex = sum(
+            (coefficients[:, i] * exponential for i, exponential in enumerate(exponentials)),
             start=np.zeros((b.shape[0], x.size), dtype=np.complex128),
         )
-        return total
+        return weighted_sum

@@ -119,19 +119,24 @@ def loaded_response(
     tip_mass_kg : float
         Point mass at the tip.
     """
-    stiffness, length = beam.bending_stiffness_n_m2, beam.length_m
-    f, u, f_slope, u_slope = _response_functions(-(length**4) * inertial_factor / elastic_factor)
-    per_mass = s_squared / (length * stiffness * inertial_factor)
+    stiffness_n_m2, length_m = beam.bending_stiffness_n_m2, beam.length_m
+    f, u, f_slope, u_slope = _response_functions(-(length_m**4) * inertial_factor / elastic_factor)
+    per_mass = s_squared / (length_m * stiffness_n_m2 * inertial_factor)
     mass_ratio = tip_mass_kg * per_mass
-    inverse = 1 / (1 - mass_ratio * f)
-    loaded = (f + mass_ratio * u) * inverse
-    by_ratio = (u + loaded * f) * inverse
-    slope = (f_slope + mass_ratio * u_slope + mass_ratio * loaded * f_slope) * inverse
-    per_length = -stiffness / length
+    inverse_factor = 1 / (1 - mass_ratio * f)
+    loaded_f = (f + mass_ratio * u) * inverse_factor
+    by_ratio = (u + loaded_f * f) * inverse_factor
+    loaded_slope = (
+        f_slope + mass_ratio * u_slope + mass_ratio * loaded_f * f_slope
+    ) * inverse_factor
+    per_length = -stiffness_n_m2 / length_m
     return LoadedResponse(
-        response=per_length * elastic_factor * loaded,
-        by_elastic=per_length * (loaded - slope),
-        by_inertial=per_length * elastic_factor / inertial_factor * (slope - mass_ratio * by_ratio),
+        response=per_length * elastic_factor * loaded_f,
+        by_elastic=per_length * (loaded_f - loaded_slope),
+        by_inertial=per_length
+        * elastic_factor
+        / inertial_factor
+        * (loaded_slope - mass_ratio * by_ratio),
         by_mass=per_length * elastic_factor * per_mass * by_ratio,
     )
 
@@ -143,21 +148,32 @@ def _add_stiffness_offsets(
     beam: Beam,
     stiffness_offsets: tuple[float, ...],
 ) -> LoadedResponse:
-    """Return the response after the stiffness offsets of modes 2, 3, … are applied to it."""
-    length, stiffness = beam.length_m, beam.bending_stiffness_n_m2
-    total, by_elastic, by_inertial = np.zeros((3, *np.shape(elastic_factor)), dtype=np.complex128)
+    """Return the torque per angle with the stiffness offsets of modes 2, 3, … included."""
+    length_m, stiffness_n_m2 = beam.length_m, beam.bending_stiffness_n_m2
+    total_response, by_elastic, by_inertial = np.zeros(
+        (3, *np.shape(elastic_factor)), dtype=np.complex128
+    )
     z = clamped_free_eigenvalues(1 + len(stiffness_offsets))[1:]
-    for k4, offset in zip((z / length) ** 4, stiffness_offsets, strict=True):
+    for k4, offset in zip((z / length_m) ** 4, stiffness_offsets, strict=True):
         # a² EI k⁴, with the participation a² = 4 L³ / z⁴
-        weight, stiffer = 4 * stiffness / length, 1 + offset
-        uniform = 1 / (elastic_factor * k4 + inertial_factor)
-        offset_mode = 1 / (elastic_factor * k4 * stiffer + inertial_factor)
-        total += weight * inertial_factor**2 * elastic_factor * offset * uniform * offset_mode
-        by_elastic += weight * inertial_factor**2 * (stiffer * offset_mode**2 - uniform**2)
-        by_inertial += weight * elastic_factor**2 * k4 * ((stiffer * offset_mode) ** 2 - uniform**2)
+        mode_weight, stiffer_mode = 4 * stiffness_n_m2 / length_m, 1 + offset
+        uniform_mode = 1 / (elastic_factor * k4 + inertial_factor)
+        offset_mode = 1 / (elastic_factor * k4 * stiffer_mode + inertial_factor)
+        total_response += (
+            mode_weight * inertial_factor**2 * elastic_factor * offset * uniform_mode * offset_mode
+        )
+        by_elastic += (
+            mode_weight * inertial_factor**2 * (stiffer_mode * offset_mode**2 - uniform_mode**2)
+        )
+        by_inertial += (
+            mode_weight
+            * elastic_factor**2
+            * k4
+            * ((stiffer_mode * offset_mode) ** 2 - uniform_mode**2)
+        )
     return replace(
         uniform_response,
-        response=uniform_response.response + total,
+        response=uniform_response.response + total_response,
         by_elastic=uniform_response.by_elastic + by_elastic,
         by_inertial=uniform_response.by_inertial + by_inertial,
     )
@@ -175,7 +191,7 @@ def differentiated_response(
     tip_mass_kg: float,
     stiffness_offsets: tuple[float, ...] = (),
 ) -> tuple[LoadedResponse, Slopes]:
-    """Return the response of a rigidly clamped beam with a tip mass, and its derivatives.
+    """Return the torque per angle of a rigidly clamped beam with a tip mass, and its derivatives.
 
     Parameters
     ----------
@@ -198,8 +214,11 @@ def differentiated_response(
     """
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
-    inertia = beam.density_over_stiffness * s_squared
-    elastic_factor, inertial_factor = 1 + damping.zeta * s_alpha, inertia + damping.gamma * s_lambda
+    inertial_term = beam.density_over_stiffness * s_squared
+    elastic_factor, inertial_factor = (
+        1 + damping.zeta * s_alpha,
+        inertial_term + damping.gamma * s_lambda,
+    )
     response = loaded_response(s_squared, elastic_factor, inertial_factor, beam, tip_mass_kg)
     if stiffness_offsets:
         response = _add_stiffness_offsets(
@@ -210,7 +229,7 @@ def differentiated_response(
         "alpha": lambda: response.by_elastic * (damping.zeta * log_s * s_alpha),
         "gamma": lambda: response.by_inertial * s_lambda,
         "lambda": lambda: response.by_inertial * (damping.gamma * log_s * s_lambda),
-        "ln_density_over_stiffness": lambda: response.by_inertial * inertia,
+        "ln_density_over_stiffness": lambda: response.by_inertial * inertial_term,
         "ln_stiffness": lambda: response.response - tip_mass_kg * response.by_mass,
         "tip_mass_kg": lambda: response.by_mass,
     }
@@ -269,17 +288,19 @@ class LoadedBeam:
         z = clamped_free_eigenvalues(len(frequency_hz))
         target_rad_s = 2 * math.pi * np.array(frequency_hz)
         offset_beam = LoadedBeam(self.beam, self.damping)
-        stiffness = np.ones(z.size)
+        relative_stiffness = np.ones(z.size)
         for _ in range(2):  # damping shifts the frequencies a little
             present_rad_s = offset_beam.poles(z)[:, 0].imag
             if not bool((present_rad_s > 0).all()):
                 raise ValueError("A mode of the beam does not oscillate.")
-            stiffness *= (target_rad_s / present_rad_s) ** 2
-            density_kg_per_m = self.beam.density_kg_per_m / float(stiffness[0])
+            relative_stiffness *= (target_rad_s / present_rad_s) ** 2
+            density_kg_per_m = self.beam.density_kg_per_m / float(relative_stiffness[0])
             offset_beam = LoadedBeam(
                 replace(self.beam, density_kg_per_m=density_kg_per_m),
                 self.damping,
-                stiffness_offsets=tuple((stiffness[1:] / stiffness[0] - 1).tolist()),
+                stiffness_offsets=tuple(
+                    (relative_stiffness[1:] / relative_stiffness[0] - 1).tolist()
+                ),
             )
         return offset_beam
 
@@ -307,7 +328,7 @@ class LoadedBeam:
         """
         at, by = self._response_and_slopes(s)
         clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
-        gradient = np.array([by[name]() for name in wrt], dtype=np.complex128)
+        gradient = np.array([by[parameter_name]() for parameter_name in wrt], dtype=np.complex128)
         return at.response * clamp_factor, gradient * clamp_factor * clamp_factor
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
@@ -327,11 +348,11 @@ class LoadedBeam:
         pole_distance = 0.0 if self.root_compliance_rad_per_nm else _POLE_DISTANCE
         s = poles_rad_s * (1 - pole_distance)
         at, by = self._response_and_slopes(s)
-        slope = self.derivative_by_s(s, at)
+        response_slope = self.derivative_by_s(s, at)
         gradients = np.zeros((s.size, len(wrt)), dtype=np.complex128)
-        for gradient_column, name in zip(gradients.T, wrt, strict=True):
-            if name in by:
-                gradient_column[:] = -by[name]() / slope
+        for gradient_column, parameter_name in zip(gradients.T, wrt, strict=True):
+            if parameter_name in by:
+                gradient_column[:] = -by[parameter_name]() / response_slope
         return gradients
 
     def _require_uniform(self) -> None:
@@ -340,7 +361,7 @@ class LoadedBeam:
             raise ValueError("Of modes of their own stiffness the shear is not known.")
 
     def _response_and_slopes(self, s: Complex) -> tuple[LoadedResponse, Slopes]:
-        """Return the response on a rigid clamp and functions that compute its derivatives.
+        """Return the coupling torque per angle on a rigid clamp, and functions for its derivatives.
 
         The derivative with respect to the clamp's compliance is that at a compliance of 0.
         """
@@ -366,53 +387,63 @@ class LoadedBeam:
         s
             Laplace variable in rad/s, not 0.
         """
-        grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
-        displacement, slope = grid.per_angle(tip) - tip, grid.per_angle(tip, 1) - 1
+        force_grid, tip = PointForceGrid(s, self.beam, self.damping), self.beam.length_m
+        displacement, slope_per_angle = (
+            force_grid.per_angle(tip) - tip,
+            force_grid.per_angle(tip, 1) - 1,
+        )
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         z = clamped_free_eigenvalues(1 + len(self.stiffness_offsets))
         tip_slopes = 2 * z * root_shear_ratio(z.size) / tip
-        for index, offset in enumerate(self.stiffness_offsets, start=1):
+        for offset_index, stiffness_offset in enumerate(self.stiffness_offsets, start=1):
             # Mode i contributes -p b / (c k⁴ (1 + d) + p); b is its part of a rigid rotation.
-            k4, rotation_part = (z[index] / tip) ** 4, 2 * (-1) ** index * tip / z[index] ** 2
-            offset_term = inertial_factor * rotation_part * elastic_factor * k4 * offset
+            k4, rotation_part = (
+                (z[offset_index] / tip) ** 4,
+                2 * (-1) ** offset_index * tip / z[offset_index] ** 2,
+            )
+            offset_term = inertial_factor * rotation_part * elastic_factor * k4 * stiffness_offset
             offset_term = offset_term / (
                 (elastic_factor * k4 + inertial_factor)
-                * (elastic_factor * k4 * (1 + offset) + inertial_factor)
+                * (elastic_factor * k4 * (1 + stiffness_offset) + inertial_factor)
             )
             displacement = displacement + 2 * offset_term
-            slope = slope + tip_slopes[index] * offset_term
+            slope_per_angle = slope_per_angle + tip_slopes[offset_index] * offset_term
         if self.tip_mass_kg:
-            tip_force = self._tip_force_per_angle(s, grid)
-            displacement = displacement + grid.per_force(tip, tip) * tip_force
-            slope = slope + grid.per_force(tip, tip, 1) * tip_force
+            tip_force = self._tip_force_per_angle(s, force_grid)
+            displacement = displacement + force_grid.per_force(tip, tip) * tip_force
+            slope_per_angle = slope_per_angle + force_grid.per_force(tip, tip, 1) * tip_force
         clamp_factor = 1 / (
             1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
         )
-        return displacement * clamp_factor, slope * clamp_factor
+        return displacement * clamp_factor, slope_per_angle * clamp_factor
 
-    def _tip_force_per_angle(self, s: Complex, grid: PointForceGrid) -> Complex:
+    def _tip_force_per_angle(self, s: Complex, force_grid: PointForceGrid) -> Complex:
         """Return the force in N/rad that the tip mass exerts on the beam per angle of the root."""
-        tip, load = self.beam.length_m, self.tip_mass_kg * s * s
-        tip_force: Complex = -load * grid.per_angle(tip) / (1 + load * grid.per_force(tip, tip))
+        tip, inertial_load = self.beam.length_m, self.tip_mass_kg * s * s
+        tip_force: Complex = (
+            -inertial_load
+            * force_grid.per_angle(tip)
+            / (1 + inertial_load * force_grid.per_force(tip, tip))
+        )
         return tip_force
 
     def shear(self, s: Complex) -> Complex:
         """Return the motor's transverse force on the beam per motor angle in N/rad at `s`."""
         self._require_uniform()
-        grid = PointForceGrid(s, self.beam, self.damping)
-        shear = grid.shear_per_angle()
+        force_grid = PointForceGrid(s, self.beam, self.damping)
+        shear_per_angle = force_grid.shear_per_angle()
         if self.tip_mass_kg:
-            shear = shear + grid.shear_per_force(self.beam.length_m) * self._tip_force_per_angle(
-                s, grid
-            )
+            shear_per_angle = shear_per_angle + force_grid.shear_per_force(
+                self.beam.length_m
+            ) * self._tip_force_per_angle(s, force_grid)
         if self.root_compliance_rad_per_nm:
-            shear = shear / (
+            shear_per_angle = shear_per_angle / (
                 1 + self.root_compliance_rad_per_nm * self.rigid_clamp_response(s).response
             )
-        return shear
+        return shear_per_angle
 
     def rigid_clamp_response(self, s: Complex) -> LoadedResponse:
-        """Return the response at `s` (rad/s) that the beam would have on a rigid clamp."""
+        """Return the torque per angle at `s` (rad/s) that the beam would have on a rigid clamp."""
         elastic_factor, inertial_factor = self.elastic_and_inertial_factors(s)
         response = loaded_response(
             s * s, elastic_factor, inertial_factor, self.beam, self.tip_mass_kg
@@ -455,7 +486,7 @@ class LoadedBeam:
         return elastic_factor, self.beam.density_over_stiffness * s * s + external
 
     def derivative_by_s(self, s: Complex, at: LoadedResponse) -> Complex:
-        """Return the derivative of the response on a rigid clamp with respect to s.
+        """Return the derivative by s of the coupling torque per angle on a rigid clamp.
 
         Parameters
         ----------
@@ -516,21 +547,21 @@ class LoadedBeam:
 
         A row is NaN if the path was lost.
         """
-        offsets = np.array(self.stiffness_offsets)
-        if not zeros and offsets.size:
+        stiffness_offsets = np.array(self.stiffness_offsets)
+        if not zeros and stiffness_offsets.size:
             # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
             z = z.copy()
-            z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
+            z[1 : 1 + stiffness_offsets.size] *= (1 + stiffness_offsets[: z.size - 1]) ** 0.25
         roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
         is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
-        if is_rigid and not (zeros and offsets.any()):
+        if is_rigid and not (zeros and stiffness_offsets.any()):
             return roots
         has_root = ~np.isnan(roots[:, 0])
         # One of a conjugate pair suffices; without oscillation both have to be found.
         oscillating = roots[has_root][:, 0].imag != 0
         second_real_poles = roots[has_root][~oscillating][:, 1]
-        current = np.concatenate([roots[has_root][:, 0], second_real_poles])
-        current *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
+        current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
+        current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
         # Relative to the beam's own values: a change that moves the poles little needs few steps.
         relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
         stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
@@ -538,69 +569,73 @@ class LoadedBeam:
             relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
         )
         if zeros:
-            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
-        steps = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
-        previous = current
-        for step in range(1, steps + 1):
-            fraction = step / steps
+            relative_change = max(
+                relative_change, float(np.abs(stiffness_offsets).max(initial=0.0))
+            )
+        step_count = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
+        previous_roots = current_roots
+        for step_number in range(1, step_count + 1):
+            fraction = step_number / step_count
             partial_beam = LoadedBeam(
                 self.beam,
                 self.damping,
                 fraction * self.tip_mass_kg,
                 fraction * self.root_compliance_rad_per_nm,
-                tuple((fraction if zeros else 1.0) * offsets),
+                tuple((fraction if zeros else 1.0) * stiffness_offsets),
             )
-            is_last_step = step == steps
-            start = 2 * current - previous if step > 1 else current
-            previous, current = (
-                current,
+            is_last_step = step_number == step_count
+            start_roots = 2 * current_roots - previous_roots if step_number > 1 else current_roots
+            previous_roots, current_roots = (
+                current_roots,
                 partial_beam._newton_roots(
-                    start,
+                    start_roots,
                     _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
                     zeros=zeros,
                 ),
             )
-        first = current[: oscillating.size]
-        second = first.conj()
-        second[~oscillating] = current[oscillating.size :]
-        roots[has_root] = np.column_stack([first, second])
+        first_roots = current_roots[: oscillating.size]
+        second_roots = first_roots.conj()
+        second_roots[~oscillating] = current_roots[oscillating.size :]
+        roots[has_root] = np.column_stack([first_roots, second_roots])
         return roots
 
-    def _newton_roots(self, s: Complex, tolerance: float, *, zeros: bool) -> Complex:
+    def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
         """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
 
-        `s` has the starts and `tolerance` is the relative length of the last step. The result is
-        NaN where no root is found near its start.
+        `s` has the start values; `step_tolerance` is the relative length of the last step. The
+        result is NaN where no root is found near its start.
         """
-        start = s
+        start_roots = s
         with np.errstate(all="ignore"):
             for _ in range(_MAX_NEWTON_STEPS):
                 at = self.rigid_clamp_response(s)
-                step = at.response / self.derivative_by_s(s, at)
-                step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
-                s = s + step
-                if not np.nanmax(np.abs(step / s), initial=0.0) > tolerance:
+                newton_step = at.response / self.derivative_by_s(s, at)
+                newton_step *= -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
+                s = s + newton_step
+                if not np.nanmax(np.abs(newton_step / s), initial=0.0) > step_tolerance:
                     break
             # Far from any root every step is short, too.
-            converged = (np.abs(step) < max(tolerance, 1e-9) * np.abs(s)) & (
-                np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start)
+            has_converged = (np.abs(newton_step) < max(step_tolerance, 1e-9) * np.abs(s)) & (
+                np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start_roots)
             )
-            return np.where(converged, s, np.nan + 0j)
+            return np.where(has_converged, s, np.nan + 0j)
 
 
 def _response_functions(q: Complex) -> tuple[Complex, Complex, Complex, Complex]:
-    """Return the functions F and U of the module's docstring at `q`, and q F' and q U'."""
+    """Return the loaded beam's dimensionless functions F and U at `q`, and q F' and q U'."""
     q = np.asarray(q, dtype=np.complex128)
     f, u, b = np.empty((3, *q.shape), dtype=np.complex128)
-    series = np.abs(q) < _SERIES_LIMIT
-    if series.any():
-        small_q = q[series]
-        divisor, *numerators = np.polynomial.polynomial.polyval(small_q, _SERIES_COEFFICIENTS)
-        for out, numerator in zip((f, u, b), numerators, strict=True):
-            out[series] = small_q * numerator / divisor
-    if not series.all():
-        for out, values in zip((f, u, b), _scaled_functions(q[~series]), strict=True):
-            out[~series] = values
+    is_small = np.abs(q) < _SERIES_LIMIT
+    if is_small.any():
+        small_q = q[is_small]
+        series_divisor, *series_numerators = np.polynomial.polynomial.polyval(
+            small_q, _SERIES_COEFFICIENTS
+        )
+        for out, series_numerator in zip((f, u, b), series_numerators, strict=True):
+            out[is_small] = small_q * series_numerator / series_divisor
+    if not is_small.all():
+        for out, function_values in zip((f, u, b), _scaled_functions(q[~is_small]), strict=True):
+            out[~is_small] = function_values
     return f, u, 0.25 * (f + u + f * f), 0.5 * (u + b) + 0.25 * u * f
 
 
@@ -613,12 +648,13 @@ def _scaled_functions(q: Complex) -> tuple[Complex, Complex, Complex]:
     a, b = decay * decay, rotation * rotation
     reciprocal = 1 / (4 * decay * rotation + (1 + a) * (1 + b))
     sine, cosine = 1j * (1 - b) * (1 + a), (1 + b) * (1 - a)
-    functions = (
+    scaled_values = (
         z * (sine - cosine) * reciprocal,
         2j * z**2 * (1 - a) * (1 - b) * reciprocal,
         z**3 * (sine + cosine) * reciprocal,
     )
-    first, second, third = (
-        np.where(lower_half_plane, values.conj(), values) for values in functions
+    scaled_f, scaled_u, scaled_b = (
+        np.where(lower_half_plane, function_values.conj(), function_values)
+        for function_values in scaled_values
     )
-    return first, second, third
+    return scaled_f, scaled_u, scaled_b

@@ -104,15 +104,15 @@ class Realisation:
 
     def transfer(self, s: ArrayLike) -> Complex:
         """Return the realisation's coupling torque per motor angle at `s` (rad/s), in N·m/rad."""
-        points = np.asarray(s, dtype=np.complex128)
-        columns = _basis_functions(points.ravel(), self.poles_rad_s)
-        direct = (
+        s_points = np.asarray(s, dtype=np.complex128)
+        basis_columns = _basis_functions(s_points.ravel(), self.poles_rad_s)
+        direct_terms = (
             self.direct_inertia_kg_m2,
             self.direct_viscosity_nm_s_per_rad,
             self.direct_stiffness_nm_per_rad,
         )
-        g: Complex = columns @ np.concatenate([self.c, direct])
-        return g.reshape(points.shape)
+        g: Complex = basis_columns @ np.concatenate([self.c, direct_terms])
+        return g.reshape(s_points.shape)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -164,55 +164,60 @@ def state_output(
         If the relative error exceeds 0.3 % (rms) between 0.02 and 500 Hz.
     """
     poles = realisation.poles_rad_s
-    omega, weight = _fit_grid(poles[poles.imag > 0])
+    omega, point_weights = _fit_grid(poles[poles.imag > 0])
     far = _far_from_landmarks(omega, poles, np.zeros(0, dtype=np.complex128))
     s = (1j * omega[far]).astype(np.complex128)
-    weight = weight[far]
-    exact = response(s)
-    columns = _basis_functions(s, poles)
-    fitted_columns = np.arange(columns.shape[1])
+    point_weights = point_weights[far]
+    exact_response = response(s)
+    basis_columns = _basis_functions(s, poles)
+    fitted_columns = np.arange(basis_columns.shape[1])
     if not inertial:
         fitted_columns = np.delete(fitted_columns, -3)
-    size = np.abs(exact) + small
-    matrix = columns[:, fitted_columns] * (weight / size)[:, None]
-    rows = np.concatenate([matrix.real, matrix.imag])
-    scale = np.linalg.norm(rows, axis=0)
-    weighted = exact * weight / size
-    target = np.concatenate([weighted.real, weighted.imag])
-    coefficients = np.zeros(columns.shape[1])
-    coefficients[fitted_columns] = (
-        np.linalg.lstsq(rows / scale, target, rcond=_SINGULAR_VALUE_CUTOFF)[0] / scale
+    response_size = np.abs(exact_response) + small
+    weighted_columns = basis_columns[:, fitted_columns] * (point_weights / response_size)[:, None]
+    real_rows = np.concatenate([weighted_columns.real, weighted_columns.imag])
+    column_scale = np.linalg.norm(real_rows, axis=0)
+    weighted_response = exact_response * point_weights / response_size
+    fit_target = np.concatenate([weighted_response.real, weighted_response.imag])
+    output_coefficients = np.zeros(basis_columns.shape[1])
+    output_coefficients[fitted_columns] = (
+        np.linalg.lstsq(real_rows / column_scale, fit_target, rcond=_SINGULAR_VALUE_CUTOFF)[0]
+        / column_scale
     )
     # The rms, not the largest error, since a response has zeros of its own.
-    within_band = weight == 1
-    residual = ((columns @ coefficients - exact) / size)[within_band]
-    error = float(np.sqrt(np.mean(np.abs(residual) ** 2)))
-    if not error <= _MAX_OUTPUT_ERROR:
+    within_band = point_weights == 1
+    relative_residual = ((basis_columns @ output_coefficients - exact_response) / response_size)[
+        within_band
+    ]
+    rms_error = float(np.sqrt(np.mean(np.abs(relative_residual) ** 2)))
+    if not rms_error <= _MAX_OUTPUT_ERROR:
         raise RealisationError(
-            f"A response of the beam is realised with a relative error of {error:.1e} (rms); "
+            f"A response of the beam is realised with a relative error of {rms_error:.1e} (rms); "
             f"{_MAX_OUTPUT_ERROR:.1e} is accepted."
         )
-    inertia, viscosity, stiffness = coefficients[-3:].tolist()
-    return StateOutput(coefficients[:-3], inertia, viscosity, stiffness)
+    inertia, viscosity, stiffness = output_coefficients[-3:].tolist()
+    return StateOutput(output_coefficients[:-3], inertia, viscosity, stiffness)
 
 
 def _basis_functions(s: Complex, poles: Complex) -> Complex:
-    """Return the functions of s whose sum, weighted by ``c, D, V, K``, is G.
+    """Return the functions of s whose sum, weighted by ``c, D, V, K``, is torque per angle.
 
     Shape (len(s), n + 3).
     """
-    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
+    upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
     s2 = (s * s)[:, None]
-    columns = np.empty((s.size, 2 * upper.size + real.size + 3), dtype=np.complex128)
-    shifted = s[:, None] - upper.real
-    determinant = shifted * shifted + upper.imag**2
-    columns[:, 0 : 2 * upper.size : 2] = s2 * shifted / determinant
-    columns[:, 1 : 2 * upper.size : 2] = -s2 * upper.imag / determinant
-    columns[:, 2 * upper.size : -3] = s2 / (s[:, None] - real)
-    columns[:, -3] = s2[:, 0]
-    columns[:, -2] = s
-    columns[:, -1] = 1
-    return columns
+    basis_columns = np.empty(
+        (s.size, 2 * upper_poles.size + real_poles.size + 3), dtype=np.complex128
+    )
+    shifted_s = s[:, None] - upper_poles.real
+    determinant = shifted_s * shifted_s + upper_poles.imag**2
+    basis_columns[:, 0 : 2 * upper_poles.size : 2] = s2 * shifted_s / determinant
+    basis_columns[:, 1 : 2 * upper_poles.size : 2] = -s2 * upper_poles.imag / determinant
+    basis_columns[:, 2 * upper_poles.size : -3] = s2 / (s[:, None] - real_poles)
+    basis_columns[:, -3] = s2[:, 0]
+    basis_columns[:, -2] = s
+    basis_columns[:, -1] = 1
+    return basis_columns
 
 
 def realise(
@@ -263,41 +268,49 @@ def realise(
     True
     """
     _check_passive(damping)
-    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets)
-    poles, modes = _realised_poles(loaded, beam if modes_of is None else modes_of)
-    zeros = _zeros_in_band(loaded)
+    loaded_beam = LoadedBeam(
+        beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets
+    )
+    poles, modes = _realised_poles(loaded_beam, beam if modes_of is None else modes_of)
+    zeros = _zeros_in_band(loaded_beam)
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
 
-    omega, weight = _fit_grid(poles_and_zeros)
+    omega, point_weights = _fit_grid(poles_and_zeros)
     far = _far_from_landmarks(omega, poles, zeros)
     s = 1j * omega[far]
-    exact = _exact_transfer(loaded, s)
-    scale = weight[far] / exact
-    coefficients = _fit_coefficients(
-        _basis_functions(s, poles) * scale[:, None], weight[far].astype(np.complex128)
+    exact_response = _exact_transfer(loaded_beam, s)
+    relative_weight = point_weights[far] / exact_response
+    output_coefficients = _fit_coefficients(
+        _basis_functions(s, poles) * relative_weight[:, None],
+        point_weights[far].astype(np.complex128),
     )
 
-    error = _relative_error(loaded, poles, zeros, coefficients)
-    if not error <= max_relative_error:
+    relative_error = _relative_error(loaded_beam, poles, zeros, output_coefficients)
+    if not relative_error <= max_relative_error:
         raise RealisationError(
-            f"{damping} on {beam} is realised with a relative error of {error:.1e} between "
+            f"{damping} on {beam} is realised with a relative error of {relative_error:.1e} "
+            "between "
             f"{ERROR_BAND_HZ[0]:g} and {ERROR_BAND_HZ[1]:g} Hz; {max_relative_error:.1e} was "
             "requested."
         )
-    realisation = _build_realisation(poles, modes, coefficients, error)
-    growth = _growth_on_frictionless_motor(realisation, beam)
-    if growth > MAX_GROWTH_PER_S:
+    realisation = _build_realisation(poles, modes, output_coefficients, relative_error)
+    growth_per_s = _growth_on_frictionless_motor(realisation, beam)
+    if growth_per_s > MAX_GROWTH_PER_S:
         raise RealisationError(
-            f"{damping} on {beam} is realised with a relative error of {error:.1e}, but a motor "
-            f"without friction would be unstable with it (growth {growth:.1e} 1/s)."
+            f"{damping} on {beam} is realised with a relative error of {relative_error:.1e}, "
+            "but a motor "
+            f"without friction would be unstable with it (growth {growth_per_s:.1e} 1/s)."
         )
     return realisation
 
 
 def _check_passive(damping: Damping) -> None:
-    """Raise if a coefficient or order of the damping lets the beam create energy."""
-    values = (damping.zeta, damping.gamma, damping.alpha, damping.lambda_)
-    if not all(value >= 0 for value in values) or not max(damping.alpha, damping.lambda_) < 2:
+    """Raise RealisationError if the damping is such that the beam creates energy."""
+    damping_values = (damping.zeta, damping.gamma, damping.alpha, damping.lambda_)
+    if (
+        not all(damping_value >= 0 for damping_value in damping_values)
+        or not max(damping.alpha, damping.lambda_) < 2
+    ):
         raise RealisationError(
             f"{damping} describes a beam that creates energy: zeta and gamma must not be negative, "
             "alpha and lambda must lie between 0 and 2."
@@ -319,58 +332,63 @@ def _realised_poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArra
     """
     highest_k_fourth = (2 * np.pi * _HIGHEST_MODE_HZ) ** 2 * modes_of.density_over_stiffness
     # Damping may lower the highest modes, so a few more are computed than the undamped count.
-    count = int(1.25 * highest_k_fourth**0.25 * modes_of.length_m / np.pi) + 3
-    if count > _MAX_MODES:
+    mode_count = int(1.25 * highest_k_fourth**0.25 * modes_of.length_m / np.pi) + 3
+    if mode_count > _MAX_MODES:
         raise RealisationError(
-            f"{modes_of} has some {count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
+            f"{modes_of} has some {mode_count} modes below {_HIGHEST_MODE_HZ:g} Hz, more than the "
             f"{_MAX_MODES} that are realised; check the units of its length, density and "
             "stiffness."
         )
-    eigenvalues = clamped_free_eigenvalues(count)
-    pairs = loaded.poles(eigenvalues)
+    eigenvalues = clamped_free_eigenvalues(mode_count)
+    pole_pairs = loaded.poles(eigenvalues)
     if modes_of == loaded.beam:
-        selected = _select_poles(pairs)
+        is_selected = _select_poles(pole_pairs)
     else:
-        selected = _select_poles(replace(loaded, beam=modes_of).poles(eigenvalues))
-    oscillating = pairs[:, 0].imag > 0
+        is_selected = _select_poles(replace(loaded, beam=modes_of).poles(eigenvalues))
+    oscillating = pole_pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
-    if np.isnan(pairs[selected]).any() or (oscillating & (selected.sum(axis=1) == 1)).any():
+    if (
+        np.isnan(pole_pairs[is_selected]).any()
+        or (oscillating & (is_selected.sum(axis=1) == 1)).any()
+    ):
         raise RealisationError(
             f"{loaded.beam} with {loaded.damping} does not have the modes of {modes_of}."
         )
-    upper = np.flatnonzero(oscillating & selected[:, 0])
-    over_damped = selected & ~oscillating[:, None]
+    upper_rows = np.flatnonzero(oscillating & is_selected[:, 0])
+    over_damped = is_selected & ~oscillating[:, None]
     cut = np.full(_BRANCH_CUT_POLES_RAD_S.size, -1)
     return (
-        np.concatenate([pairs[upper, 0], pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]),
-        np.concatenate([upper, np.nonzero(over_damped)[0], cut]),
+        np.concatenate(
+            [pole_pairs[upper_rows, 0], pole_pairs[over_damped], _BRANCH_CUT_POLES_RAD_S]
+        ),
+        np.concatenate([upper_rows, np.nonzero(over_damped)[0], cut]),
     )
 
 
-def _select_poles(pairs: Complex) -> NDArray[np.bool_]:
-    """Return a mask of the modal poles that the state space includes, in the shape of `pairs`."""
-    oscillating = pairs[:, 0].imag > 0
+def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
+    """Return a mask of the modal poles in the state space, in the shape of `pole_pairs`."""
+    oscillating = pole_pairs[:, 0].imag > 0
     mode_indices = np.flatnonzero(oscillating)
-    upper = pairs[mode_indices, 0]
-    within_band = np.abs(upper) < 2 * np.pi * _FIT_BAND_HZ[1]
-    lightly_damped = within_band | (-upper.real < _HEAVY_DAMPING_RATIO * np.abs(upper))
-    mode_indices, upper = mode_indices[lightly_damped], upper[lightly_damped]
-    above_band = np.flatnonzero(upper.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
+    upper_poles = pole_pairs[mode_indices, 0]
+    within_band = np.abs(upper_poles) < 2 * np.pi * _FIT_BAND_HZ[1]
+    lightly_damped = within_band | (-upper_poles.real < _HEAVY_DAMPING_RATIO * np.abs(upper_poles))
+    mode_indices, upper_poles = mode_indices[lightly_damped], upper_poles[lightly_damped]
+    above_band = np.flatnonzero(upper_poles.imag > 2 * np.pi * _HIGHEST_MODE_HZ)
     mode_indices = mode_indices[: above_band[0] + 1] if above_band.size else mode_indices
-    selected = ~oscillating[:, None] & (np.abs(pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
-    selected[mode_indices] = True
-    return selected
+    is_selected = ~oscillating[:, None] & (np.abs(pole_pairs) < 2 * np.pi * _HIGHEST_MODE_HZ)
+    is_selected[mode_indices] = True
+    return is_selected
 
 
 def _zeros_in_band(loaded: LoadedBeam) -> Complex:
     """Return the zeros of G in rad/s up to 500 Hz, which are poles of the pinned–free beam."""
     beam = loaded.beam
     highest_k_fourth = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
-    count = int(highest_k_fourth**0.25 * beam.length_m / np.pi) + 1
-    z = np.pi * np.arange(1.25, count + 1)  # of tan z = tanh z, within 4e-4
+    zero_count = int(highest_k_fourth**0.25 * beam.length_m / np.pi) + 1
+    z = np.pi * np.arange(1.25, zero_count + 1)  # of tan z = tanh z, within 4e-4
     zeros = loaded.zeros(z)[:, 0]
-    upper: Complex = zeros[zeros.imag > 0]
-    return upper
+    upper_zeros: Complex = zeros[zeros.imag > 0]
+    return upper_zeros
 
 
 def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
@@ -379,51 +397,53 @@ def _fit_grid(poles_and_zeros: Complex) -> tuple[Real, Real]:
     The grid covers the fit's band, where it is dense near `poles_and_zeros`, and both tails.
     """
     lowest_hz, highest_hz = _FIT_BAND_HZ
-    band = np.concatenate(
+    band_hz = np.concatenate(
         [np.geomspace(lowest_hz, highest_hz, 200), _grid_around(poles_and_zeros, 10)]
     )
-    band = band[(band >= lowest_hz) & (band <= highest_hz)]
-    tails = np.concatenate(
+    band_hz = band_hz[(band_hz >= lowest_hz) & (band_hz <= highest_hz)]
+    tails_hz = np.concatenate(
         [
             np.geomspace(_TAIL_BAND_HZ[0], lowest_hz, 25),
             np.geomspace(highest_hz, _TAIL_BAND_HZ[1], 25),
         ]
     )
-    frequency = np.concatenate([band, tails])
-    weight = np.concatenate([np.ones(band.size), np.full(tails.size, _TAIL_WEIGHT)])
-    return 2 * np.pi * frequency, weight
+    frequency_hz = np.concatenate([band_hz, tails_hz])
+    point_weights = np.concatenate([np.ones(band_hz.size), np.full(tails_hz.size, _TAIL_WEIGHT)])
+    return 2 * np.pi * frequency_hz, point_weights
 
 
 def _grid_around(poles_and_zeros: Complex, points: int) -> Real:
     """Return a grid of frequencies (Hz) within three half-widths of each pole or zero."""
     half_width = np.maximum(-poles_and_zeros.real, 1e-4 * poles_and_zeros.imag)
-    offsets = np.linspace(-3, 3, points)
-    frequency: Real = (poles_and_zeros.imag[:, None] + half_width[:, None] * offsets).ravel() / (
-        2 * np.pi
-    )
-    return frequency
+    width_offsets = np.linspace(-3, 3, points)
+    frequency_hz: Real = (
+        poles_and_zeros.imag[:, None] + half_width[:, None] * width_offsets
+    ).ravel() / (2 * np.pi)
+    return frequency_hz
 
 
-def _fit_coefficients(columns: Complex, target: Complex) -> Real:
+def _fit_coefficients(equation_columns: Complex, equation_target: Complex) -> Real:
     """Return the real least-squares solution whose last three unknowns (D, V, K) are not negative.
 
     The equations ``columns @ solution = target`` are complex.
     """
-    matrix = np.concatenate([columns.real, columns.imag])
-    scale = np.linalg.norm(matrix, axis=0)
-    q, r = np.linalg.qr(matrix / scale)
-    rotated = q.T @ np.concatenate([target.real, target.imag])
-    free_columns = np.arange(matrix.shape[1])
+    real_columns = np.concatenate([equation_columns.real, equation_columns.imag])
+    column_scale = np.linalg.norm(real_columns, axis=0)
+    q, r = np.linalg.qr(real_columns / column_scale)
+    rotated_target = q.T @ np.concatenate([equation_target.real, equation_target.imag])
+    free_columns = np.arange(real_columns.shape[1])
     while True:
-        solution = np.zeros(matrix.shape[1])
-        solution[free_columns] = np.linalg.lstsq(
-            r[:, free_columns], rotated, rcond=_SINGULAR_VALUE_CUTOFF
+        scaled_solution = np.zeros(real_columns.shape[1])
+        scaled_solution[free_columns] = np.linalg.lstsq(
+            r[:, free_columns], rotated_target, rcond=_SINGULAR_VALUE_CUTOFF
         )[0]
-        direct = solution[-3:]
-        if (direct >= 0).all():
-            scaled: Real = solution / scale
+        direct_terms = scaled_solution[-3:]
+        if (direct_terms >= 0).all():
+            scaled: Real = scaled_solution / column_scale
             return scaled
-        free_columns = free_columns[free_columns != matrix.shape[1] - 3 + np.argmin(direct)]
+        free_columns = free_columns[
+            free_columns != real_columns.shape[1] - 3 + np.argmin(direct_terms)
+        ]
 
 
 def _relative_error(
@@ -432,13 +452,13 @@ def _relative_error(
     """Return the realisation's largest relative error on a grid denser than that of the fit."""
     lowest_hz, highest_hz = ERROR_BAND_HZ
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
-    frequency = np.concatenate(
+    frequency_hz = np.concatenate(
         [np.geomspace(lowest_hz, highest_hz, 1200), _grid_around(poles_and_zeros, 34)]
     )
-    omega = 2 * np.pi * frequency[(frequency >= lowest_hz) & (frequency <= highest_hz)]
+    omega = 2 * np.pi * frequency_hz[(frequency_hz >= lowest_hz) & (frequency_hz <= highest_hz)]
     s = 1j * omega[_far_from_landmarks(omega, poles, zeros)]
-    exact = _exact_transfer(loaded, s)
-    return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact - 1)))
+    exact_response = _exact_transfer(loaded, s)
+    return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact_response - 1)))
 
 
 def _far_from_landmarks(omega: Real, poles: Complex, zeros: Complex) -> NDArray[np.bool_]:
@@ -450,22 +470,24 @@ def _far_from_landmarks(omega: Real, poles: Complex, zeros: Complex) -> NDArray[
 
 
 def _build_realisation(
-    poles: Complex, modes: NDArray[np.intp], coefficients: Real, error: float
+    poles: Complex, modes: NDArray[np.intp], coefficients: Real, relative_error: float
 ) -> Realisation:
     """Build the realisation from its poles and the fitted coefficients ``c, D, V, K``."""
-    upper, real = poles[poles.imag > 0], poles[poles.imag == 0].real
-    n = 2 * upper.size + real.size
+    upper_poles, real_poles = poles[poles.imag > 0], poles[poles.imag == 0].real
+    n = 2 * upper_poles.size + real_poles.size
     a = np.zeros((n, n))
-    upper_rows = np.arange(0, 2 * upper.size, 2)
-    a[upper_rows, upper_rows] = a[upper_rows + 1, upper_rows + 1] = upper.real
-    a[upper_rows, upper_rows + 1] = upper.imag
-    a[upper_rows + 1, upper_rows] = -upper.imag
-    real_rows = np.arange(2 * upper.size, n)
-    a[real_rows, real_rows] = real
+    upper_rows = np.arange(0, 2 * upper_poles.size, 2)
+    a[upper_rows, upper_rows] = a[upper_rows + 1, upper_rows + 1] = upper_poles.real
+    a[upper_rows, upper_rows + 1] = upper_poles.imag
+    a[upper_rows + 1, upper_rows] = -upper_poles.imag
+    real_rows = np.arange(2 * upper_poles.size, n)
+    a[real_rows, real_rows] = real_poles
     b = np.ones(n)
     b[upper_rows + 1] = 0.0
-    inertia, viscosity, stiffness = (float(value) for value in coefficients[-3:])
-    return Realisation(a, b, coefficients[:-3], inertia, viscosity, stiffness, error, poles, modes)
+    inertia, viscosity, stiffness = (float(coefficient) for coefficient in coefficients[-3:])
+    return Realisation(
+        a, b, coefficients[:-3], inertia, viscosity, stiffness, relative_error, poles, modes
+    )
 
 
 def _growth_on_frictionless_motor(realisation: Realisation, beam: Beam) -> float:
@@ -549,19 +571,19 @@ def with_filter(model: CoupledModel, corner_hz: float, order: int) -> CoupledMod
     a = np.zeros((n + extra_states, n + extra_states))
     b = np.zeros(n + extra_states)
     a[:n, :n], b[:n] = model.a, model.b
-    filtered = (
+    filtered_outputs = (
         (n, model.sensor_torque, model.sensor_torque_per_torque),
         (n + order, model.shear, model.shear_per_torque),
     )
-    for first, row, per_torque in filtered:
-        last = first + order - 1
+    for first_state, row, per_torque in filtered_outputs:
+        last_state = first_state + order - 1
         # x' = omega (u - x), or x' = omega y, y' = omega (u - x - sqrt(2) y)
-        a[last, :n] = omega * row
-        b[last] = omega * per_torque
-        a[last, first] = -omega
+        a[last_state, :n] = omega * row
+        b[last_state] = omega * per_torque
+        a[last_state, first_state] = -omega
         if order == 2:
-            a[first, last] = omega
-            a[last, last] = -math.sqrt(2) * omega
+            a[first_state, last_state] = omega
+            a[last_state, last_state] = -math.sqrt(2) * omega
     no_output = np.zeros(extra_states)
     return replace(
         model,
@@ -606,7 +628,7 @@ def couple(
     rigid_torque = np.zeros(n)  # Γ without the term D θ''
     direct_inertia = 0.0
     a = np.zeros((n, n))
-    angle, velocity = np.eye(2, n)
+    angle_row, velocity_row = np.eye(2, n)
     if realisation is not None:
         rigid_torque[0] = realisation.direct_stiffness_nm_per_rad
         rigid_torque[1] = realisation.direct_viscosity_nm_s_per_rad
@@ -615,29 +637,29 @@ def couple(
         a[2:, 2:] = realisation.a
 
     total_inertia = motor_inertia_kg_m2 + tool_inertia_kg_m2 + direct_inertia
-    acceleration = -(rigid_torque + viscous_nm_s_per_rad * velocity) / total_inertia
-    a[0] = velocity
-    a[1] = acceleration
-    b = velocity / total_inertia
+    acceleration_row = -(rigid_torque + viscous_nm_s_per_rad * velocity_row) / total_inertia
+    a[0] = velocity_row
+    a[1] = acceleration_row
+    b = velocity_row / total_inertia
     if realisation is not None:
-        a[2:] += np.outer(realisation.b, acceleration)
+        a[2:] += np.outer(realisation.b, acceleration_row)
         b[2:] = realisation.b / total_inertia
     sensed_inertia = direct_inertia + tool_inertia_kg_m2
     shear_row, shear_per_acceleration = np.zeros(n), 0.0
     if shear is not None:
         shear_per_acceleration = shear.per_acceleration
         shear_row = np.concatenate([[shear.per_angle, shear.per_velocity], shear.c])
-        shear_row += shear_per_acceleration * acceleration
+        shear_row += shear_per_acceleration * acceleration_row
     return CoupledModel(
         a=a,
         b=b,
-        angle=angle,
-        velocity=velocity,
-        acceleration=acceleration,
+        angle=angle_row,
+        velocity=velocity_row,
+        acceleration=acceleration_row,
         acceleration_per_torque=1 / total_inertia,
-        beam_torque=rigid_torque + direct_inertia * acceleration,
+        beam_torque=rigid_torque + direct_inertia * acceleration_row,
         beam_torque_per_torque=direct_inertia / total_inertia,
-        sensor_torque=rigid_torque + sensed_inertia * acceleration,
+        sensor_torque=rigid_torque + sensed_inertia * acceleration_row,
         sensor_torque_per_torque=sensed_inertia / total_inertia,
         shear=shear_row,
         shear_per_torque=shear_per_acceleration / total_inertia,
@@ -671,11 +693,11 @@ def propagator(model: CoupledModel, duration_s: float) -> tuple[Real, Real]:
      [0.  1. ]] [ 2.5 50. ]
     """
     n = model.b.size
-    extended = np.zeros((n + 1, n + 1))
-    extended[:n, :n] = model.a * duration_s
-    extended[:n, n] = model.b * duration_s
-    exponential = _matrix_exponential(extended)
-    return exponential[:n, :n], exponential[:n, n]
+    extended_matrix = np.zeros((n + 1, n + 1))
+    extended_matrix[:n, :n] = model.a * duration_s
+    extended_matrix[:n, n] = model.b * duration_s
+    matrix_exponential = _matrix_exponential(extended_matrix)
+    return matrix_exponential[:n, :n], matrix_exponential[:n, n]
 
 
 def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: float) -> Real:
@@ -691,32 +713,32 @@ def states_after_constant_inputs(model: CoupledModel, inputs: Real, duration_s: 
         Time for which the inputs are constant.
     """
     n, m = inputs.shape
-    extended = np.zeros((n + m, n + m))
-    extended[:n, :n] = model.a * duration_s
-    extended[:n, n:] = inputs * duration_s
-    return _matrix_exponential(extended)[:n, n:]
+    extended_matrix = np.zeros((n + m, n + m))
+    extended_matrix[:n, :n] = model.a * duration_s
+    extended_matrix[:n, n:] = inputs * duration_s
+    return _matrix_exponential(extended_matrix)[:n, n:]
 
 
-def _matrix_exponential(matrix: Real) -> Real:
+def _matrix_exponential(square_matrix: Real) -> Real:
     """Return the matrix exponential by scaling and squaring with the [13/13] Padé approximant.
 
     Algorithm 2.3 of N. J. Higham, SIAM J. Matrix Anal. Appl. 26 (2005) 1179, without its low-order
     cases. scipy has the same, but importing it takes longer than all else a fast session starts.
     """
-    norm = float(np.linalg.norm(matrix, 1))
-    squarings = max(0, math.ceil(math.log2(norm / 5.37))) if norm > 0 else 0
-    x = matrix / 2.0**squarings
+    matrix_norm = float(np.linalg.norm(square_matrix, 1))
+    squarings = max(0, math.ceil(math.log2(matrix_norm / 5.37))) if matrix_norm > 0 else 0
+    x = square_matrix / 2.0**squarings
     x2 = x @ x
     x4 = x2 @ x2
-    powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
-    coefficient = np.cumprod([1.0] + [(13 - k) / ((26 - k) * (k + 1)) for k in range(13)])
-    upper_rows, odd = (
-        np.tensordot(coefficient[parity:8:2], powers, 1)
-        + powers[3] @ np.tensordot(coefficient[8 + parity :: 2], powers[1:], 1)
+    matrix_powers = np.stack([np.eye(len(x)), x2, x4, x2 @ x4])  # of x²: 0, 1, 2, 3
+    pade_coefficients = np.cumprod([1.0] + [(13 - k) / ((26 - k) * (k + 1)) for k in range(13)])
+    even_part, odd = (
+        np.tensordot(pade_coefficients[parity:8:2], matrix_powers, 1)
+        + matrix_powers[3] @ np.tensordot(pade_coefficients[8 + parity :: 2], matrix_powers[1:], 1)
         for parity in (0, 1)
     )
     odd = x @ odd
-    result: Real = np.linalg.solve(upper_rows - odd, upper_rows + odd)
+    matrix_exponential: Real = np.linalg.solve(even_part - odd, even_part + odd)
     for _ in range(squarings):
-        result = result @ result
-    return result
+        matrix_exponential = matrix_exponential @ matrix_exponential
+    return matrix_exponential

@@ -106,53 +106,59 @@ def tip_motion(
     14.2 mm, 0.0201 rad
     """
     n = angle_rad.size
-    padded = _fast_fft_length(int(np.ceil(_EXTENSION_FACTOR * n)))
+    padded_length = _fast_fft_length(int(np.ceil(_EXTENSION_FACTOR * n)))
     # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY_EXPONENT * rate_hz / padded
-    s = np.asarray(2j * np.pi * np.fft.rfftfreq(padded, 1 / rate_hz), np.complex128)
+    sigma = _DECAY_EXPONENT * rate_hz / padded_length
+    s = np.asarray(2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128)
     s += sigma
     # The angle stays at its final value: a jump back would ring at the last samples.
-    angle = np.full(padded, angle_rad[-1] - angle_rad[0])
-    np.subtract(angle_rad, angle_rad[0], out=angle[:n])
-    for start in range(0, padded, _BLOCK_POINTS):
-        ticks = np.arange(start, min(start + _BLOCK_POINTS, padded))
-        angle[start : start + _BLOCK_POINTS] *= np.exp(-sigma * ticks / rate_hz)
-    deflection = np.fft.rfft(angle)
-    del angle
+    angle_samples = np.full(padded_length, angle_rad[-1] - angle_rad[0])
+    np.subtract(angle_rad, angle_rad[0], out=angle_samples[:n])
+    for block_start in range(0, padded_length, _BLOCK_POINTS):
+        tick_numbers = np.arange(block_start, min(block_start + _BLOCK_POINTS, padded_length))
+        angle_samples[block_start : block_start + _BLOCK_POINTS] *= np.exp(
+            -sigma * tick_numbers / rate_hz
+        )
+    deflection_spectrum = np.fft.rfft(angle_samples)
+    del angle_samples
     tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
-    loaded = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
+    loaded_beam = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
     # Block by block and without copies: these arrays have the record's length.
-    for start in range(0, s.size, _BLOCK_POINTS):
-        block_slice = slice(start, start + _BLOCK_POINTS)
-        angle_spectrum = deflection[block_slice].copy()
+    for block_start in range(0, s.size, _BLOCK_POINTS):
+        block_slice = slice(block_start, block_start + _BLOCK_POINTS)
+        angle_spectrum = deflection_spectrum[block_slice].copy()
         root_angle: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
-        if loaded.is_uniform_cantilever:
-            tip_displacement, slope = tip_response(beam, damping, s[block_slice])
+        if loaded_beam.is_uniform_cantilever:
+            tip_displacement, slope_per_angle = tip_response(beam, damping, s[block_slice])
             tip_displacement -= beam.length_m
-            slope -= 1
+            slope_per_angle -= 1
         else:
-            tip_displacement, slope = loaded.tip_response(s[block_slice])
+            tip_displacement, slope_per_angle = loaded_beam.tip_response(s[block_slice])
             root_angle = angle_spectrum * (
-                1 - root_compliance_rad_per_nm * loaded.transfer(s[block_slice])
+                1 - root_compliance_rad_per_nm * loaded_beam.transfer(s[block_slice])
             )
-        deflection[block_slice] = tip_displacement * angle_spectrum
-        tip_slope[block_slice] = slope * angle_spectrum
+        deflection_spectrum[block_slice] = tip_displacement * angle_spectrum
+        tip_slope[block_slice] = slope_per_angle * angle_spectrum
         tip_speed[block_slice] = s[block_slice] * (
-            deflection[block_slice] + beam.length_m * root_angle
+            deflection_spectrum[block_slice] + beam.length_m * root_angle
         )
     del s
 
     def largest(spectrum: Complex) -> float:
-        motion = np.fft.irfft(spectrum, padded)[:n]
-        peaks = []
-        for start in range(0, n, _BLOCK_POINTS):
-            block = motion[start : start + _BLOCK_POINTS]
-            growth = np.exp(sigma * np.arange(start, start + block.size) / rate_hz)
-            peaks.append(float(np.max(np.abs(block * growth))))
-        return float(np.max(peaks))  # NaN stays NaN
+        motion_samples = np.fft.irfft(spectrum, padded_length)[:n]
+        block_peaks = []
+        for block_start in range(0, n, _BLOCK_POINTS):
+            motion_block = motion_samples[block_start : block_start + _BLOCK_POINTS]
+            growth_factor = np.exp(
+                sigma * np.arange(block_start, block_start + motion_block.size) / rate_hz
+            )
+            block_peaks.append(float(np.max(np.abs(motion_block * growth_factor))))
+        return float(np.max(block_peaks))  # NaN stays NaN
 
     return TipMotion(
-        deflection_m=largest(deflection), slope_rad=largest(tip_slope), speed_m_s=largest(tip_speed)
+        deflection_m=largest(deflection_spectrum),
+        slope_rad=largest(tip_slope),
+        speed_m_s=largest(tip_speed),
     )
 
 
@@ -170,26 +176,26 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     -------
     displacement
         Displacement of the tip per angle in m/rad, in the shape of `s`.
-    slope
+    tip_slope
         Slope of the tip per angle, dimensionless, in the shape of `s`.
     """
     external = damping.gamma * s**damping.lambda_
     internal = 1 + damping.zeta * s**damping.alpha
-    fourth = -(beam.density_over_stiffness * s * s + external) / internal
-    z = beam.length_m * np.sqrt(np.sqrt(fourth))
+    fourth_power = -(beam.density_over_stiffness * s * s + external) / internal
+    z = beam.length_m * np.sqrt(np.sqrt(fourth_power))
     # Numerators and denominator over exp(z - j sign z): nothing overflows.
-    sign = np.where(z.imag < 0, -1.0, 1.0)
-    rotation, decay = np.exp(1j * sign * z), np.exp(-z)
+    imaginary_sign = np.where(z.imag < 0, -1.0, 1.0)
+    rotation, decay = np.exp(1j * imaginary_sign * z), np.exp(-z)
     a, b = decay * decay, rotation * rotation
     reciprocal = 1 / (4 * rotation * decay + (1 + b) * (1 + a))
-    sines = 2 * rotation * (1 - a) + 2j * sign * decay * (1 - b)
+    sines = 2 * rotation * (1 - a) + 2j * imaginary_sign * decay * (1 - b)
     cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
     displacement: Complex = beam.length_m * sines * reciprocal / z
-    slope: Complex = cosines * reciprocal
-    return displacement, slope
+    tip_slope: Complex = cosines * reciprocal
+    return displacement, tip_slope
 
 
 def _fast_fft_length(min_length: int) -> int:
     """Return a length of at least `min_length`, at most an eighth more, whose FFT is fast."""
-    unit = 1 << max(0, min_length.bit_length() - 4)
-    return -(-min_length // unit) * unit
+    length_unit = 1 << max(0, min_length.bit_length() - 4)
+    return -(-min_length // length_unit) * length_unit

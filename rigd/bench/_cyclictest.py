@@ -41,15 +41,15 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> LoopMeasu
     The program runs on the core `cpu` with the SCHED_FIFO priority `priority`; 0 means ordinary
     scheduling.
     """
-    command = [
+    command_line = [
         *(NAME, "--quiet", "--threads=1", f"--affinity={cpu}", "--mlockall"),
         *(f"--priority={priority}", f"--policy={'fifo' if priority else 'other'}"),
         *(f"--interval={round(1e6 / rate_hz)}", f"--loops={round(rate_hz * seconds)}"),
         *(f"--histogram={_HISTOGRAM_US}", f"--latency={MAX_WAKE_UP_US}"),
     ]
     try:
-        completed = subprocess.run(
-            command,
+        completed_process = subprocess.run(
+            command_line,
             capture_output=True,
             text=True,
             check=True,
@@ -57,9 +57,11 @@ def run(rate_hz: float, seconds: float, *, cpu: int, priority: int) -> LoopMeasu
             env=os.environ | {"LC_ALL": "C"},
         )
     except (OSError, subprocess.SubprocessError) as error:
-        message = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
-        raise CyclictestError(message[-1] if message else "it failed without a message") from error
-    return parse_measurement(completed.stdout, rate_hz)
+        error_message = (getattr(error, "stderr", None) or str(error)).strip().splitlines()
+        raise CyclictestError(
+            error_message[-1] if error_message else "it failed without a message"
+        ) from error
+    return parse_measurement(completed_process.stdout, rate_hz)
 
 
 def parse_measurement(output: str, rate_hz: float) -> LoopMeasurement:
@@ -71,16 +73,24 @@ def parse_measurement(output: str, rate_hz: float) -> LoopMeasurement:
     delays_us = np.array(list(_delays(output)), dtype=np.float64)
     if not delays_us.size:
         raise CyclictestError("its output holds no histogram.")
-    missed = int(np.floor(delays_us * rate_hz * 1e-6).sum())
+    missed_ticks = int(np.floor(delays_us * rate_hz * 1e-6).sum())
     return LoopMeasurement(
-        NAME, rate_hz, delays_us, np.empty(0), scheduled=delays_us.size + missed, missed=missed
+        NAME,
+        rate_hz,
+        delays_us,
+        np.empty(0),
+        scheduled=delays_us.size + missed_ticks,
+        missed=missed_ticks,
     )
 
 
 def _delays(output: str) -> Iterator[float]:
     """Yield all delays in µs of the histogram in the program's output."""
-    for delay_us, count in _BIN_LINE.findall(output):
-        yield from [float(delay_us)] * int(count)
-    overflows, largest = _OVERFLOW_LINE.search(output), _LARGEST_DELAY_LINE.search(output)
-    if overflows is not None and largest is not None:
-        yield from [float(largest[1])] * int(overflows[1])
+    for delay_us, delay_count in _BIN_LINE.findall(output):
+        yield from [float(delay_us)] * int(delay_count)
+    overflow_match, largest_match = (
+        _OVERFLOW_LINE.search(output),
+        _LARGEST_DELAY_LINE.search(output),
+    )
+    if overflow_match is not None and largest_match is not None:
+        yield from [float(largest_match[1])] * int(overflow_match[1])

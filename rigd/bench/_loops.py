@@ -55,8 +55,8 @@ def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profi
     """
     rig = profile.rig
     if unknown_values(rig):  # these values are irrelevant here
-        sim = load_profile("sim").rig
-        rig = replace(rig, motor=sim.motor, encoder=sim.encoder)
+        simulated_rig = load_profile("sim").rig
+        rig = replace(rig, motor=simulated_rig.motor, encoder=simulated_rig.encoder)
     return replace(
         profile,
         rig=replace(
@@ -95,54 +95,56 @@ def simulated_profile(profile: Profile, rate_hz: float, spin_us: float) -> Profi
 def connected_rig(profile: Profile, *, live: bool = False) -> Iterator[tuple[Rig, ProcessGroup]]:
     """Start and connect the processes of a rig; they end when the context is left."""
     try:
-        with ProcessGroup(live=live) as group, ExitStack() as connection:
-            rig = Rig(profile, group=group)
+        with ProcessGroup(live=live) as process_group, ExitStack() as connection:
+            rig = Rig(profile, group=process_group)
             rig.connect()
             # This also releases the priority and cores of the supervisor, which the next
             # measurement, such as cyclictest, would inherit.
             connection.callback(rig.disconnect)
-            yield rig, group
+            yield rig, process_group
     except (FailureError, OSError) as error:
         raise LoopError(str(error)) from error
 
 
-def run_alone(name: str, profile: Profile, seconds: float, on_poll: OnPoll) -> LoopMeasurement:
+def run_alone(
+    measurement_name: str, profile: Profile, seconds: float, on_poll: OnPoll
+) -> LoopMeasurement:
     """Measure the loop without a recorder, or raise LoopError.
 
     This process only reads the samples from the ring buffer.
     """
     rate_hz, excitation = profile.rig.rate_hz, _hold_excitation(profile, seconds)
-    with connected_rig(profile) as (_, group):
-        channels, shared_state = group.channels, group.channels.shared_state
-        meter = UsageMeter(group.control.pid)
+    with connected_rig(profile) as (_, process_group):
+        channels, shared_state = process_group.channels, process_group.channels.shared_state
+        usage_meter = UsageMeter(process_group.control.pid)
         shared_state[StateField.STOP] = Stop.NO
         shared_state[StateField.GO] = 1
-        reference = write_reference(channels.reference_fd, excitation.reference_rad)
-        group.control.send(SessionJob(profile, reference))
-        blocks = []
-        finished = None
-        while not isinstance(finished, Finished):
-            finished = group.control.poll(_POLL_TIMEOUT_S)
+        reference_record = write_reference(channels.reference_fd, excitation.reference_rad)
+        process_group.control.send(SessionJob(profile, reference_record))
+        sample_blocks = []
+        finished_message = None
+        while not isinstance(finished_message, Finished):
+            finished_message = process_group.control.poll(_POLL_TIMEOUT_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            meter.sample(Phase(shared_state[StateField.PHASE]))
-            while block := channels.samples.take(_BLOCK_RECORDS):
-                blocks.append(block)
+            usage_meter.sample(Phase(shared_state[StateField.PHASE]))
+            while sample_block := channels.samples.take(_BLOCK_RECORDS):
+                sample_blocks.append(sample_block)
             channels.controls.discard()
             channels.timings.discard()
             on_poll()
-    _require_complete(finished.outcome, finished.reason)
+    _require_complete(finished_message.outcome, finished_message.reason)
     return record_measurement(
-        name,
+        measurement_name,
         rate_hz,
-        np.concatenate([decode_samples(block) for block in blocks]),
-        scheduled=excitation.reference_rad.size,
-        cpu_percent=meter.cpu_percent,
-        page_faults=meter.page_faults,
+        np.concatenate([decode_samples(sample_block) for sample_block in sample_blocks]),
+        scheduled_ticks=excitation.reference_rad.size,
+        cpu_percent=usage_meter.cpu_percent,
+        page_faults=usage_meter.page_faults,
     )
 
 
 def run_session(
-    name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
+    measurement_name: str, profile: Profile, seconds: float, on_poll: OnPoll, *, live: bool = False
 ) -> LoopMeasurement:
     """Measure a complete session like that of ``rigd run``, or raise LoopError.
 
@@ -150,30 +152,30 @@ def run_session(
     """
     excitation = _hold_excitation(profile, seconds)
     with (
-        tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
-        connected_rig(profile, live=live) as (rig, group),
+        tempfile.TemporaryDirectory(prefix="rigd-bench-") as temporary_folder,
+        connected_rig(profile, live=live) as (rig, process_group),
     ):
-        order = Order(profile, excitation, Path(folder) / "bench.mcap")
-        meter = UsageMeter(group.control.pid)
-        stop = StopRequest()
+        session_order = Order(profile, excitation, Path(temporary_folder) / "bench.mcap")
+        usage_meter = UsageMeter(process_group.control.pid)
+        stop_request = StopRequest()
         if live:
-            rig.show(order, stop)
+            rig.show(session_order, stop_request)
 
         def on_progress(progress: SessionProgress, _: object) -> None:
-            meter.sample(progress.phase)
+            usage_meter.sample(progress.phase)
             on_poll()
 
-        result = rig.run(order, stop, on_progress)
-        _require_complete(result.outcome, result.reason)
-        assert result.path is not None
-        samples = read_session(result.path).samples
+        session_result = rig.run(session_order, stop_request, on_progress)
+        _require_complete(session_result.outcome, session_result.reason)
+        assert session_result.path is not None
+        samples = read_session(session_result.path).samples
     return record_measurement(
-        name,
+        measurement_name,
         profile.rig.rate_hz,
         samples,
-        scheduled=excitation.reference_rad.size,
-        cpu_percent=meter.cpu_percent,
-        page_faults=meter.page_faults,
+        scheduled_ticks=excitation.reference_rad.size,
+        cpu_percent=usage_meter.cpu_percent,
+        page_faults=usage_meter.page_faults,
     )
 
 

@@ -62,7 +62,7 @@ class Results:
     @property
     def alone(self) -> LoopMeasurement:
         """Measurements of the loop alone, pooled over the rounds."""
-        return pool_measurements(LOOP_ALONE, [loop for loop, _ in self.rounds])
+        return pool_measurements(LOOP_ALONE, [loop_alone for loop_alone, _ in self.rounds])
 
     @property
     def peer(self) -> LoopMeasurement | None:
@@ -72,16 +72,22 @@ class Results:
 
     @property
     def highest_rate_hz(self) -> float | None:
-        """Highest measured rate in Hz at which nearly all ticks ran in time, or None."""
+        """Highest measured rate in Hz at which 99.9 % of the ticks ran in time, or None."""
         held_rates = [
-            measured.rate_hz for measured in self.search if measured.held >= HELD_FRACTION
+            search_measurement.rate_hz
+            for search_measurement in self.search
+            if search_measurement.held >= HELD_FRACTION
         ]
         return max(held_rates, default=None)
 
     @property
     def highest_rate_between_stalls_hz(self) -> float | None:
-        """Highest rate in Hz at which nearly all ticks outside of stalls ran in time, or None."""
-        held_rates = [measured.rate_hz for measured in self.search if _holds(measured)]
+        """Highest rate in Hz at which 99.9 % of the ticks were in time, without stalls; or None."""
+        held_rates = [
+            search_measurement.rate_hz
+            for search_measurement in self.search
+            if _holds(search_measurement)
+        ]
         return max(held_rates, default=None)
 
     def ratios(self) -> tuple[float, float] | None:
@@ -90,15 +96,15 @@ class Results:
         They are medians over the rounds, or None without cyclictest.
         """
         pairs = [
-            (percentiles(loop.lateness_us), percentiles(peer.lateness_us))
-            for loop, peer in self.rounds
+            (percentiles(loop_alone.lateness_us), percentiles(peer.lateness_us))
+            for loop_alone, peer in self.rounds
             if peer is not None
         ]
         if not pairs:
             return None
         return (
-            _median([loop.p50 / max(peer.p50, 1.0) for loop, peer in pairs]),
-            _median([loop.p99 / max(peer.p99, 1.0) for loop, peer in pairs]),
+            _median([loop_alone.p50 / max(peer.p50, 1.0) for loop_alone, peer in pairs]),
+            _median([loop_alone.p99 / max(peer.p99, 1.0) for loop_alone, peer in pairs]),
         )
 
 
@@ -161,8 +167,8 @@ class Bench:
     def alternate(self, results: Results) -> None:
         """Measure the loop alone and cyclictest in turn, and add the results."""
         for _ in range(ROUNDS):
-            loop = self._measure_loop_alone()
-            results.rounds.append((loop, self._measure_cyclictest(results)))
+            loop_alone = self._measure_loop_alone()
+            results.rounds.append((loop_alone, self._measure_cyclictest(results)))
 
     def run_sessions(self, results: Results) -> None:
         """Measure complete sessions with increasing additional load, and add the results."""
@@ -184,23 +190,23 @@ class Bench:
             rate_hz = rate_hz * 2.0 if upwards else rate_hz / 2.0
             if not LOWEST_HZ <= rate_hz <= HIGHEST_HZ:
                 return
-            attempt = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
-            if attempt.held < HELD_FRACTION:
-                attempt = max(
-                    attempt, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
+            attempt_number = self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz)
+            if attempt_number.held < HELD_FRACTION:
+                attempt_number = max(
+                    attempt_number, self.session(f"{rate_hz:g} Hz", rate_hz=rate_hz), key=_sort_key
                 )
-            results.search.append(attempt)
-            if _holds(attempt) is not upwards:
+            results.search.append(attempt_number)
+            if _holds(attempt_number) is not upwards:
                 return
 
     def session(
-        self, name: str, *, rate_hz: float | None = None, live: bool = False
+        self, measurement_name: str, *, rate_hz: float | None = None, live: bool = False
     ) -> LoopMeasurement:
-        """Measure a complete session.
+        """Measure the loop in a complete session like that of ``rigd run``.
 
         Parameters
         ----------
-        name
+        measurement_name
             Name of the measurement.
         rate_hz
             Rate of the loop, or None for that of the series.
@@ -208,15 +214,17 @@ class Bench:
             Whether the session is shown in a live view.
         """
         rate_hz = rate_hz or self._rate_hz
-        self._register_start(name)
-        profile = loops.simulated_profile(self._profile, rate_hz, self._spin_us)
-        return loops.run_session(name, profile, self._seconds, self._show_progress, live=live)
+        self._register_start(measurement_name)
+        simulated_profile = loops.simulated_profile(self._profile, rate_hz, self._spin_us)
+        return loops.run_session(
+            measurement_name, simulated_profile, self._seconds, self._show_progress, live=live
+        )
 
     def _measure_loop_alone(self) -> LoopMeasurement:
         """Measure the loop without a recorder."""
         self._register_start(LOOP_ALONE)
-        profile = loops.simulated_profile(self._profile, self._rate_hz, self._spin_us)
-        return loops.run_alone(LOOP_ALONE, profile, self._seconds, self._show_progress)
+        simulated_profile = loops.simulated_profile(self._profile, self._rate_hz, self._spin_us)
+        return loops.run_alone(LOOP_ALONE, simulated_profile, self._seconds, self._show_progress)
 
     def _measure_cyclictest(self, results: Results) -> LoopMeasurement | None:
         """Measure with cyclictest, or return None and state the reason in the results."""
@@ -244,50 +252,58 @@ class Bench:
         except (OSError, subprocess.SubprocessError, ValueError) as error:
             raise loops.LoopError(f"The real-time settings cannot be tried ({error}).") from error
 
-    def _register_start(self, name: str) -> None:
-        """Register the start of a measurement for the progress."""
-        self._present_name = name
+    def _register_start(self, measurement_name: str) -> None:
+        """Register the name and the start of a measurement, which the progress shows."""
+        self._present_name = measurement_name
         duration_s = self._seconds + loops.OVERHEAD_S
         self._remaining_s = max(0.0, self._remaining_s - duration_s)
         self._present_end_s = time.monotonic() + duration_s
 
     def _show_progress(self) -> None:
-        """Report the present measurement and the remaining time of the series."""
+        """Report the present measurement's name and the remaining time of the series in s."""
         self._on_progress(
             self._present_name, self._remaining_s + max(0.0, self._present_end_s - time.monotonic())
         )
 
 
-def loop_core(granted: dict[str, str]) -> int:
+def loop_core(granted_settings: dict[str, str]) -> int:
     """Return the number of the processor core on which the loop runs.
 
-    `granted` has the granted real-time settings by name.
+    `granted_settings` has the granted real-time settings by name.
     """
-    text = granted["cpu"]
-    return max(os.sched_getaffinity(0)) if text.startswith(REFUSED) else int(text.split(",")[0])
+    core_text = granted_settings["cpu"]
+    return (
+        max(os.sched_getaffinity(0))
+        if core_text.startswith(REFUSED)
+        else int(core_text.split(",")[0])
+    )
 
 
-def cores_without_loop(granted: dict[str, str]) -> set[int]:
+def cores_without_loop(granted_settings: dict[str, str]) -> set[int]:
     """Return the processor cores on which the loop does not run, or all cores if there is only one.
 
-    `granted` has the granted real-time settings by name.
+    `granted_settings` has the granted real-time settings by name.
     """
-    allowed = os.sched_getaffinity(0)
-    return allowed - {loop_core(granted)} or allowed
+    allowed_cores = os.sched_getaffinity(0)
+    return allowed_cores - {loop_core(granted_settings)} or allowed_cores
 
 
 def _sort_key(measured: LoopMeasurement) -> tuple[bool, float]:
-    """Return the sort key that is largest for the best measurement at a rate."""
+    """Return the key by which the best measurement of the loop at a rate sorts last."""
     return measured.held >= HELD_FRACTION, measured.held_between_stalls
 
 
 def _holds(measured: LoopMeasurement) -> bool:
-    """Return whether nearly all ticks outside of stalls ran within their periods."""
+    """Return whether 99.9 % or more of the ticks outside of stalls ran within their periods."""
     return measured.held_between_stalls >= HELD_FRACTION
 
 
-def _median(values: list[float]) -> float:
+def _median(numbers: list[float]) -> float:
     """Return the median of at least one value."""
-    ordered = sorted(values)
-    half = len(ordered) // 2
-    return ordered[half] if len(ordered) % 2 else (ordered[half - 1] + ordered[half]) / 2
+    ordered_values = sorted(numbers)
+    middle_index = len(ordered_values) // 2
+    return (
+        ordered_values[middle_index]
+        if len(ordered_values) % 2
+        else (ordered_values[middle_index - 1] + ordered_values[middle_index]) / 2
+    )

@@ -28,14 +28,19 @@ def report_lines(results: Results) -> Iterator[str]:
     str
         Line of text.
     """
-    spin = f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
+    spin_text = (
+        f", the last {results.spin_us:g} µs of each wait busy-polled" if results.spin_us else ""
+    )
     yield (
         f"The control loop at {results.rate_hz:g} Hz, everything simulated, {results.seconds:g} s "
-        f"each{spin}."
+        f"each{spin_text}."
     )
     yield (
         "Real time: "
-        + ", ".join(f"{name.replace('_', ' ')} {text}" for name, text in results.granted.items())
+        + ", ".join(
+            f"{setting_name.replace('_', ' ')} {setting_text}"
+            for setting_name, setting_text in results.granted.items()
+        )
         + "."
     )
     yield f"Load of this computer before: {results.load_average[0]:.2f}."
@@ -45,8 +50,11 @@ def report_lines(results: Results) -> Iterator[str]:
     yield from _peer_lines(results)
     yield ""
     yield "Wake-up latency:"
-    columns = [(each.name, each.lateness_us) for each in _measurements(results)[:2]]
-    yield from histogram_lines(columns)
+    histogram_columns = [
+        (loop_measurement.name, loop_measurement.lateness_us)
+        for loop_measurement in _measurements(results)[:2]
+    ]
+    yield from histogram_lines(histogram_columns)
     yield ""
     yield "Rates, with recorder:"
     yield from _search_table(results.search)
@@ -60,30 +68,36 @@ def verdict(results: Results) -> str:
         results.highest_rate_hz,
         results.highest_rate_between_stalls_hz,
     )
-    criterion = f"{100 * HELD_FRACTION:g} % of the ticks or more"
+    criterion_text = f"{100 * HELD_FRACTION:g} % of the ticks or more"
     if highest_hz is not None:
-        text = f"This computer holds {highest_hz:g} Hz: {criterion}."
+        verdict_text = f"This computer holds {highest_hz:g} Hz: {criterion_text}."
     else:
         best_measurement = max(results.search, key=lambda each: each.held)
-        text = (
+        verdict_text = (
             f"This computer holds none of these rates: {best_measurement.rate_hz:g} Hz came "
             f"nearest, with {100 * best_measurement.held:.2f} % of the ticks."
         )
     if between_stalls_hz is not None and between_stalls_hz != highest_hz:
-        text += (
+        verdict_text += (
             f" Without stalls of {STALL_US * 1e-3:g} ms and more, which affect any rate, it would "
             f"hold {between_stalls_hz:g} Hz."
         )
-    refused = [name for name, text in results.granted.items() if text.startswith(REFUSED)]
-    if refused:
-        text += f" Not granted: {', '.join(refused).replace('_', ' ')}; rigd check says how."
+    refused_names = [
+        setting_name
+        for setting_name, verdict_text in results.granted.items()
+        if verdict_text.startswith(REFUSED)
+    ]
+    if refused_names:
+        verdict_text += (
+            f" Not granted: {', '.join(refused_names).replace('_', ' ')}; rigd check says how."
+        )
     peer = results.peer
     if peer is not None and peer.held < HELD_FRACTION:
-        text += (
+        verdict_text += (
             f" cyclictest alone would have missed {100 * (1 - peer.held):.2f} % at "
             f"{peer.rate_hz:g} Hz: this is due to the computer itself."
         )
-    return text
+    return verdict_text
 
 
 def as_json(results: Results) -> dict[str, object]:
@@ -97,13 +111,13 @@ def as_json(results: Results) -> dict[str, object]:
         "realtime": results.granted,
         "load_average": list(results.load_average),
         "rounds": [
-            {"loop": _as_dict(loop), "cyclictest": None if peer is None else _as_dict(peer)}
-            for loop, peer in results.rounds
+            {"loop": _as_dict(loop_alone), "cyclictest": None if peer is None else _as_dict(peer)}
+            for loop_alone, peer in results.rounds
         ],
         "ratio_to_cyclictest": None if ratios is None else {"p50": ratios[0], "p99": ratios[1]},
         "no_cyclictest": results.no_peer,
-        "sessions": [_as_dict(each) for each in results.sessions],
-        "rates": [_as_dict(each) for each in results.search],
+        "sessions": [_as_dict(measurement) for measurement in results.sessions],
+        "rates": [_as_dict(measurement) for measurement in results.search],
         "highest_rate_hz": results.highest_rate_hz,
         "highest_rate_between_stalls_hz": results.highest_rate_between_stalls_hz,
         "verdict": verdict(results),
@@ -116,8 +130,8 @@ def _measurements(results: Results) -> list[LoopMeasurement]:
     return [results.alone, *([] if peer is None else [peer]), *results.sessions]
 
 
-def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
-    """Yield the lines of the table of latencies."""
+def _latency_table(measurements: list[LoopMeasurement]) -> Iterator[str]:
+    """Yield the lines of the report's table of wake-up latencies and execution times in µs."""
     yield (
         f"{'':{_NAME_WIDTH}}{'wake-up latency, µs':>40}   {'execution, µs':>16}   {'missed':>7}  "
         f"{'CPU':>5}  faults"
@@ -126,19 +140,27 @@ def _latency_table(rows: list[LoopMeasurement]) -> Iterator[str]:
         f"{'':{_NAME_WIDTH}}{'p50':>8}{'p90':>8}{'p99':>8}{'p99.9':>8}{'max':>8}   "
         f"{'p50':>8}{'p99':>8}   {'%':>7}  {'%':>5}"
     )
-    for each in rows:
-        latency = percentiles(each.lateness_us)
-        numbers = (latency.p50, latency.p90, latency.p99, latency.p999, latency.largest)
-        text = f"{each.name:{_NAME_WIDTH}}" + "".join(f"{number:8.0f}" for number in numbers)
-        if each.work_us.size:
-            execution = percentiles(each.work_us)
-            text += f"   {execution.p50:8.0f}{execution.p99:8.0f}"
+    for measurement in measurements:
+        latency_percentiles = percentiles(measurement.lateness_us)
+        number_cells = (
+            latency_percentiles.p50,
+            latency_percentiles.p90,
+            latency_percentiles.p99,
+            latency_percentiles.p999,
+            latency_percentiles.largest,
+        )
+        cells_text = f"{measurement.name:{_NAME_WIDTH}}" + "".join(
+            f"{percentile_us:8.0f}" for percentile_us in number_cells
+        )
+        if measurement.work_us.size:
+            work_percentiles = percentiles(measurement.work_us)
+            cells_text += f"   {work_percentiles.p50:8.0f}{work_percentiles.p99:8.0f}"
         else:
-            text += " " * 19
-        text += f"   {100 * (1 - each.held):7.3f}"
-        if each.cpu_percent is not None and each.page_faults is not None:
-            text += f"  {each.cpu_percent:5.1f}  {each.page_faults:6d}"
-        yield text
+            cells_text += " " * 19
+        cells_text += f"   {100 * (1 - measurement.held):7.3f}"
+        if measurement.cpu_percent is not None and measurement.page_faults is not None:
+            cells_text += f"  {measurement.cpu_percent:5.1f}  {measurement.page_faults:6d}"
+        yield cells_text
 
 
 def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
@@ -147,12 +169,13 @@ def _search_table(search: list[LoopMeasurement]) -> Iterator[str]:
         f"{'':>10}{'held, %':>9}{'but stalls':>12}{'stalls':>8}{'late p99, µs':>14}"
         f"{'exec p99, µs':>14}{'CPU, %':>8}"
     )
-    for each in sorted(search, key=lambda each: each.rate_hz):
-        cpu = "" if each.cpu_percent is None else f"{each.cpu_percent:8.1f}"
+    for measured in sorted(search, key=lambda measured: measured.rate_hz):
+        cpu = "" if measured.cpu_percent is None else f"{measured.cpu_percent:8.1f}"
         yield (
-            f"{each.rate_hz:7.0f} Hz{100 * each.held:9.3f}{100 * each.held_between_stalls:12.3f}"
-            f"{each.stalls:8d}{percentiles(each.lateness_us).p99:14.0f}"
-            f"{percentiles(each.work_us).p99:14.0f}{cpu}"
+            f"{measured.rate_hz:7.0f} "
+            f"Hz{100 * measured.held:9.3f}{100 * measured.held_between_stalls:12.3f}"
+            f"{measured.stalls:8d}{percentiles(measured.lateness_us).p99:14.0f}"
+            f"{percentiles(measured.work_us).p99:14.0f}{cpu}"
         )
 
 
@@ -168,29 +191,33 @@ def _peer_lines(results: Results) -> Iterator[str]:
     )
 
 
-def _as_dict(each: LoopMeasurement) -> dict[str, object]:
+def _as_dict(measurement: LoopMeasurement) -> dict[str, object]:
     """Return a measurement as a JSON object."""
     return {
-        "name": each.name,
-        "rate_hz": each.rate_hz,
-        "scheduled": each.scheduled,
-        "missed": each.missed,
-        "held": each.held,
-        "held_between_stalls": each.held_between_stalls,
-        "stalls": each.stalls,
-        "lateness_us": _percentiles_object(each.lateness_us),
-        "work_us": _percentiles_object(each.work_us) if each.work_us.size else None,
-        "cpu_percent": each.cpu_percent,
-        "page_faults": each.page_faults,
+        "name": measurement.name,
+        "rate_hz": measurement.rate_hz,
+        "scheduled": measurement.scheduled,
+        "missed": measurement.missed,
+        "held": measurement.held,
+        "held_between_stalls": measurement.held_between_stalls,
+        "stalls": measurement.stalls,
+        "lateness_us": _percentiles_object(measurement.lateness_us),
+        "work_us": _percentiles_object(measurement.work_us) if measurement.work_us.size else None,
+        "cpu_percent": measurement.cpu_percent,
+        "page_faults": measurement.page_faults,
         "histogram_us": dict(
-            zip((f"{edge:g}" for edge in edges_us()), counts_of(each.lateness_us), strict=True)
+            zip(
+                (f"{edge_us:g}" for edge_us in edges_us()),
+                counts_of(measurement.lateness_us),
+                strict=True,
+            )
         ),
     }
 
 
-def _percentiles_object(values: npt.NDArray[np.float64]) -> dict[str, float]:
-    """Return the percentiles of some values as a JSON object."""
-    return asdict(percentiles(values))
+def _percentiles_object(delays_us: npt.NDArray[np.float64]) -> dict[str, float]:
+    """Return the percentiles of some delays in µs as a JSON object."""
+    return asdict(percentiles(delays_us))
 
 
 # Histogram
@@ -217,44 +244,51 @@ def edges_us() -> list[float]:
 
 
 def counts_of(delays_us: npt.NDArray[np.float64]) -> list[int]:
-    """Return the number of delays in each bin of the histogram."""
+    """Return how many delays in µs are in each bin of the histogram."""
     bin_indices = np.searchsorted(edges_us(), delays_us, side="right") - 1
     counts: list[int] = np.bincount(bin_indices, minlength=len(edges_us())).tolist()
     return counts
 
 
-def histogram_lines(columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
+def histogram_lines(histogram_columns: Sequence[tuple[str, npt.NDArray[np.float64]]]) -> list[str]:
     """Return the lines of text with the histograms of several series of delays, side by side.
 
-    `columns` has a name and the delays in µs of each series. The length of a bar is proportional to
-    the logarithm of its count, so that rare delays are visible.
+    Each column has a series' name and its delays in µs. The length of a bar is proportional to the
+    logarithm of its count, so that rare delays are visible.
     """
-    bin_counts = [counts_of(delays_us) for _, delays_us in columns]
+    bin_counts = [counts_of(delays_us) for _, delays_us in histogram_columns]
     used_bins = [
-        index for index in range(len(edges_us())) if any(counts[index] for counts in bin_counts)
+        bin_no
+        for bin_no in range(len(edges_us()))
+        if any(bin_totals[bin_no] for bin_totals in bin_counts)
     ]
     if not used_bins:
         return []
-    longest = max(max(counts) for counts in bin_counts)
-    header = " " * (_LABEL_WIDTH + 3) + "".join(f"{name:<{_BAR_WIDTH + 9}}" for name, _ in columns)
-    lines = [header.rstrip()]
-    for index in range(used_bins[0], used_bins[-1] + 1):
-        bars = (
-            f"{_histogram_bar(counts[index], longest)}{counts[index]:>7}  " for counts in bin_counts
+    longest_count = max(max(bin_totals) for bin_totals in bin_counts)
+    header_line = " " * (_LABEL_WIDTH + 3) + "".join(
+        f"{column_title:<{_BAR_WIDTH + 9}}" for column_title, _ in histogram_columns
+    )
+    histogram_text = [header_line.rstrip()]
+    for bin_no in range(used_bins[0], used_bins[-1] + 1):
+        bars_text = (
+            f"{_histogram_bar(bin_totals[bin_no], longest_count)}{bin_totals[bin_no]:>7}  "
+            for bin_totals in bin_counts
         )
-        lines.append(f"{_bin_label(index):>{_LABEL_WIDTH}}   {''.join(bars)}".rstrip())
-    return lines
+        histogram_text.append(
+            f"{_bin_label(bin_no):>{_LABEL_WIDTH}}   {''.join(bars_text)}".rstrip()
+        )
+    return histogram_text
 
 
-def _histogram_bar(count: int, longest: int) -> str:
+def _histogram_bar(bin_count: int, longest: int) -> str:
     """Return the bar of a bin; `longest` is the count of the longest bar."""
-    length = round((_BAR_WIDTH - 1) * log10(1 + count) / log10(1 + longest))
-    return f"{_BAR_CHARACTER * max(length, int(count > 0)):<{_BAR_WIDTH}}"
+    bar_length = round((_BAR_WIDTH - 1) * log10(1 + bin_count) / log10(1 + longest))
+    return f"{_BAR_CHARACTER * max(bar_length, int(bin_count > 0)):<{_BAR_WIDTH}}"
 
 
-def _bin_label(index: int) -> str:
+def _bin_label(bin_index: int) -> str:
     """Return the label of a bin with its edges."""
-    edges = edges_us()
-    if index + 1 == len(edges):
-        return f"{edges[index]:.0f} µs and more"
-    return f"{edges[index]:.0f}–{edges[index + 1]:.0f} µs"
+    bin_edges_us = edges_us()
+    if bin_index + 1 == len(bin_edges_us):
+        return f"{bin_edges_us[bin_index]:.0f} µs and more"
+    return f"{bin_edges_us[bin_index]:.0f}–{bin_edges_us[bin_index + 1]:.0f} µs"

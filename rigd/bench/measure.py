@@ -19,7 +19,7 @@ Firmware or the host of a virtual machine causes such delays, not the loop or it
 
 @dataclass(frozen=True, slots=True)
 class Usage:
-    """Processor time and page faults of a process since its start."""
+    """Processor time in s and number of page faults of a process since its start."""
 
     cpu_s: float
     """Processor time that the process has used."""
@@ -46,9 +46,9 @@ def process_usage(pid: int, proc: Path = Path("/proc")) -> Usage:
         If the process has ended.
     """
     # The process's name, in brackets, may contain any character.
-    fields = (proc / str(pid) / "stat").read_text().rpartition(")")[2].split()
+    stat_fields = (proc / str(pid) / "stat").read_text().rpartition(")")[2].split()
     cpu_ns = int((proc / str(pid) / "schedstat").read_text().split()[0])
-    return Usage(cpu_ns * 1e-9, int(fields[7]) + int(fields[9]))
+    return Usage(cpu_ns * 1e-9, int(stat_fields[7]) + int(stat_fields[9]))
 
 
 class UsageMeter:
@@ -68,18 +68,18 @@ class UsageMeter:
         """Read the processor time and page faults so far, if the session's record is running."""
         if phase == Phase.RUNNING:
             try:
-                usage = process_usage(self._pid)
+                process_reading = process_usage(self._pid)
             except OSError:
                 return  # this kernel has no such statistics
-            self._readings = [*self._readings[:1], (time.monotonic(), usage)]
+            self._readings = [*self._readings[:1], (time.monotonic(), process_reading)]
 
     @property
     def cpu_percent(self) -> float | None:
         """Load of a processor core by the process in percent, or None before two readings."""
         if len(self._readings) < 2:
             return None
-        (begin_s, first), (end_s, last) = self._readings
-        return 100.0 * (last.cpu_s - first.cpu_s) / (end_s - begin_s)
+        (begin_s, first_usage), (end_s, last_usage) = self._readings
+        return 100.0 * (last_usage.cpu_s - first_usage.cpu_s) / (end_s - begin_s)
 
     @property
     def page_faults(self) -> int | None:
@@ -158,7 +158,7 @@ def percentiles(values_us: npt.NDArray[np.float64]) -> LatencyPercentiles:
     return LatencyPercentiles(*np.percentile(values_us, [50, 90, 99, 99.9, 100]).tolist())
 
 
-def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
+def wake_ups_us(sample_records: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np.float64]:
     """Return the wake-up latency of each sample in µs, relative to the awaited deadline.
 
     The lateness in a sample is relative to the tick that was run. After missed ticks this tick is
@@ -166,23 +166,25 @@ def wake_ups_us(samples: npt.NDArray[np.void], rate_hz: float) -> npt.NDArray[np
 
     Parameters
     ----------
-    samples
+    sample_records
         Recorded samples, without those that the recorder lost.
     rate_hz
         Loop rate in ticks per second.
     """
-    ticks: npt.NDArray[np.int64] = samples["tick"].astype(np.int64)
-    missed = np.diff(ticks, prepend=-1) - 1
-    latency_us: npt.NDArray[np.float64] = samples["lateness_ns"] * 1e-3 + missed * (1e6 / rate_hz)
+    tick_numbers: npt.NDArray[np.int64] = sample_records["tick"].astype(np.int64)
+    missed_ticks = np.diff(tick_numbers, prepend=-1) - 1
+    latency_us: npt.NDArray[np.float64] = sample_records["lateness_ns"] * 1e-3 + missed_ticks * (
+        1e6 / rate_hz
+    )
     return latency_us
 
 
 def record_measurement(
     name: str,
     rate_hz: float,
-    samples: npt.NDArray[np.void],
+    sample_records: npt.NDArray[np.void],
     *,
-    scheduled: int,
+    scheduled_ticks: int,
     cpu_percent: float | None,
     page_faults: int | None,
 ) -> LoopMeasurement:
@@ -194,9 +196,9 @@ def record_measurement(
         Name of the measurement.
     rate_hz
         Loop rate in ticks per second.
-    samples
+    sample_records
         Samples of the record; ticks without a sample were missed.
-    scheduled
+    scheduled_ticks
         Number of scheduled ticks.
     cpu_percent, page_faults
         Processor load and page faults of the control process.
@@ -204,34 +206,42 @@ def record_measurement(
     return LoopMeasurement(
         name,
         rate_hz,
-        wake_ups_us(samples, rate_hz),
-        samples["work_ns"] * 1e-3,
-        scheduled,
-        scheduled - samples.size,
+        wake_ups_us(sample_records, rate_hz),
+        sample_records["work_ns"] * 1e-3,
+        scheduled_ticks,
+        scheduled_ticks - sample_records.size,
         cpu_percent,
         page_faults,
     )
 
 
-def pool_measurements(name: str, parts: list[LoopMeasurement]) -> LoopMeasurement:
+def pool_measurements(name: str, measurements: list[LoopMeasurement]) -> LoopMeasurement:
     """Combine several measurements of the same loop into one.
 
     Parameters
     ----------
     name
         Name of the measurement.
-    parts
+    measurements
         Measurements at one rate, at least one.
     """
-    cpu_loads = [part.cpu_percent for part in parts if part.cpu_percent is not None]
-    faults = [part.page_faults for part in parts if part.page_faults is not None]
+    cpu_loads = [
+        measurement.cpu_percent
+        for measurement in measurements
+        if measurement.cpu_percent is not None
+    ]
+    page_faults = [
+        measurement.page_faults
+        for measurement in measurements
+        if measurement.page_faults is not None
+    ]
     return LoopMeasurement(
         name,
-        parts[0].rate_hz,
-        np.concatenate([part.lateness_us for part in parts]),
-        np.concatenate([part.work_us for part in parts]),
-        sum(part.scheduled for part in parts),
-        sum(part.missed for part in parts),
+        measurements[0].rate_hz,
+        np.concatenate([measurement.lateness_us for measurement in measurements]),
+        np.concatenate([measurement.work_us for measurement in measurements]),
+        sum(measurement.scheduled for measurement in measurements),
+        sum(measurement.missed for measurement in measurements),
         sum(cpu_loads) / len(cpu_loads) if cpu_loads else None,
-        sum(faults) if faults else None,
+        sum(page_faults) if page_faults else None,
     )

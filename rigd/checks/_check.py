@@ -18,20 +18,26 @@ from rigd.runner.planning import RigPreview, excitation_for
 
 
 def check_rig(profile: Profile) -> list[CheckRow]:
-    """Run all checks of a rig that need no torque, and return their rows.
+    """Run all checks of a rig that need no torque, and return their results as table rows.
 
     The devices are not connected if identifiers collide or the bus load is too high, because
     devices might obey frames for others. They are not connected either if a value of the profile is
     unknown.
     """
-    rows = _rows_without_devices(profile)
+    check_rows = _rows_without_devices(profile)
     if any(row.verdict is CheckResult.FAIL for row in wiring_rows(profile.rig)):
-        why = "not connected: first the bus has to be right"
-        return [*rows, CheckRow("devices", "connection", why, "", CheckResult.SKIPPED)]
+        skip_reason = "not connected: first the bus has to be right"
+        return [
+            *check_rows,
+            CheckRow("devices", "connection", skip_reason, "", CheckResult.SKIPPED),
+        ]
     if unknown_values(profile.rig):
-        why = "not connected: first the unknown values have to be entered"
-        return [*rows, CheckRow("devices", "connection", why, "", CheckResult.SKIPPED)]
-    return rows + inspect_devices(profile)
+        skip_reason = "not connected: first the unknown values have to be entered"
+        return [
+            *check_rows,
+            CheckRow("devices", "connection", skip_reason, "", CheckResult.SKIPPED),
+        ]
+    return check_rows + inspect_devices(profile)
 
 
 def check_without_devices(
@@ -52,11 +58,16 @@ def check_without_devices(
     list of CheckRow
         Rows of the checks on paper, of this computer, and of the calibration.
     """
-    rows = _rows_without_devices(profile)
+    check_rows = _rows_without_devices(profile)
     if calibration is None:
-        return [*rows, CheckRow("devices", "connection", "not connected", "", CheckResult.SKIPPED)]
-    rows.append(CheckRow("devices", "connection", "connected by the daemon", "", CheckResult.OK))
-    return [*rows, *calibration_rows(calibration, profile.rig)]
+        return [
+            *check_rows,
+            CheckRow("devices", "connection", "not connected", "", CheckResult.SKIPPED),
+        ]
+    check_rows.append(
+        CheckRow("devices", "connection", "connected by the daemon", "", CheckResult.OK)
+    )
+    return [*check_rows, *calibration_rows(calibration, profile.rig)]
 
 
 def _rows_without_devices(profile: Profile) -> list[CheckRow]:
@@ -70,24 +81,24 @@ def _rows_without_devices(profile: Profile) -> list[CheckRow]:
 
 
 def default_session_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on whether `rigd run chirp` without options stays within the profile's limits.
+    """Yield the result on whether a default `rigd run chirp` stays within the profile's limits.
 
     It is at most a warning, since other sessions may stay within the limits: a hold moves nothing.
     """
     try:
         chirp = excitation_for(profile, "chirp", {})
-        percent = 100 * RigPreview(profile).fraction_of_limits(chirp.reference_rad)
+        limit_percent = 100 * RigPreview(profile).fraction_of_limits(chirp.reference_rad)
     except UserError:  # an unstable loop or an unknown value, which have rows of their own
         return
-    beyond = not percent <= 100
+    exceeds_limits = not limit_percent <= 100
     yield CheckRow(
         "session",
         "chirp without options",
-        f"predicted peaks reach {percent:.0f} % of a limit",
+        f"predicted peaks reach {limit_percent:.0f} % of a limit",
         "at most 100 %",
-        grade(fail=False, warn=beyond),
+        grade(fail=False, warn=exceeds_limits),
         "Session: rigd run chirp is refused with its default amplitude; it names the limit and the "
         "largest amplitude (--amplitude)."
-        if beyond
+        if exceeds_limits
         else "",
     )

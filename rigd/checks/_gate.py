@@ -16,7 +16,7 @@ from rigd.profile import Profile
 
 
 class CheckFailedError(FailureError):
-    """Checks on paper have failed; the message names the rows, and how to accept them.
+    """Checks that need no device have failed; the message names them, and how to accept them.
 
     Parameters
     ----------
@@ -37,7 +37,7 @@ class UnknownRowError(UserError):
 
 @dataclass(frozen=True, slots=True)
 class PaperCheck:
-    """One check that needs no device."""
+    """Check of a rig's profile or computer that needs no device."""
 
     rows: Callable[[Profile], Iterator[CheckRow]]
     """Function that yields the rows of the check; rows that can fail have a name."""
@@ -102,18 +102,18 @@ def paper_rows(profile: Profile) -> list[CheckRow]:
     profile
         Profile of the rig.
     """
-    return [row for check in PAPER_CHECKS for row in _rows_of_check(check, profile)]
+    return [row for paper_check in PAPER_CHECKS for row in _rows_of_check(paper_check, profile)]
 
 
-def _rows_of_check(check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows of a check, or none if it needs a value of the profile that is unknown."""
-    if not (check.needs_values and unknown_values(profile.rig)):
-        yield from check.rows(profile)
+def _rows_of_check(paper_check: PaperCheck, profile: Profile) -> Iterator[CheckRow]:
+    """Yield a check's result rows, or none if it needs a value that the profile lacks."""
+    if not (paper_check.needs_values and unknown_values(profile.rig)):
+        yield from paper_check.rows(profile)
 
 
 @dataclass(frozen=True, slots=True)
 class FailedCheck:
-    """A failed row of the checks on paper, and whether a session can be run nevertheless."""
+    """A failed check that needs no device, and whether a session can be run nevertheless."""
 
     name: str
     """Name of the failed row."""
@@ -137,12 +137,16 @@ class PaperCheckResult:
     @property
     def refusals(self) -> tuple[str, ...]:
         """Messages that refuse the session, one for each failed row that is not accepted."""
-        return tuple(_refusal_message(each) for each in self.failed if not each.accepted)
+        return tuple(
+            _refusal_message(failed_check)
+            for failed_check in self.failed
+            if not failed_check.accepted
+        )
 
     @property
     def accepted(self) -> tuple[FailedCheck, ...]:
         """Failed rows that the operator has accepted for the session."""
-        return tuple(each for each in self.failed if each.accepted)
+        return tuple(failed_check for failed_check in self.failed if failed_check.accepted)
 
     def require(self) -> None:
         """Raise CheckFailedError unless all failed rows are accepted.
@@ -153,18 +157,18 @@ class PaperCheckResult:
             If a failed row is not accepted; the message names each of them.
         """
         if self.refusals:
-            never_acceptable = not all(each.acceptable for each in self.failed)
+            never_acceptable = not all(failed_check.acceptable for failed_check in self.failed)
             raise CheckFailedError("\n".join(self.refusals), wrong_use=never_acceptable)
 
 
-def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> PaperCheckResult:
+def check_on_paper(profile: Profile, accepted_names: Sequence[str] = ()) -> PaperCheckResult:
     """Run the checks on paper for a session, and return which rows failed or are accepted.
 
     Parameters
     ----------
     profile
         Profile of the rig, with the beam of the session.
-    accept
+    accepted_names
         Names of rows that may fail in this session.
 
     Returns
@@ -177,22 +181,26 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> PaperCheckRe
     UnknownRowError
         If no row has such a name, or its failure cannot be accepted.
     """
-    for row_name in accept:
+    for row_name in accepted_names:
         _check_name(row_name)
-    failed: dict[str, FailedCheck] = {}
-    for check in PAPER_CHECKS:
-        for row in _rows_of_check(check, profile) if check.names else ():
+    failed_rows: dict[str, FailedCheck] = {}
+    for paper_check in PAPER_CHECKS:
+        for row in _rows_of_check(paper_check, profile) if paper_check.names else ():
             if row.verdict is not CheckResult.FAIL:
                 continue
-            row_name, text = row.name, _failure_text(row)
-            if row_name in failed:  # several rows of one name: an EDS file that lacks two objects
-                text = f"{failed[row_name].text}\n{text}"
-            failed[row_name] = FailedCheck(
-                row_name, text, not check.not_acceptable, row_name in accept
+            row_name, names_text = row.name, _failure_text(row)
+            if (
+                row_name in failed_rows
+            ):  # several rows of one name: an EDS file that lacks two objects
+                names_text = f"{failed_rows[row_name].text}\n{names_text}"
+            failed_rows[row_name] = FailedCheck(
+                row_name, names_text, not paper_check.not_acceptable, row_name in accepted_names
             )
-    accepted_needlessly = [row_name for row_name in dict.fromkeys(accept) if row_name not in failed]
+    accepted_needlessly = [
+        row_name for row_name in dict.fromkeys(accepted_names) if row_name not in failed_rows
+    ]
     return PaperCheckResult(
-        tuple(failed.values()),
+        tuple(failed_rows.values()),
         tuple(
             f"--accept {row_name}: it did not fail; nothing was accepted."
             for row_name in accepted_needlessly
@@ -200,27 +208,36 @@ def check_on_paper(profile: Profile, accept: Sequence[str] = ()) -> PaperCheckRe
     )
 
 
-def _check_name(name: str) -> None:
-    """Raise UnknownRowError unless the operator can accept a row of this name."""
-    check = _CHECK_BY_ROW_NAME.get(name)
-    if check is None:
+def _check_name(row_name: str) -> None:
+    """Raise UnknownRowError unless a failed check of this name can be accepted by the operator."""
+    paper_check = _CHECK_BY_ROW_NAME.get(row_name)
+    if paper_check is None:
         raise UnknownRowError(
-            f"--accept {name[:60]}: no row of rigd check has that name; those that can be accepted "
+            f"--accept {row_name[:60]}: no row of rigd check has that name; those that can "
+            "be accepted "
             f"are {', '.join(ACCEPTABLE)}."
         )
-    if check.not_acceptable:
+    if paper_check.not_acceptable:
         raise UnknownRowError(
-            f"--accept {name}: a failure of that row cannot be accepted: {check.not_acceptable}."
+            f"--accept {row_name}: a failure of that row cannot be accepted: "
+            f"{paper_check.not_acceptable}."
         )
 
 
-def _failure_text(row: CheckRow) -> str:
+def _failure_text(failed_row: CheckRow) -> str:
     """Return the finding of a failed row and its remedy as text for the operator."""
-    requirement = f" (wanted: {row.wanted})" if row.wanted else ""
-    return f"{row.group}, {row.what}: {row.found.rstrip('.')}{requirement}. {row.detail}".strip()
+    requirement_text = f" (wanted: {failed_row.wanted})" if failed_row.wanted else ""
+    return (
+        f"{failed_row.group}, {failed_row.what}: "
+        f"{failed_row.found.rstrip('.')}{requirement_text}. {failed_row.detail}"
+    ).strip()
 
 
-def _refusal_message(failed: FailedCheck) -> str:
+def _refusal_message(failed_check: FailedCheck) -> str:
     """Return the message that refuses a session because of a failed row."""
-    remedy = f" To accept it for one session: --accept {failed.name}." if failed.acceptable else ""
-    return f"rigd check fails ({failed.name}): {failed.text}{remedy}"
+    remedy_text = (
+        f" To accept it for one session: --accept {failed_check.name}."
+        if failed_check.acceptable
+        else ""
+    )
+    return f"rigd check fails ({failed_check.name}): {failed_check.text}{remedy_text}"

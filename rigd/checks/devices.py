@@ -65,64 +65,76 @@ class InspectedDrive(Protocol):
 
 
 def _drive_rows(drive: InspectableDrive, rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the drive's identity, rated torque and safeguards.
+    """Yield check results on the drive's identity, rated torque and safeguards.
 
     They are never failed: a drive that contradicts the profile cannot be connected.
     """
-    settings = rig.cia402
-    wanted = {
+    drive_settings = rig.cia402
+    wanted_texts = {
         "rated_torque_nm": f"{rig.motor.rated_torque_nm:.4g} N·m",
         "supported_modes": "0x200 (cyclic torque) among them",
     }
-    if settings is not None:
-        wanted["gear_ratio"] = f"{settings.gear_ratio:.5g}"
-        wanted["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
-        wanted["vendor_id"] = f"{settings.vendor_id:#x}" if settings.vendor_id else "any"
-        wanted["product_code"] = f"{settings.product_code:#x}" if settings.product_code else "any"
-    for key, value in drive.identity().items():
-        if key in _HEXADECIMAL_KEYS and isinstance(value, int):
-            found = f"{value:#x}"
+    if drive_settings is not None:
+        wanted_texts["gear_ratio"] = f"{drive_settings.gear_ratio:.5g}"
+        wanted_texts["encoder_step_rad"] = f"{rig.encoder.resolution_rad:.4g} rad"
+        wanted_texts["vendor_id"] = (
+            f"{drive_settings.vendor_id:#x}" if drive_settings.vendor_id else "any"
+        )
+        wanted_texts["product_code"] = (
+            f"{drive_settings.product_code:#x}" if drive_settings.product_code else "any"
+        )
+    for key, found_value in drive.identity().items():
+        if key in _HEXADECIMAL_KEYS and isinstance(found_value, int):
+            found_text = f"{found_value:#x}"
         else:
-            found = "not stated by the drive" if value in (None, "") else format_value(key, value)
-        verdict = CheckResult.OK
-        if key in _SCALE_OBJECTS and value is None:
-            found = f"unknown: the drive does not state it (object {_SCALE_OBJECTS[key]})"
-            verdict = CheckResult.SKIPPED
-        yield CheckRow("drive", key_label(key), found, wanted.get(key, ""), verdict)
+            found_text = (
+                "not stated by the drive"
+                if found_value in (None, "")
+                else format_value(key, found_value)
+            )
+        check_result = CheckResult.OK
+        if key in _SCALE_OBJECTS and found_value is None:
+            found_text = f"unknown: the drive does not state it (object {_SCALE_OBJECTS[key]})"
+            check_result = CheckResult.SKIPPED
+        yield CheckRow("drive", key_label(key), found_text, wanted_texts.get(key, ""), check_result)
     capabilities = drive.capabilities() if isinstance(drive, InspectedDrive) else None
     if capabilities is not None:
         yield from _safeguard_rows(capabilities)
 
 
 def _safeguard_rows(capabilities: DriveCapabilities) -> Iterator[CheckRow]:
-    """Yield the rows on the drive's watchdog, missing objects, and objects that were set."""
-    watchdog, after_s = capabilities.watchdog, capabilities.watchdog_s
+    """Yield check results on the drive's watchdog, missing objects, and objects that were set."""
+    watchdog, watchdog_s = capabilities.watchdog, capabilities.watchdog_s
     is_unproven = watchdog in (Watchdog.OWN, Watchdog.NONE)
     yield CheckRow(
         "drive",
         "watchdog",
-        f"{watchdog.value}, {after_s * 1e3:g} ms" if isfinite(after_s) else "none: accepted",
+        f"{watchdog.value}, {watchdog_s * 1e3:g} ms" if isfinite(watchdog_s) else "none: accepted",
         "switches the torque off if this computer stops communicating",
         CheckResult.WARNING if is_unproven else CheckResult.OK,
         _WATCHDOG_ADVICE.get(watchdog, ""),
     )
-    accepted = capabilities.accepted
+    accepted_features = capabilities.accepted
     for row in capabilities.lacks:
-        is_accepted = row.accept in accepted
-        substitute = f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+        is_accepted = row.accept in accepted_features
+        substitute_text = (
+            f"stands in: {row.stand_in}" if row.stand_in and row.accept != WATCHDOG else ""
+        )
         if row.accept == WATCHDOG:
-            substitute = f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
-        acceptance = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
+            substitute_text = (
+                f"stands in: {watchdog.value}" if watchdog is not Watchdog.NONE else ""
+            )
+        acceptance_text = f'accepted by cia402.accept_without "{row.accept}"' if is_accepted else ""
         yield CheckRow(
             "drive",
             f"object {row.address} ({row.name})",
-            "; ".join(("absent or not usable", *filter(None, (acceptance, substitute)))),
+            "; ".join(("absent or not usable", *filter(None, (acceptance_text, substitute_text)))),
             "",
             CheckResult.WARNING if is_accepted else CheckResult.OK,
             f"{row.name}: {row.sentence}" if is_accepted else "",
         )
-    for text in capabilities.assigned:
-        yield CheckRow("drive", "object set", text, "read back", CheckResult.OK)
+    for safeguard_text in capabilities.assigned:
+        yield CheckRow("drive", "object set", safeguard_text, "read back", CheckResult.OK)
 
 
 # Sensor
@@ -161,51 +173,56 @@ class MeasurableSensor(Protocol):
         """
 
 
-def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the sensor's identity, calibration and measuring range.
+def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> Iterator[CheckRow]:
+    """Yield check results on the sensor's identity, calibration and measuring range.
 
     Parameters
     ----------
-    found
+    calibration
         Calibration that the sensor reports.
     rig
         Parameters of the profile, with which serial number and range are compared.
     """
     for key in _KEYS_SHOWN_IF_REPORTED:
-        if key in found:
+        if key in calibration:
             yield CheckRow(
                 "sensor",
                 key_label(key),
-                _format_calibration_value(key, found),
+                _format_calibration_value(key, calibration),
                 _required_calibration_value(key, rig),
                 CheckResult.OK,
             )
     for key in _KEYS_ALWAYS_SHOWN:
         yield CheckRow(
-            "sensor", key_label(key), _format_calibration_value(key, found), "", CheckResult.OK
+            "sensor",
+            key_label(key),
+            _format_calibration_value(key, calibration),
+            "",
+            CheckResult.OK,
         )
-    yield _range_row(found, rig.sensor.range)
-    if found.get(_ASSUMED_KEY):
+    yield _range_row(calibration, rig.sensor.range)
+    if calibration.get(_ASSUMED_KEY):
         yield CheckRow(
             "sensor",
             "counts and units",
             "assumed, below",
             "reported by the sensor",
             CheckResult.WARNING,
-            f"Sensor: assumed are {found[_ASSUMED_KEY]}; compare with its calibration certificate.",
+            f"Sensor: assumed are {calibration[_ASSUMED_KEY]}; compare with its calibration "
+            "certificate.",
         )
-    status = found.get(_STATUS_KEY)
-    if status is not None:
+    sensor_status = calibration.get(_STATUS_KEY)
+    if sensor_status is not None:
         yield CheckRow(
             "sensor",
             "status",
-            format_value(_STATUS_KEY, status),
+            format_value(_STATUS_KEY, sensor_status),
             "none",
-            grade(fail=False, warn=bool(status)),
+            grade(fail=False, warn=bool(sensor_status)),
         )
     other_values = [
-        f"{key_label(key)} {format_value(key, value)}"
-        for key, value in found.items()
+        f"{key_label(key)} {format_value(key, found_value)}"
+        for key, found_value in calibration.items()
         if key
         not in (
             *_KEYS_SHOWN_IF_REPORTED,
@@ -215,64 +232,77 @@ def calibration_rows(found: Mapping[str, object], rig: RigParameters) -> Iterato
             _ASSUMED_KEY,
             "matrix",
         )
-        and value != ""
+        and found_value != ""
     ]
     if other_values:
-        detail = f"Sensor: {'; '.join(other_values)}."
+        detail_text = f"Sensor: {'; '.join(other_values)}."
         yield CheckRow(
-            "sensor", "more", f"{len(other_values)} values, below", "", CheckResult.OK, detail
+            "sensor", "more", f"{len(other_values)} values, below", "", CheckResult.OK, detail_text
         )
 
 
 def _measured_rows(
-    measured: Mapping[str, float], rig: RigParameters, cause: str = ""
+    measured_values: Mapping[str, float], rig: RigParameters, gap_cause: str = ""
 ) -> Iterator[CheckRow]:
-    """Yield the rows on the sensor's measured rate and response times.
+    """Yield check results on the sensor's measured rate and response times.
 
-    `cause` is the reason for gaps that the sensor reports.
+    `gap_cause` is the reason for gaps that the sensor reports.
     """
-    for key, value in measured.items():
-        wanted, verdict = _assess_diagnostic(key, value, rig)
-        detail = cause if key == "longest_gap_s" and verdict is not CheckResult.OK else ""
-        yield CheckRow("sensor", key_label(key), format_value(key, value), wanted, verdict, detail)
+    for key, measured_value in measured_values.items():
+        wanted_text, check_result = _assess_diagnostic(key, measured_value, rig)
+        detail_text = (
+            gap_cause if key == "longest_gap_s" and check_result is not CheckResult.OK else ""
+        )
+        yield CheckRow(
+            "sensor",
+            key_label(key),
+            format_value(key, measured_value),
+            wanted_text,
+            check_result,
+            detail_text,
+        )
 
 
-def _format_calibration_value(key: str, found: Mapping[str, object]) -> str:
+def _format_calibration_value(key: str, calibration: Mapping[str, object]) -> str:
     """Format the value of a key of the calibration with its unit."""
-    value = found.get(key)
-    return _NOT_REPORTED if value in (None, "") else format_value(key, value)
+    calibration_value = calibration.get(key)
+    return (
+        _NOT_REPORTED if calibration_value in (None, "") else format_value(key, calibration_value)
+    )
 
 
 def _required_calibration_value(key: str, rig: RigParameters) -> str:
     """Return the value of a key of the calibration that the profile requires, or ""."""
     if key != "serial_number":
         return ""
-    expected = rig.ati_can.serial_number if rig.ati_can else ""
-    return expected or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
+    serial_number = rig.ati_can.serial_number if rig.ati_can else ""
+    return serial_number or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
 
 
-def _range_row(found: Mapping[str, object], wanted: tuple[float, ...]) -> CheckRow:
-    """Return the row that compares the sensor's measuring range with that of the profile."""
-    limits = "profile: " + format_value("range_n_nm", wanted)
-    key = next((key for key in _RANGE_KEYS if key in found), "")
-    reported_range = found.get(key)
+def _range_row(calibration: Mapping[str, object], profile_range: tuple[float, ...]) -> CheckRow:
+    """Return the result that compares the sensor's measuring range with that of the profile."""
+    limits_text = "profile: " + format_value("range_n_nm", profile_range)
+    key = next((key for key in _RANGE_KEYS if key in calibration), "")
+    reported_range = calibration.get(key)
     if not isinstance(reported_range, list | tuple):
         # Over CAN the range cannot be requested.
-        return CheckRow("sensor", "range", _NOT_REPORTED, limits, CheckResult.OK)
+        return CheckRow("sensor", "range", _NOT_REPORTED, limits_text, CheckResult.OK)
     exceeds_range = any(
         profile_value > _RANGE_TOLERANCE_FACTOR * float(sensor_value)
-        for profile_value, sensor_value in zip(wanted, reported_range, strict=True)
+        for profile_value, sensor_value in zip(profile_range, reported_range, strict=True)
     )
     return CheckRow(
         "sensor",
         "range",
         format_value("range_n_nm", reported_range),
-        limits,
+        limits_text,
         grade(fail=exceeds_range),
     )
 
 
-def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str, CheckResult]:
+def _assess_diagnostic(
+    key: str, measured_value: float, rig: RigParameters
+) -> tuple[str, CheckResult]:
     """Return the required value of a measured diagnostic as text, and the check's result."""
     period_s = 1.0 / rig.rate_hz
     acquisition = rig.acquisition
@@ -280,22 +310,22 @@ def _assess_diagnostic(key: str, value: float, rig: RigParameters) -> tuple[str,
     deadline_s = acquisition.deadline_us * 1e-6 if acquisition and same_tick else period_s
     deadline_text = f"at most {deadline_s * 1e3:.4g} ms"
     if key == "polls_hz":
-        return f"at least {rig.rate_hz:g} Hz", grade(fail=not value >= rig.rate_hz)
+        return f"at least {rig.rate_hz:g} Hz", grade(fail=not measured_value >= rig.rate_hz)
     if key == "records_hz" and rig.ati_serial is not None:
         stated_hz = rig.ati_serial.stream_hz
-        relative_error = abs(value / stated_hz - 1.0)
+        relative_error = abs(measured_value / stated_hz - 1.0)
         return f"{stated_hz:g} Hz", grade(
             fail=not relative_error <= _RATE_ERROR_FAILURE,
             warn=relative_error > _RATE_ERROR_WARNING,
         )
     if key == "turnaround_median_s":
-        return deadline_text, grade(fail=not value <= deadline_s)
+        return deadline_text, grade(fail=not measured_value <= deadline_s)
     if key == "turnaround_p99_s":
-        return deadline_text, grade(fail=False, warn=not value <= deadline_s)
+        return deadline_text, grade(fail=False, warn=not measured_value <= deadline_s)
     if key == "longest_gap_s":
-        return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=value > period_s)
+        return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=measured_value > period_s)
     # All other diagnostics are counts of errors.
-    return "0", grade(fail=False, warn=value > 0)
+    return "0", grade(fail=False, warn=measured_value > 0)
 
 
 # Exchange of a tick
@@ -322,44 +352,44 @@ def _exchange_rows(
     drive, sensor = devices.drive, devices.sensor
     period_ns = round(1e9 / profile.rig.rate_hz)
     delays_ms, angles_rad = np.zeros(EXCHANGE_TICKS), np.zeros(EXCHANGE_TICKS)
-    missing_angles = missing_wrenches = saturated = 0
-    clock = RealClock()
-    due_ns = clock.now_ns()
-    for tick in range(EXCHANGE_TICKS):
-        due_ns = max(due_ns + period_ns, clock.now_ns())
-        clock.wait_until(due_ns)
+    missing_angles = missing_wrenches = saturated_ticks = 0
+    real_clock = RealClock()
+    due_ns = real_clock.now_ns()
+    for tick_number in range(EXCHANGE_TICKS):
+        due_ns = max(due_ns + period_ns, real_clock.now_ns())
+        real_clock.wait_until(due_ns)
         begin_ns = time.monotonic_ns()
         drive.latch(due_ns)
         sensor.request(due_ns)
-        angles_rad[tick] = drive.read_angle()
+        angles_rad[tick_number] = drive.read_angle()
         sensor.read_wrench()
-        delays_ms[tick] = (time.monotonic_ns() - begin_ns) * 1e-6
+        delays_ms[tick_number] = (time.monotonic_ns() - begin_ns) * 1e-6
         missing_angles += drive.angle_stale
         missing_wrenches += sensor.wrench_stale
-        saturated += sensor.wrench_saturated
+        saturated_ticks += sensor.wrench_saturated
 
     yield _reply_row(profile, delays_ms, target)
-    for what, missing_count in (
+    for missing_text, missing_count in (
         ("angles missing", missing_angles),
         ("wrenches missing", missing_wrenches),
     ):
-        verdict = grade(
+        check_result = grade(
             fail=missing_count > _MISSING_FRACTION_FAILURE * EXCHANGE_TICKS,
             warn=missing_count > _MISSING_FRACTION_WARNING * EXCHANGE_TICKS,
         )
         yield CheckRow(
             _EXCHANGE_GROUP,
-            what,
+            missing_text,
             f"{missing_count} of {EXCHANGE_TICKS} ticks",
             f"at most {100 * _MISSING_FRACTION_WARNING:.0f} %",
-            verdict,
+            check_result,
         )
     yield CheckRow(
         _EXCHANGE_GROUP,
         "sensor saturated",
-        f"{saturated} of {EXCHANGE_TICKS} ticks",
+        f"{saturated_ticks} of {EXCHANGE_TICKS} ticks",
         "0",
-        grade(fail=saturated > 0),
+        grade(fail=saturated_ticks > 0),
     )
     moved_rad = float(np.ptp(angles_rad))
     allowed_rad = max(
@@ -376,43 +406,51 @@ def _exchange_rows(
 
 
 def _reply_row(profile: Profile, delays_ms: np.ndarray, target: ActuationTarget) -> CheckRow:
-    """Return the row that compares the delays of the devices' replies with the deadline."""
+    """Return the result that compares the delays of the devices' replies with the deadline."""
     acquisition = profile.rig.acquisition
     median_ms, p99_ms = np.percentile(delays_ms, [50, 99]).tolist()
-    found = f"p50 {median_ms:.2f} ms, p99 {p99_ms:.2f} ms"
-    what = "both replies after"
+    found_text = f"p50 {median_ms:.2f} ms, p99 {p99_ms:.2f} ms"
+    row_label = "both replies after"
     if acquisition is None or acquisition.mode == "previous_tick":
         return CheckRow(
-            _EXCHANGE_GROUP, what, "replies of the previous tick are used", "", CheckResult.SKIPPED
+            _EXCHANGE_GROUP,
+            row_label,
+            "replies of the previous tick are used",
+            "",
+            CheckResult.SKIPPED,
         )
     if target is ActuationTarget.LOCK_STEP:
-        return CheckRow(_EXCHANGE_GROUP, what, found, "any time (lock-step)", CheckResult.OK)
+        return CheckRow(
+            _EXCHANGE_GROUP, row_label, found_text, "any time (lock-step)", CheckResult.OK
+        )
     limit_ms = acquisition.deadline_us * 1e-3
-    verdict = grade(fail=median_ms >= limit_ms, warn=p99_ms >= limit_ms)
-    return CheckRow(_EXCHANGE_GROUP, what, found, f"less than {limit_ms:.2f} ms", verdict)
+    check_result = grade(fail=median_ms >= limit_ms, warn=p99_ms >= limit_ms)
+    return CheckRow(
+        _EXCHANGE_GROUP, row_label, found_text, f"less than {limit_ms:.2f} ms", check_result
+    )
 
 
 # Probing move
 
 
 def _probing_rows(profile: Profile, target: ActuationTarget) -> Iterator[CheckRow]:
-    """Yield the row on whether scales and signs are known or need a probing move."""
+    """Yield the check result on whether scales and signs are known or need a probing move."""
     if target is ActuationTarget.SIMULATED:
         return
     not_measured = [key for key in PROBED_KEYS if profile.sources.get(key) != "measured"]
     if not not_measured:
-        found, verdict = "motor and encoder are measured", CheckResult.OK
+        found_text, check_result = "motor and encoder are measured", CheckResult.OK
     else:
-        found = "scales and signs: verified by the probing move before the first session"
-        verdict = CheckResult.SKIPPED
-    detail = (
+        found_text = "scales and signs: verified by the probing move before the first session"
+        check_result = CheckResult.SKIPPED
+    detail_text = (
         f"Probing move: sessions begin with it because {', '.join(not_measured)} "
         f"{'is' if len(not_measured) == 1 else 'are'} not measured; rigd probe makes it by itself "
         "(docs/safety.md)."
         if not_measured
         else ""
     )
-    yield CheckRow("drive", "probing move", found, "", verdict, detail)
+    yield CheckRow("drive", "probing move", found_text, "", check_result, detail_text)
 
 
 # All devices
@@ -425,22 +463,22 @@ def inspect_devices(profile: Profile) -> list[CheckRow]:
     """
     rig = profile.rig
     target = actuation_target(rig)
-    rows = list(_link_rows(rig, target))
+    check_rows = list(_link_rows(rig, target))
     try:
         devices = open_devices(rig)
-        with ExitStack() as closing:
-            closing.callback(devices.sensor.close)
-            closing.callback(devices.drive.close)
-            _check_devices(profile, devices, target, rows)
+        with ExitStack() as exit_stack:
+            exit_stack.callback(devices.sensor.close)
+            exit_stack.callback(devices.drive.close)
+            _check_devices(profile, devices, target, check_rows)
     except (DeviceError, OSError) as error:
-        rows.append(CheckRow("devices", "open and close", str(error), "", CheckResult.FAIL))
-    return rows
+        check_rows.append(CheckRow("devices", "open and close", str(error), "", CheckResult.FAIL))
+    return check_rows
 
 
 def _check_devices(
-    profile: Profile, devices: Devices, target: ActuationTarget, rows: list[CheckRow]
+    profile: Profile, devices: Devices, target: ActuationTarget, check_rows: list[CheckRow]
 ) -> None:
-    """Connect drive and sensor, and append the rows of their checks to `rows`."""
+    """Connect drive and sensor, and append the rows of their checks to `check_rows`."""
     rig, drive, sensor = profile.rig, devices.drive, devices.sensor
 
     def drive_rows() -> Iterator[CheckRow]:
@@ -465,45 +503,47 @@ def _check_devices(
                 "sensor", "rate", f"not measured: {target.value}", "", CheckResult.SKIPPED
             )
         else:
-            measured = sensor.measure(RATE_MEASUREMENT_S)
-            yield from _measured_rows(measured, rig, sensor.health().cause)
+            measured_values = sensor.measure(RATE_MEASUREMENT_S)
+            yield from _measured_rows(measured_values, rig, sensor.health().cause)
 
     # The drive is connected last, since an operational drive expects a SYNC every period.
-    sensor_ok = _collect_rows("sensor", sensor_rows(), rows) and _collect_rows(
-        "sensor", rate_rows(), rows
+    sensor_ok = _collect_rows("sensor", sensor_rows(), check_rows) and _collect_rows(
+        "sensor", rate_rows(), check_rows
     )
-    drive_ok = _collect_rows("drive", drive_rows(), rows)
+    drive_ok = _collect_rows("drive", drive_rows(), check_rows)
     if target is ActuationTarget.SIMULATED:
-        rows.append(
+        check_rows.append(
             CheckRow("exchange", "ticks", "simulated in this process", "", CheckResult.SKIPPED)
         )
     elif drive_ok and sensor_ok:
-        _collect_rows("exchange", _exchange_rows(profile, devices, target), rows)
+        _collect_rows("exchange", _exchange_rows(profile, devices, target), check_rows)
     else:
         why = "not without drive and sensor"
-        rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
+        check_rows.append(CheckRow("exchange", "ticks", why, "", CheckResult.SKIPPED))
 
 
-def _collect_rows(group: str, found: Iterable[CheckRow], rows: list[CheckRow]) -> bool:
-    """Append the rows of a check to `rows`, and return whether the check raised no error.
+def _collect_rows(
+    row_group: str, found_rows: Iterable[CheckRow], check_rows: list[CheckRow]
+) -> bool:
+    """Append the rows of a check to `check_rows`, and return whether the check raised no error.
 
     An error of a device becomes a failed row.
     """
     try:
-        rows.extend(found)
+        check_rows.extend(found_rows)
     except (DeviceError, OSError) as error:
-        rows.append(CheckRow(group, "error", str(error), "", CheckResult.FAIL))
+        check_rows.append(CheckRow(row_group, "error", str(error), "", CheckResult.FAIL))
         return False
     return True
 
 
 def _connection_text(target: ActuationTarget) -> str:
-    """Return the text for a connected device."""
+    """Return the finding for a connected device: "simulated in this process" or "it answers"."""
     return "simulated in this process" if target is ActuationTarget.SIMULATED else "it answers"
 
 
 def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow]:
-    """Yield the rows on the target that will move and on its bus and serial line."""
+    """Yield check results on the target that will move and on its bus and serial line."""
     simulator = find_simulator(rig.name)
     if simulator is not None:
         target_text = f"{target.value} (process {simulator.pid})"
@@ -511,8 +551,8 @@ def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow
         return
     yield CheckRow("link", "what moves", target.value, "", CheckResult.OK)
     if rig.can is not None:
-        bus = f"{rig.can.channel} ({rig.can.interface})"
-        yield CheckRow("link", "CAN", bus, "", CheckResult.OK)
+        bus_text = f"{rig.can.channel} ({rig.can.interface})"
+        yield CheckRow("link", "CAN", bus_text, "", CheckResult.OK)
     if rig.ati_serial is not None:
         yield CheckRow(
             "link",

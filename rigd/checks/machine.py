@@ -60,24 +60,24 @@ def settings_granted(settings: RealtimeSettings) -> dict[str, str]:
     OSError, subprocess.SubprocessError, ValueError
         If the process cannot be started, or fails.
     """
-    numbers = settings.priority, settings.supervision_priority, settings.cpu
-    command = [*OWN_PYTHON, "-c", _GRANT_PROGRAM, *map(str, numbers)]
-    completed = subprocess.run(
-        command, capture_output=True, text=True, timeout=_GRANT_TIMEOUT_S, check=True
+    setting_numbers = settings.priority, settings.supervision_priority, settings.cpu
+    command_line = [*OWN_PYTHON, "-c", _GRANT_PROGRAM, *map(str, setting_numbers)]
+    completed_process = subprocess.run(
+        command_line, capture_output=True, text=True, timeout=_GRANT_TIMEOUT_S, check=True
     )
-    granted: dict[str, str]
-    granted, supervision = json.loads(completed.stdout)
-    if supervision:
-        cores = supervision.get("cores")
-        core_text = f" on core {cores}" if cores else ""
-        granted["supervision"] = supervision["scheduling"] + core_text
-    return granted
+    granted_settings: dict[str, str]
+    granted_settings, supervision_settings = json.loads(completed_process.stdout)
+    if supervision_settings:
+        core_numbers = supervision_settings.get("cores")
+        core_text = f" on core {core_numbers}" if core_numbers else ""
+        granted_settings["supervision"] = supervision_settings["scheduling"] + core_text
+    return granted_settings
 
 
 def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
-    """Yield the rows on the real-time settings that the system would grant to a session."""
+    """Yield check results on the real-time settings that the system would grant to a session."""
     try:
-        granted = settings_granted(settings)
+        granted_settings = settings_granted(settings)
     except (OSError, subprocess.SubprocessError, ValueError) as error:
         yield CheckRow(
             "real time", "rights", f"could not be tried: {error}", "", CheckResult.WARNING
@@ -85,40 +85,40 @@ def rights_rows(settings: RealtimeSettings) -> Iterator[CheckRow]:
         return
     if settings.priority == 0:
         yield CheckRow("real time", "scheduling", "not requested", "", CheckResult.OK)
-    for name, text in granted.items():
-        not_granted = (
-            text.startswith(REFUSED)
-            or (name == "memory" and text != MEMORY_LOCKED)
-            or (name == "supervision" and not text.startswith("SCHED_RR"))
+    for setting_name, granted_text in granted_settings.items():
+        is_refused = (
+            granted_text.startswith(REFUSED)
+            or (setting_name == "memory" and granted_text != MEMORY_LOCKED)
+            or (setting_name == "supervision" and not granted_text.startswith("SCHED_RR"))
         )
-        wanted = _REQUIRED_SETTINGS.get(name, "granted") if not_granted else ""
+        wanted_text = _REQUIRED_SETTINGS.get(setting_name, "granted") if is_refused else ""
         yield CheckRow(
             "real time",
-            _ROW_LABELS.get(name, name.replace("_", " ")),
-            text,
-            wanted.format(
+            _ROW_LABELS.get(setting_name, setting_name.replace("_", " ")),
+            granted_text,
+            wanted_text.format(
                 priority=settings.priority, supervision_priority=settings.supervision_priority
             ),
-            grade(fail=False, warn=not_granted),
-            _setting_advice(name, settings) if not_granted else "",
+            grade(fail=False, warn=is_refused),
+            _setting_advice(setting_name, settings) if is_refused else "",
         )
 
 
-def _setting_advice(name: str, settings: RealtimeSettings) -> str:
+def _setting_advice(setting_name: str, settings: RealtimeSettings) -> str:
     """Return the advice for a setting that was not granted, or "" if there is none."""
-    if name == "idle_states":
+    if setting_name == "idle_states":
         return _IDLE_STATES_ADVICE
-    lines = {
+    limits_lines = {
         "memory": f"{_user_name()} - memlock unlimited",
         "scheduling": f"{_user_name()} - rtprio {settings.priority}",
         "supervision": f"{_user_name()} - rtprio {settings.priority}",
     }
-    if name not in lines:
+    if setting_name not in limits_lines:
         return ""
-    row = _ROW_LABELS.get(name, name).capitalize()
+    row_label = _ROW_LABELS.get(setting_name, setting_name).capitalize()
     return (
-        f"{row}: put this line into /etc/security/limits.d/rigd.conf and log in again: "
-        f"{lines[name]}"
+        f"{row_label}: put this line into /etc/security/limits.d/rigd.conf and log in again: "
+        f"{limits_lines[setting_name]}"
     )
 
 
@@ -157,7 +157,7 @@ _MIN_RUNTIME_FRACTION = 0.95
 def machine_rows(
     settings: RealtimeSettings, root: Path = Path("/"), kernel: str = ""
 ) -> Iterator[CheckRow]:
-    """Yield the rows on settings of this computer that can delay ticks, with advice.
+    """Yield check results on settings of this computer that can delay ticks, with advice.
 
     Parameters
     ----------
@@ -179,20 +179,20 @@ def machine_rows(
 
 
 def _kernel_row(root: Path, kernel: str) -> CheckRow:
-    """Return the row on whether the kernel is a real-time kernel."""
-    preemptible = "PREEMPT_RT" in kernel or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
-    if preemptible:
-        found = "PREEMPT_RT"
+    """Return the check result on whether the kernel is a real-time kernel."""
+    is_preemptible = "PREEMPT_RT" in kernel or _read_or_empty(root / _REALTIME_KERNEL_FILE) == "1"
+    if is_preemptible:
+        found_text = "PREEMPT_RT"
     else:
-        found = "preemptible" if "PREEMPT" in kernel else "not preemptible"
+        found_text = "preemptible" if "PREEMPT" in kernel else "not preemptible"
     return CheckRow(
         _COMPUTER_GROUP,
         "kernel",
-        found,
+        found_text,
         "PREEMPT_RT",
-        grade(fail=False, warn=not preemptible),
+        grade(fail=False, warn=not is_preemptible),
         ""
-        if preemptible
+        if is_preemptible
         else "Kernel: an ordinary one delays a tick by milliseconds now and then; install your "
         "distribution's real-time kernel (Debian: linux-image-rt-amd64; Ubuntu: pro enable "
         "realtime-kernel).",
@@ -200,62 +200,67 @@ def _kernel_row(root: Path, kernel: str) -> CheckRow:
 
 
 def _virtual_row(root: Path) -> CheckRow:
-    """Return the row on whether this computer is a virtual machine."""
+    """Return the check result on whether this computer is a virtual machine."""
     cpu_info_words = set(_read_or_empty(root / "proc/cpuinfo").split())
-    virtual = "hypervisor" in cpu_info_words or bool(_read_or_empty(root / "sys/hypervisor/type"))
+    is_virtual = "hypervisor" in cpu_info_words or bool(
+        _read_or_empty(root / "sys/hypervisor/type")
+    )
     return CheckRow(
         _COMPUTER_GROUP,
         "hardware",
-        "virtual machine" if virtual else "no hypervisor seen",
+        "virtual machine" if is_virtual else "no hypervisor seen",
         "a dedicated computer",
-        grade(fail=False, warn=virtual),
+        grade(fail=False, warn=is_virtual),
         "Hardware: the hypervisor can suspend this machine for milliseconds, which nothing inside "
         "can prevent; run a real rig on a dedicated computer."
-        if virtual
+        if is_virtual
         else "",
     )
 
 
 def _core_row(settings: RealtimeSettings, root: Path) -> CheckRow:
-    """Return the row on whether the loop's core is isolated from other programs."""
-    isolated = isolated_cores(root)
-    cores = ", ".join(map(str, sorted(isolated)))
-    loop_core_isolated = settings.cpu in isolated if settings.cpu >= 0 else bool(isolated)
-    if settings.cpu >= 0 and isolated and not loop_core_isolated:
-        found, remedy = (
-            f"{cores}; the loop runs on {settings.cpu}",
-            f"Isolated core: set realtime.cpu to -1 or to one of {cores}.",
+    """Return the check result on whether the loop's core is isolated from other programs."""
+    isolated_numbers = isolated_cores(root)
+    cores_text = ", ".join(map(str, sorted(isolated_numbers)))
+    loop_core_isolated = (
+        settings.cpu in isolated_numbers if settings.cpu >= 0 else bool(isolated_numbers)
+    )
+    if settings.cpu >= 0 and isolated_numbers and not loop_core_isolated:
+        found_text, remedy_text = (
+            f"{cores_text}; the loop runs on {settings.cpu}",
+            f"Isolated core: set realtime.cpu to -1 or to one of {cores_text}.",
         )
     else:
-        found, remedy = cores or "none", _isolation_advice((os.cpu_count() or 1) - 1)
+        found_text, remedy_text = cores_text or "none", _isolation_advice((os.cpu_count() or 1) - 1)
     return CheckRow(
         _COMPUTER_GROUP,
         "isolated core",
-        found,
+        found_text,
         "one",
         grade(fail=False, warn=not loop_core_isolated),
-        "" if loop_core_isolated else remedy,
+        "" if loop_core_isolated else remedy_text,
     )
 
 
-def _isolation_advice(last: int) -> str:
-    """Return the advice to isolate the last core, whose number is `last`."""
-    if last == 0:
+def _isolation_advice(last_core: int) -> str:
+    """Return the advice to isolate the last core, whose number is `last_core`."""
+    if last_core == 0:
         return (
             "Isolated core: this computer has one core, which everything shares; use one with more."
         )
     return (
         "Isolated core: other programs may share the loop's core. Boot with "
-        f"isolcpus={last} nohz_full={last} irqaffinity=0 (GRUB_CMDLINE_LINUX in /etc/default/grub, "
+        f"isolcpus={last_core} nohz_full={last_core} irqaffinity=0 (GRUB_CMDLINE_LINUX in "
+        "/etc/default/grub, "
         "then update-grub)."
     )
 
 
 def _governor_row(root: Path) -> CheckRow:
-    """Return the row on the governor of the processor's frequency."""
+    """Return the check result on the governor of the processor's frequency."""
     governors = {
-        _read_or_empty(path)
-        for path in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
+        _read_or_empty(governor_file)
+        for governor_file in sorted((root / _CPU_FOLDER).glob("cpu[0-9]*/cpufreq/scaling_governor"))
     }
     is_slow = bool(governors - {"performance"})
     return CheckRow(
@@ -272,14 +277,14 @@ def _governor_row(root: Path) -> CheckRow:
 
 
 def _clock_row(root: Path) -> CheckRow:
-    """Return the row on the kernel's clock source."""
-    source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
+    """Return the check result on the kernel's clock source."""
+    clock_source = _read_or_empty(root / _CLOCK_SOURCE_FILE)
     # Architectures other than x86 have a fast counter of their own.
-    is_fast = source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
+    is_fast = clock_source in ("tsc", "kvm-clock", "arch_sys_counter", "riscv_clocksource")
     return CheckRow(
         _COMPUTER_GROUP,
         "clock source",
-        source or "unknown",
+        clock_source or "unknown",
         "tsc",
         grade(fail=False, warn=not is_fast),
         ""
@@ -290,36 +295,36 @@ def _clock_row(root: Path) -> CheckRow:
 
 
 def _wall_clock_row() -> CheckRow:
-    """Return the row on whether the wall clock is synchronised."""
-    synchronised = _is_wall_clock_synchronised()
+    """Return the check result on whether the wall clock is synchronised."""
+    is_synchronised = _is_wall_clock_synchronised()
     return CheckRow(
         _COMPUTER_GROUP,
         "wall clock",
-        "synchronised" if synchronised else "not synchronised",
+        "synchronised" if is_synchronised else "not synchronised",
         "synchronised",
-        grade(fail=False, warn=not synchronised),
+        grade(fail=False, warn=not is_synchronised),
         ""
-        if synchronised
+        if is_synchronised
         else "Wall clock: the times in the files may be wrong (ticks do not depend on it); "
         "timedatectl set-ntp true, or install chrony.",
     )
 
 
 def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
-    """Return the row on the fraction of time that the kernel leaves to real-time processes."""
+    """Return the result on the fraction of time that the kernel leaves to real-time processes."""
     runtime_us = _read_number(root / _RUNTIME_FILE, -1)
     period_us = _read_number(root / _PERIOD_FILE, 1_000_000)
-    fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
-    too_low = fraction < _MIN_RUNTIME_FRACTION and settings.priority > 0
+    runtime_fraction = runtime_us / period_us if runtime_us >= 0 else 1.0
+    is_too_low = runtime_fraction < _MIN_RUNTIME_FRACTION and settings.priority > 0
     return CheckRow(
         _COMPUTER_GROUP,
         "real-time share",
-        "all of a core" if runtime_us < 0 else f"{100 * fraction:.0f} % of a core",
+        "all of a core" if runtime_us < 0 else f"{100 * runtime_fraction:.0f} % of a core",
         f"{100 * _MIN_RUNTIME_FRACTION:.0f} %",
-        grade(fail=False, warn=too_low),
+        grade(fail=False, warn=is_too_low),
         "Real-time share: the kernel stops real-time processes that take more; "
         "sysctl kernel.sched_rt_runtime_us=950000."
-        if too_low
+        if is_too_low
         else "",
     )
 
@@ -327,10 +332,10 @@ def _throttling_row(settings: RealtimeSettings, root: Path) -> CheckRow:
 def _is_wall_clock_synchronised() -> bool:
     """Return whether the kernel reports a synchronised wall clock."""
     try:
-        state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
+        clock_state: int = ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_SIZE))
     except (OSError, AttributeError):
         return False
-    return 0 <= state < _TIME_ERROR_STATE
+    return 0 <= clock_state < _TIME_ERROR_STATE
 
 
 def _read_or_empty(path: Path) -> str:

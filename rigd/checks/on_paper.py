@@ -70,73 +70,82 @@ STABILITY_ROW = "loop_stability"
 
 
 def stability_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on whether the closed loop of a profile's rig is stable."""
+    """Yield the check result on whether the closed loop of a profile's rig is stable."""
     try:
-        loop, warning = stable_loop(profile.loop_model())
+        closed_loop, warning_text = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
         yield CheckRow(
             "loop", "stability", str(error), "stable", CheckResult.FAIL, name=STABILITY_ROW
         )
         return
-    found = f"closed loop stable, slowest pole {loop.growth_per_s:.2g} 1/s"
+    found_text = f"closed loop stable, slowest pole {closed_loop.growth_per_s:.2g} 1/s"
     yield CheckRow(
         "loop",
         "stability",
-        warning or found,
+        warning_text or found_text,
         "stable",
-        grade(fail=False, warn=warning is not None),
+        grade(fail=False, warn=warning_text is not None),
         name=STABILITY_ROW,
     )
 
 
 def margin_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the stability margins of the closed loop; skipped if it is unstable."""
+    """Yield results on the stability margins of the closed loop; skipped if it is unstable."""
     from rigd.control import loop_margins
 
     try:
-        loop, warning = stable_loop(profile.loop_model())
+        closed_loop, warning_text = stable_loop(profile.loop_model())
     except (ControlDesignError, RealisationError) as error:
-        warning = str(error)
-    if warning is not None:
+        warning_text = str(error)
+    if warning_text is not None:
         yield CheckRow("loop", "margins", "the loop is not stable", "", CheckResult.SKIPPED)
         return
     period_s = 1.0 / profile.rig.rate_hz
-    for margins in loop_margins(loop):
-        least_gain = (
-            LEAST_ANGLE_GAIN_FACTOR if margins.cut == "angle reading" else LEAST_TORQUE_GAIN_FACTOR
+    for cut_margins in loop_margins(closed_loop):
+        least_gain_factor = (
+            LEAST_ANGLE_GAIN_FACTOR
+            if cut_margins.cut == "angle reading"
+            else LEAST_TORQUE_GAIN_FACTOR
         )
-        yield from _margin_rows(margins, least_gain, LEAST_DELAY_MARGIN_PERIODS * period_s)
+        yield from _margin_rows(
+            cut_margins, least_gain_factor, LEAST_DELAY_MARGIN_PERIODS * period_s
+        )
 
 
-def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) -> Iterator[CheckRow]:
-    """Yield the rows on the stability margins at one signal of the loop."""
-    group = f"loop, {margins.cut}"
-    too_strong = (
+def _margin_rows(
+    margins: "Margins", least_gain_factor: float, least_delay_s: float
+) -> Iterator[CheckRow]:
+    """Yield check results on the stability margins at one signal of the loop."""
+    row_group = f"loop, {margins.cut}"
+    gain_up_text = (
         "any"
         if margins.gain_up == inf
         else _with_frequency(_decibels(margins.gain_up), margins.gain_up_hz)
     )
-    too_weak = (
+    gain_down_text = (
         "any"
         if margins.gain_down == 0.0
         else _with_frequency(_decibels(margins.gain_down), margins.gain_down_hz)
     )
     yield CheckRow(
-        group,
+        row_group,
         "gain margin",
-        f"{too_weak} / {too_strong}",
-        f"{_decibels(1 / least_gain)} / {_decibels(least_gain)}",
-        grade(fail=False, warn=margins.gain_up < least_gain or margins.gain_down > 1 / least_gain),
+        f"{gain_down_text} / {gain_up_text}",
+        f"{_decibels(1 / least_gain_factor)} / {_decibels(least_gain_factor)}",
+        grade(
+            fail=False,
+            warn=margins.gain_up < least_gain_factor or margins.gain_down > 1 / least_gain_factor,
+        ),
     )
     yield CheckRow(
-        group,
+        row_group,
         "phase margin",
         _with_frequency(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
         f"{degrees(LEAST_PHASE_MARGIN_RAD):.0f}°",
         grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_MARGIN_RAD),
     )
     yield CheckRow(
-        group,
+        row_group,
         "delay margin",
         "any"
         if margins.delay_s == inf
@@ -145,7 +154,7 @@ def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) ->
         grade(fail=False, warn=margins.delay_s < least_delay_s),
     )
     yield CheckRow(
-        group,
+        row_group,
         "modulus margin",
         _with_frequency(f"{margins.modulus:.2f}", margins.modulus_hz),
         "",
@@ -154,13 +163,13 @@ def _margin_rows(margins: "Margins", least_gain: float, least_delay_s: float) ->
 
 
 def _decibels(gain: float) -> str:
-    """Format a gain in decibels with its sign."""
+    """Format a gain factor of the loop in decibels with its sign."""
     return f"{20 * log10(gain):+.1f} dB"
 
 
-def _with_frequency(value: str, frequency_hz: float) -> str:
-    """Append the frequency in brackets to a value, unless the frequency is not a number."""
-    return value if frequency_hz != frequency_hz else f"{value} ({frequency_hz:.1f} Hz)"
+def _with_frequency(value_text: str, frequency_hz: float) -> str:
+    """Append a frequency in Hz in brackets to a value's text, unless the frequency is NaN."""
+    return value_text if frequency_hz != frequency_hz else f"{value_text} ({frequency_hz:.1f} Hz)"
 
 
 # Stopping distance
@@ -229,14 +238,14 @@ def worst_travel(
     with_beam_kg_m2 = without_beam_kg_m2 + beam.density_kg_per_m * beam.length_m**3 / 3
     speed_rad_s = limits.velocity_rad_s
     under_torque_rad = 0.0
-    steps = round(torque_on_s / _TIME_STEP_S)
-    for step in range(steps):
+    step_count = round(torque_on_s / _TIME_STEP_S)
+    for step_number in range(step_count):
         torque_nm = motor.peak_torque_nm - _friction_nm(rig, speed_rad_s)
         faster_rad_s = max(0.0, speed_rad_s + torque_nm / without_beam_kg_m2 * _TIME_STEP_S)
         previous_rad_s, speed_rad_s = speed_rad_s, min(faster_rad_s, max_speed_rad_s)
         under_torque_rad += 0.5 * (previous_rad_s + speed_rad_s) * _TIME_STEP_S
         if speed_rad_s == previous_rad_s:  # it goes on like this
-            under_torque_rad += speed_rad_s * (steps - 1 - step) * _TIME_STEP_S
+            under_torque_rad += speed_rad_s * (step_count - 1 - step_number) * _TIME_STEP_S
             break
         if under_torque_rad > _MAX_TRAVEL_RAD:
             break
@@ -251,14 +260,14 @@ def _coasting_rad(inertia_kg_m2: float, motor: "Motor", speed_rad_s: float) -> f
 
     It is infinite if there is no friction.
     """
-    viscous, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
-    ratio = viscous * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
-    if ratio < _NEGLIGIBLE_VISCOUS_RATIO:
+    viscous_nm_s_per_rad, coulomb_nm = motor.viscous_nm_s_per_rad, motor.coulomb_nm
+    viscous_ratio = viscous_nm_s_per_rad * speed_rad_s / coulomb_nm if coulomb_nm > 0.0 else inf
+    if viscous_ratio < _NEGLIGIBLE_VISCOUS_RATIO:
         return 0.5 * inertia_kg_m2 * speed_rad_s**2 / coulomb_nm
-    if viscous == 0.0:
+    if viscous_nm_s_per_rad == 0.0:
         return inf if speed_rad_s > 0.0 else 0.0
-    coulomb_correction = log1p(ratio) / ratio if isfinite(ratio) else 0.0
-    return inertia_kg_m2 * speed_rad_s / viscous * (1.0 - coulomb_correction)
+    coulomb_correction = log1p(viscous_ratio) / viscous_ratio if isfinite(viscous_ratio) else 0.0
+    return inertia_kg_m2 * speed_rad_s / viscous_nm_s_per_rad * (1.0 - coulomb_correction)
 
 
 @dataclass(frozen=True, slots=True)
@@ -278,19 +287,19 @@ class _UncontrolledFailure:
 
 
 def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]:
-    """Return the failures after which the torque remains on for a time."""
-    rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
-    assert drive is not None
+    """Return the failures after which the torque remains on for a time without control."""
+    rig, limits, drive_settings = profile.rig, profile.limits, profile.rig.cia402
+    assert drive_settings is not None
     stale_ticks, missed_ticks = limits.stale_ticks_in_a_row, limits.missed_ticks_in_a_row
-    own_watchdog = drive.watchdog_s > drive.heartbeat_timeout_s
-    watchdog = "cia402.own_watchdog_s" if own_watchdog else "cia402.heartbeat_timeout_s"
+    own_watchdog = drive_settings.watchdog_s > drive_settings.heartbeat_timeout_s
+    watchdog_key = "cia402.own_watchdog_s" if own_watchdog else "cia402.heartbeat_timeout_s"
     return (
         _UncontrolledFailure(
             TRAVEL_LOOP_FAILS_ROW,
             _LOOP_FAILS_LABEL,
-            drive.watchdog_s,
-            f"of the drive's watchdog ({watchdog})",
-            watchdog,
+            drive_settings.watchdog_s,
+            f"of the drive's watchdog ({watchdog_key})",
+            watchdog_key,
         ),
         # The tick that finds one old angle too many removes the torque, after the command's delay.
         _UncontrolledFailure(
@@ -318,71 +327,89 @@ def _uncontrolled_failures(profile: Profile) -> tuple[_UncontrolledFailure, ...]
 
 
 def travel_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows that compare the stopping distance after each failure with the free angle.
+    """Yield results that compare the stopping distance after each failure with the free angle.
 
     The free angle is that between the limit of the angle and the mechanical stop.
     """
-    rig, limits, drive = profile.rig, profile.limits, profile.rig.cia402
-    if drive is None:
-        why = "the drive is part of this program and ends with it"
+    rig, limits, drive_settings = profile.rig, profile.limits, profile.rig.cia402
+    if drive_settings is None:
+        skip_reason = "the drive is part of this program and ends with it"
         yield CheckRow(
             _TRAVEL_GROUP,
             _LOOP_FAILS_LABEL,
-            why,
+            skip_reason,
             "",
             CheckResult.SKIPPED,
             name=TRAVEL_LOOP_FAILS_ROW,
         )
         return
-    failures = _uncontrolled_failures(profile)
+    uncontrolled_failures = _uncontrolled_failures(profile)
     margin_rad = limits.stop_angle_rad - limits.angle_rad
-    bound = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
-    has_no_bound = isinf(drive.watchdog_s)
+    bound_text = f"at most {margin_rad:.2f} rad (limits.stop_angle_rad - limits.angle_rad)"
+    has_no_bound = isinf(drive_settings.watchdog_s)
     if has_no_bound:
-        failures = tuple(failure for failure in failures if not isinf(failure.duration_s))
+        uncontrolled_failures = tuple(
+            uncontrolled_failure
+            for uncontrolled_failure in uncontrolled_failures
+            if not isinf(uncontrolled_failure.duration_s)
+        )
         yield CheckRow(
             _TRAVEL_GROUP,
             f"worst, {_LOOP_FAILS_LABEL}",
             "without bound: the profile accepts a drive without a watchdog",
-            bound,
+            bound_text,
             CheckResult.WARNING,
             f"Travel {_LOOP_FAILS_LABEL}: nothing but the wired stop ends it "
             '(cia402.accept_without = ["watchdog"]).',
             TRAVEL_LOOP_FAILS_ROW,
         )
-    has_speed_limit = drive.max_speed_rad_s > 0
-    highest_rad_s = drive.max_speed_rad_s if has_speed_limit else inf
-    travels = [worst_travel(rig, limits, failure.duration_s, highest_rad_s) for failure in failures]
-    longest = max(range(len(failures)), key=lambda number: travels[number].total_rad)
-    for number, (failure, travel) in enumerate(zip(failures, travels, strict=True)):
-        too_far = not travel.total_rad <= margin_rad
-        detail = ""
-        if number == longest:
-            unlimited = worst_travel(rig, limits, failure.duration_s)
-            detail = "" if has_no_bound else f"Travel: the worst is {failure.what}. "
-            detail += (
-                f"It relies on the drive's own speed limit of {drive.max_speed_rad_s:g} rad/s "
-                f"(object 6080); without it, it would be {_format_angle(unlimited.total_rad)}."
+    has_speed_limit = drive_settings.max_speed_rad_s > 0
+    highest_rad_s = drive_settings.max_speed_rad_s if has_speed_limit else inf
+    travels = [
+        worst_travel(rig, limits, uncontrolled_failure.duration_s, highest_rad_s)
+        for uncontrolled_failure in uncontrolled_failures
+    ]
+    longest_index = max(
+        range(len(uncontrolled_failures)),
+        key=lambda failure_index: travels[failure_index].total_rad,
+    )
+    for failure_index, (uncontrolled_failure, stopping_travel) in enumerate(
+        zip(uncontrolled_failures, travels, strict=True)
+    ):
+        exceeds_margin = not stopping_travel.total_rad <= margin_rad
+        detail_text = ""
+        if failure_index == longest_index:
+            unlimited_failures = worst_travel(rig, limits, uncontrolled_failure.duration_s)
+            detail_text = (
+                "" if has_no_bound else f"Travel: the worst is {uncontrolled_failure.what}. "
+            )
+            detail_text += (
+                "It relies on the drive's own speed limit of "
+                f"{drive_settings.max_speed_rad_s:g} rad/s "
+                "(object 6080); without it, it would be "
+                f"{_format_angle(unlimited_failures.total_rad)}."
                 if has_speed_limit
                 else "The drive's own speed limit (object 6080) is not set; "
                 "cia402.max_speed_rad_s shortens it."
             )
-        if too_far:
-            detail += (
-                f" Travel {failure.what}: lower {failure.key}, cia402.max_speed_rad_s, "
+        if exceeds_margin:
+            detail_text += (
+                f" Travel {uncontrolled_failure.what}: lower {uncontrolled_failure.key}, "
+                "cia402.max_speed_rad_s, "
                 "limits.velocity_rad_s or limits.angle_rad."
             )
-        worst = "worst, " if number == longest and not has_no_bound else ""
+        worst_failure = "worst, " if failure_index == longest_index and not has_no_bound else ""
         yield CheckRow(
             _TRAVEL_GROUP,
-            f"{worst}{failure.what}",
-            f"{_format_angle(travel.total_rad)}: {_format_angle(travel.driven_rad)} in the "
-            f"{failure.duration_s * 1e3:g} ms {failure.ended_by}, "
-            f"{_format_angle(travel.coasting_rad)} coasting",
-            bound,
-            grade(fail=too_far),
-            detail.strip(),
-            failure.name,
+            f"{worst_failure}{uncontrolled_failure.what}",
+            f"{_format_angle(stopping_travel.total_rad)}: "
+            f"{_format_angle(stopping_travel.driven_rad)} in the "
+            f"{uncontrolled_failure.duration_s * 1e3:g} ms {uncontrolled_failure.ended_by}, "
+            f"{_format_angle(stopping_travel.coasting_rad)} coasting",
+            bound_text,
+            grade(fail=exceeds_margin),
+            detail_text.strip(),
+            uncontrolled_failure.name,
         )
 
 
@@ -403,7 +430,7 @@ EDS_ROW = "eds"
 
 
 def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
-    """Yield the rows that compare a drive's EDS file with the requirements on a drive.
+    """Yield the check results that compare a drive's EDS file with the requirements on a drive.
 
     Parameters
     ----------
@@ -415,7 +442,7 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
     from rigd.devices.cia402 import Grade, check_suitability
     from rigd.devices.eds import EdsError, read_eds
 
-    verdicts = {
+    result_by_grade = {
         Grade.FITS: CheckResult.OK,
         Grade.SUBSTITUTED: CheckResult.OK,
         Grade.ASK: CheckResult.SKIPPED,
@@ -436,17 +463,17 @@ def eds_rows(path: Path, rig: RigParameters | None) -> Iterator[CheckRow]:
             finding.what,
             finding.found,
             finding.wanted,
-            verdicts[finding.grade],
+            result_by_grade[finding.grade],
             finding.sentence,
             EDS_ROW,
         )
 
 
 def drive_file_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the EDS file that the profile names; none if it names no file."""
-    settings = profile.rig.cia402
-    if settings is not None and settings.eds:
-        yield from eds_rows(Path(settings.eds), profile.rig)
+    """Yield check results on the EDS file that the profile names; none if it names no file."""
+    drive_settings = profile.rig.cia402
+    if drive_settings is not None and drive_settings.eds:
+        yield from eds_rows(Path(drive_settings.eds), profile.rig)
 
 
 # Profile and wiring
@@ -458,25 +485,28 @@ An additional device, or repeated frames after a disturbance, would not fit."""
 
 
 def profile_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the rows on the profile's name and its assumed, not verified, numbers."""
+    """Yield check results on the profile's name and its assumed, not verified, numbers."""
     yield CheckRow("profile", profile.name, str(profile.path), "", CheckResult.OK)
-    assumed = [key for key, source in profile.sources.items() if source == "assumed"]
+    assumed_keys = [
+        key for key, number_source in profile.sources.items() if number_source == "assumed"
+    ]
     yield CheckRow(
         "profile",
         "unverified profile values",
-        f"{len(assumed)} of {len(profile.sources)}",
+        f"{len(assumed_keys)} of {len(profile.sources)}",
         "none",
-        grade(fail=False, warn=bool(assumed)),
-        f"Assumed: {', '.join(assumed)}." if assumed else "",
+        grade(fail=False, warn=bool(assumed_keys)),
+        f"Assumed: {', '.join(assumed_keys)}." if assumed_keys else "",
     )
 
 
 def record_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on the longest possible record, and whether a default chirp fits into it."""
-    options = signature(chirp).parameters
-    limit = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
+    """Yield the result on the longest possible record, and whether a default chirp fits into it."""
+    chirp_parameters = signature(chirp).parameters
+    limit_text = f"no more than {MAX_SAMPLES} samples can be analysed, exported or replayed"
     default_chirp_s = sum(
-        float(options[name].default) for name in ("rest_s", "duration_s", "ring_down_s")
+        float(chirp_parameters[parameter_name].default)
+        for parameter_name in ("rest_s", "duration_s", "ring_down_s")
     )
     longest_s = MAX_SAMPLES / profile.rig.rate_hz
     yield CheckRow(
@@ -485,7 +515,7 @@ def record_rows(profile: Profile) -> Iterator[CheckRow]:
         f"{longest_s:g} s at {profile.rig.rate_hz:g} Hz",
         f"{default_chirp_s:g} s (run chirp)",
         grade(fail=False, warn=longest_s < default_chirp_s),
-        f"A chirp of {default_chirp_s:g} s is refused: {limit}."
+        f"A chirp of {default_chirp_s:g} s is refused: {limit_text}."
         if longest_s < default_chirp_s
         else "",
     )
@@ -503,23 +533,28 @@ _EXAMPLE_TILT_DEG = 0.5
 
 
 def axis_tilt_rows(profile: Profile) -> Iterator[CheckRow]:
-    """Yield the row on the measured inclination of the motor's axis; it refuses no session."""
+    """Yield the result on the measured inclination of the motor's axis; it refuses no session."""
     if profile.rig.devices.drive == "sim":
-        found, detail, verdict = "the simulated rig has no gravity", "", CheckResult.SKIPPED
+        found_text, detail_text, check_result = (
+            "the simulated rig has no gravity",
+            "",
+            CheckResult.SKIPPED,
+        )
     elif profile.axis_tilt_deg is None:
-        found, verdict = "not known", CheckResult.WARNING
-        shift = _tilt_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
-        detail = (
-            f"Axis plumb: gravity along the beam shifts its modes, mode 1 by {shift:.2g} % for "
+        found_text, check_result = "not known", CheckResult.WARNING
+        shift_percent = _tilt_shift_percent(profile.rig.beam, _EXAMPLE_TILT_DEG)
+        detail_text = (
+            "Axis plumb: gravity along the beam shifts its modes, mode 1 by "
+            f"{shift_percent:.2g} % for "
             f"{_EXAMPLE_TILT_DEG:g}°, which an analysis can mistake for damping or for a mass at "
             "the tip. Measure the inclination of the motor's flange along the resting beam with a "
             "level, and state it as rig.axis_tilt_deg (positive: the tip is lower)."
         )
     else:
-        shift = _tilt_shift_percent(profile.rig.beam, profile.axis_tilt_deg)
-        found = f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {shift:+.2g} %"
-        detail, verdict = "", CheckResult.OK
-    yield CheckRow("profile", "axis plumb", found, "measured", verdict, detail)
+        shift_percent = _tilt_shift_percent(profile.rig.beam, profile.axis_tilt_deg)
+        found_text = f"{profile.axis_tilt_deg:g}° off, mode 1 shifted by {shift_percent:+.2g} %"
+        detail_text, check_result = "", CheckResult.OK
+    yield CheckRow("profile", "axis plumb", found_text, "measured", check_result, detail_text)
 
 
 def _tilt_shift_percent(beam: Beam, tilt_deg: float) -> float:
@@ -539,9 +574,9 @@ UNKNOWN_VALUES_ROW = "unknown_values"
 def unknown_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield a failed row for each value that every session needs and the profile lacks."""
     for key in unknown_values(profile.rig):
-        remedy = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
+        remedy_text = f"{key}: enter its value in {profile.path} ({MAY_BE_UNKNOWN[key]})."
         yield CheckRow(
-            "profile", key, "unknown", "a value", CheckResult.FAIL, remedy, UNKNOWN_VALUES_ROW
+            "profile", key, "unknown", "a value", CheckResult.FAIL, remedy_text, UNKNOWN_VALUES_ROW
         )
 
 
@@ -551,13 +586,13 @@ CAN_IDENTIFIERS_ROW, CAN_LOAD_ROW, SERIAL_LOAD_ROW = "can_identifiers", "can_loa
 
 
 def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
-    """Yield the rows on the CAN identifiers and on the load of the CAN bus and the serial line."""
+    """Yield results on the CAN identifiers and on the load of the CAN bus and the serial line."""
     if rig.can is not None:
         from rigd.devices.canbus import bus_load, check_identifiers
 
         collisions = check_identifiers(rig)
-        for collision in collisions:
-            yield _identifier_row(collision, CheckResult.FAIL)
+        for id_collision in collisions:
+            yield _identifier_row(id_collision, CheckResult.FAIL)
         if not collisions:
             yield _identifier_row("no collision", CheckResult.OK)
         yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
@@ -565,42 +600,42 @@ def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
         yield _line_row(rig.ati_serial)
 
 
-def _identifier_row(found: str, verdict: CheckResult) -> CheckRow:
-    """Return the row on the CAN identifiers."""
+def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:
+    """Return the check result on the CAN identifiers."""
     return CheckRow(
-        "CAN bus", "identifiers", found, "no collision", verdict, name=CAN_IDENTIFIERS_ROW
+        "CAN bus", "identifiers", found_text, "no collision", check_result, name=CAN_IDENTIFIERS_ROW
     )
 
 
-def _bus_row(load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
-    """Return the row on the load of the CAN bus."""
+def _bus_row(bus_load: "BusLoad", bitrate_bit_s: int) -> CheckRow:
+    """Return the check result on the load of the CAN bus."""
     from rigd.devices.canbus import MAX_LOAD
 
-    frames = ", ".join(
-        f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in load.traffic
+    frames_text = ", ".join(
+        f"{t.what} ({t.can_id:#05x}, {t.length} bytes, {t.rate_hz:g} Hz)" for t in bus_load.traffic
     )
     return CheckRow(
         "CAN bus",
         "load",
-        f"{100 * load.worst:.1f} % at worst, {100 * load.plain:.1f} % without stuffing",
+        f"{100 * bus_load.worst:.1f} % at worst, {100 * bus_load.plain:.1f} % without stuffing",
         f"at most {100 * MAX_LOAD:.0f} %",
-        grade(fail=load.worst > MAX_LOAD, warn=load.worst > HIGH_BUS_LOAD),
-        f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames}.",
+        grade(fail=bus_load.worst > MAX_LOAD, warn=bus_load.worst > HIGH_BUS_LOAD),
+        f"At {bitrate_bit_s / 1e3:g} kbit/s: {frames_text}.",
         CAN_LOAD_ROW,
     )
 
 
-def _line_row(serial: "AtiSerial") -> CheckRow:
-    """Return the row on the load of the serial line."""
+def _line_row(serial_settings: "AtiSerial") -> CheckRow:
+    """Return the check result on the load of the serial line."""
     from rigd.devices.ati import RECORD_BITS
     from rigd.devices.canbus import MAX_LOAD
 
-    load = RECORD_BITS * serial.stream_hz / serial.baud
+    line_load = RECORD_BITS * serial_settings.stream_hz / serial_settings.baud
     return CheckRow(
         "serial line",
         "load",
-        f"{100 * load:.1f} % of {serial.baud} bit/s",
+        f"{100 * line_load:.1f} % of {serial_settings.baud} bit/s",
         f"at most {100 * MAX_LOAD:.0f} %",
-        grade(fail=load > MAX_LOAD),
+        grade(fail=line_load > MAX_LOAD),
         name=SERIAL_LOAD_ROW,
     )

@@ -14,13 +14,13 @@ _MILLISECONDS_PER_UNIT = {"s": 1e3, "ns": 1e-6, "µs": 1e-3}
 
 
 def key_label(key: str) -> str:
-    """Return a key with spaces instead of underscores and without its unit, as a label."""
+    """Return a key as a label: with spaces instead of underscores and without its unit's suffix."""
     end = _unit_suffix(key)
     return (key[: -len(end)] if end else key).replace("_", " ")
 
 
 def format_value(key: str, value: object) -> str:
-    """Format the value of a key with its unit; numbers have four significant digits.
+    """Format a reported value with its key's unit; numbers have four significant digits.
 
     Parameters
     ----------
@@ -30,31 +30,31 @@ def format_value(key: str, value: object) -> str:
         Number, text, or a list of them.
     """
     unit = UNITS.get(_unit_suffix(key), "")
-    factor = 1.0
+    unit_factor = 1.0
     if unit in _MILLISECONDS_PER_UNIT:
-        factor, unit = _MILLISECONDS_PER_UNIT[unit], "ms"
-    if isinstance(value, list | tuple) and not all(_is_number(each) for each in value):
+        unit_factor, unit = _MILLISECONDS_PER_UNIT[unit], "ms"
+    if isinstance(value, list | tuple) and not all(_is_number(number) for number in value):
         return "; ".join(map(str, value))
     if isinstance(value, list | tuple):
-        text = ", ".join(f"{factor * each:.4g}" for each in value) or "none"
+        value_text = ", ".join(f"{unit_factor * number:.4g}" for number in value) or "none"
     elif isinstance(value, float):
-        text = f"{factor * value:.4g}" if isfinite(value) else "none"
+        value_text = f"{unit_factor * value:.4g}" if isfinite(value) else "none"
     elif isinstance(value, int) and not isinstance(value, bool) and unit:
-        text = f"{factor * value:.4g}"
+        value_text = f"{unit_factor * value:.4g}"
     else:
         return str(value)
-    return f"{text} {unit}".rstrip()
+    return f"{value_text} {unit}".rstrip()
 
 
 def _unit_suffix(key: str) -> str:
-    """Return the unit suffix of a key, or an empty string."""
+    """Return the suffix of a key that names its unit, or "" if there is none."""
     # A number of counts has no unit: the name of the key says what is counted.
     return "" if key.endswith("_counts") else suffix_of(key)
 
 
-def _is_number(value: object) -> bool:
+def _is_number(document_value: object) -> bool:
     """Return whether a value is an integer or a float, but not a boolean."""
-    return isinstance(value, int | float) and not isinstance(value, bool)
+    return isinstance(document_value, int | float) and not isinstance(document_value, bool)
 
 
 # Rows

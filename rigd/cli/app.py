@@ -35,7 +35,7 @@ def before_a_command(
         ),
     ] = False,
 ) -> None:
-    """Accept the options before a command; their callbacks have already run."""
+    """Accept the options of ``rigd`` itself; their callbacks have already run."""
 
 
 _SECTIONS: Final = {
@@ -56,15 +56,26 @@ class RigdGroup(TyperGroup):
     # Typer's click is its own in some versions and the package of that name in others.
     def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
         """Write the list of commands of the help text, in sections."""
-        listed = {name for names in _SECTIONS.values() for name in names}
-        others = tuple(name for name in self.list_commands(ctx) if name not in listed)
-        for title, names in {**_SECTIONS, _OTHERS: others}.items():
-            known = [name for name in names if name in self.commands]
+        listed_names = {
+            command_name for command_names in _SECTIONS.values() for command_name in command_names
+        }
+        other_names = tuple(
+            command_name
+            for command_name in self.list_commands(ctx)
+            if command_name not in listed_names
+        )
+        for section_title, command_names in {**_SECTIONS, _OTHERS: other_names}.items():
+            known = [
+                command_name for command_name in command_names if command_name in self.commands
+            ]
             if known:
-                width = formatter.width - 6 - max(map(len, known))
-                rows = [(name, self.commands[name].get_short_help_str(width)) for name in known]
-                with formatter.section(title):
-                    formatter.write_dl(rows)
+                name_width = formatter.width - 6 - max(map(len, known))
+                help_rows = [
+                    (command_name, self.commands[command_name].get_short_help_str(name_width))
+                    for command_name in known
+                ]
+                with formatter.section(section_title):
+                    formatter.write_dl(help_rows)
 
     def make_context(self, *args: Any, **extra: Any) -> Any:  # noqa: ANN401
         """Parse the options before the command, with readable error messages."""

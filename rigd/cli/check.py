@@ -66,26 +66,28 @@ def _eds_file_rows(eds: Path, profile: str | None) -> "list[CheckRow]":
     return list(eds_rows(eds, rig_profile.rig))
 
 
-def _print_result(rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
+def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, on_paper: bool) -> None:
     """Print the rows of a check as a table or JSON, and end with exit code 1 if it failed.
 
     `on_paper` states that the rows are those of an EDS file only.
     """
     from rigd.checks.rows import overall
 
-    verdict = overall(rows)
+    verdict = overall(check_rows)
     if as_json:
-        document = {"verdict": verdict, "rows": [row.as_dict() for row in rows]}
-        typer.echo(json.dumps(document, ensure_ascii=False))
+        json_document = {"verdict": verdict, "rows": [row.as_dict() for row in check_rows]}
+        typer.echo(json.dumps(json_document, ensure_ascii=False))
     else:
         from rigd.checks import ACCEPTABLE
         from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, CheckResult, print_table
 
-        print_table(rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
-        failed = {row.name for row in rows if row.verdict is CheckResult.FAIL}
-        if failed and failed.issubset(ACCEPTABLE) and not on_paper:
-            accepted = " ".join(f"--accept {name}" for name in ACCEPTABLE if name in failed)
-            typer.echo(f"To accept that for one session: rigd run … {accepted}")
+        print_table(check_rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
+        has_failed = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}
+        if has_failed and has_failed.issubset(ACCEPTABLE) and not on_paper:
+            accepted_rows = " ".join(
+                f"--accept {row_name}" for row_name in ACCEPTABLE if row_name in has_failed
+            )
+            typer.echo(f"To accept that for one session: rigd run … {accepted_rows}")
     if verdict == "failed":
         raise typer.Exit(EXIT_FAILED)
 
@@ -126,7 +128,7 @@ def _openable_profile(name: str) -> "Profile":
 
 
 def _interrupt_on_end_signals() -> None:
-    """Make SIGTERM and SIGHUP act as Ctrl-C, so that the devices are closed."""
+    """Make SIGTERM and SIGHUP raise KeyboardInterrupt, so that the devices are closed."""
     raise_on_signals(signal.SIGTERM, signal.SIGHUP)
 
 
@@ -177,16 +179,18 @@ def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: f
     from rigd.devices import ActuationTarget, actuation_target
     from rigd.runtime import RigLock
 
-    hardware = actuation_target(profile.rig) is ActuationTarget.HARDWARE
+    moves_hardware = actuation_target(profile.rig) is ActuationTarget.HARDWARE
     console = Console(stderr=True)
     # A simultaneous session of this rig would make both loops late.
     with (
-        RigLock(profile.name, "rigd bench", hardware=hardware),
+        RigLock(profile.name, "rigd bench", hardware=moves_hardware),
         Status("preparing", console=console) as status,
     ):
 
-        def on_progress(name: str, remaining_s: float) -> None:
-            status.update(f"{name}; {remaining_s // 60:.0f}:{remaining_s % 60:02.0f} left")
+        def on_progress(measurement_name: str, remaining_s: float) -> None:
+            status.update(
+                f"{measurement_name}; {remaining_s // 60:.0f}:{remaining_s % 60:02.0f} left"
+            )
 
         bench = Bench(
             profile, rate_hz=rate_hz, seconds=seconds, spin_us=spin_us, on_progress=on_progress

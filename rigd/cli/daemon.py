@@ -72,7 +72,7 @@ def serve(
 
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
-    number = run_daemon(
+    exit_code = run_daemon(
         rig_profile,
         output.absolute(),
         group=group,
@@ -82,7 +82,7 @@ def serve(
         page_port=web_port,
         quick_looks=not no_quick_look,
     )
-    if number is not signal.SIGTERM:
+    if exit_code is not signal.SIGTERM:
         raise typer.Exit(EXIT_INTERRUPTED)
 
 
@@ -94,7 +94,7 @@ DaemonOf = Annotated[
 
 @contextmanager
 def daemon_of(profile: str | None) -> "Iterator[Client]":
-    """Connect to the daemon of a profile, or to the only running daemon; yield the client."""
+    """Connect to the daemon of a profile, or the only running one; yield the connected client."""
     from rigd.daemon.client import Client
 
     with Client(_socket_path(profile)) as client:
@@ -115,7 +115,7 @@ def rig_name(profile: str | None) -> str | None:
     from rigd.daemon.address import running, socket_path
 
     # Reading a profile is slow, and unnecessary if a daemon of that name is running.
-    if any(path.name == socket_path(profile).name for path in running()):
+    if any(profile_path.name == socket_path(profile).name for profile_path in running()):
         return profile
     from rigd.cli.options import profile_named
 
@@ -145,14 +145,14 @@ def status(
         _watch_status(profile)
         return
     with daemon_of(profile) as client:
-        reply = client.ask("status")
+        daemon_reply = client.ask("status")
     if as_json:
-        del reply["reply"], reply["ok"]
-        typer.echo(json.dumps(reply))
+        del daemon_reply["reply"], daemon_reply["ok"]
+        typer.echo(json.dumps(daemon_reply))
         return
     from rigd.cli.status_view import print_status
 
-    print_status(reply)
+    print_status(daemon_reply)
 
 
 def stop(
@@ -184,14 +184,17 @@ def tare(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd tare
     """
     with daemon_of(profile) as client:
-        reply = client.ask("tare")
+        daemon_reply = client.ask("tare")
     if as_json:
-        typer.echo(json.dumps(_measured_values(reply)))
+        typer.echo(json.dumps(_measured_values(daemon_reply)))
         return
-    for axis, mean in reply["mean"].items():
-        name, unit = axis.removesuffix(suffix_of(axis)), unit_of(axis)
-        typer.echo(f"{name}: mean {mean:.3f} {unit}, s.d. {reply['std'][axis]:.3f} {unit}")
-    typer.echo(f"coupling torque: s.d. {reply['torque_std_nm']:.3f} N·m")
+    for axis, axis_mean in daemon_reply["mean"].items():
+        value_name, unit_text = axis.removesuffix(suffix_of(axis)), unit_of(axis)
+        typer.echo(
+            f"{value_name}: mean {axis_mean:.3f} {unit_text}, s.d. {daemon_reply['std'][axis]:.3f} "
+            f"{unit_text}"
+        )
+    typer.echo(f"coupling torque: s.d. {daemon_reply['torque_std_nm']:.3f} N·m")
 
 
 def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
@@ -202,36 +205,42 @@ def zero(profile: DaemonOf = None, as_json: AsJson = False) -> None:
     Example: rigd zero
     """
     with daemon_of(profile) as client:
-        reply = client.ask("zero")
+        daemon_reply = client.ask("zero")
     if as_json:
-        typer.echo(json.dumps(_measured_values(reply)))
+        typer.echo(json.dumps(_measured_values(daemon_reply)))
     else:
-        typer.echo(f"Zero set (shift {reply['moved_rad']:.5f} rad).")
+        typer.echo(f"Zero set (shift {daemon_reply['moved_rad']:.5f} rad).")
 
 
 def reset_by_daemon(profile: str | None) -> bool:
-    """Reset a fault through a profile's daemon, or the only daemon; return whether one runs."""
+    """Reset the rig's fault by its daemon, or the only daemon; return False if none runs."""
     from rigd.daemon.address import running, socket_path
 
-    sockets = running()
+    socket_paths = running()
     if profile is None:
-        if not sockets:
+        if not socket_paths:
             return False
     else:
-        name = rig_name(profile)
-        if name is None or socket_path(name).name not in {path.name for path in sockets}:
+        wanted_rig = rig_name(profile)
+        if wanted_rig is None or socket_path(wanted_rig).name not in {
+            path.name for path in socket_paths
+        }:
             return False
     with daemon_of(profile) as client:
-        reply = client.ask("reset")
+        daemon_reply = client.ask("reset")
     typer.echo("The fault is reset; the devices are connected and the torque is off.")
-    if reply["zero_lost"]:
+    if daemon_reply["zero_lost"]:
         typer.echo("The zero of the angle was lost: move the motor to mid-travel; run rigd zero.")
     return True
 
 
-def _measured_values(reply: dict[str, Any]) -> dict[str, Any]:
+def _measured_values(daemon_reply: dict[str, Any]) -> dict[str, Any]:
     """Return the measured values in a daemon's reply, without the reply's name and result."""
-    return {name: value for name, value in reply.items() if name not in ("reply", "ok")}
+    return {
+        value_name: measured_value
+        for value_name, measured_value in daemon_reply.items()
+        if value_name not in ("reply", "ok")
+    }
 
 
 def _watch_status(profile: str | None) -> None:
@@ -243,18 +252,18 @@ def _watch_status(profile: str | None) -> None:
     from rigd.daemon.address import find
     from rigd.daemon.client import Client
 
-    name = rig_name(profile)
-    with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live:
+    wanted_rig = rig_name(profile)
+    with daemon_of(profile) as client, Live(console=Console(), auto_refresh=False) as live_display:
         connected_client: Client | None = client
         while True:
             try:
-                connected_client = connected_client or Client(find(name))
-                reply = connected_client.ask("status")
-                name = name or reply["daemon"]["profile"]
-                live.update(status_table(reply), refresh=True)
+                connected_client = connected_client or Client(find(wanted_rig))
+                daemon_reply = connected_client.ask("status")
+                wanted_rig = wanted_rig or daemon_reply["daemon"]["profile"]
+                live_display.update(status_table(daemon_reply), refresh=True)
             except RigdError as error:
                 if connected_client is not None:
                     connected_client.close()
                     connected_client = None
-                live.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
+                live_display.update(f"{error} Waiting for it; Ctrl-C quits.", refresh=True)
             time.sleep(_UPDATE_PERIOD_S)

@@ -109,8 +109,8 @@ def motor(
         )
     _, proposal = _estimate_motor(files, profile)
     if as_json:
-        document = {"files": [str(path) for path in files], **proposal.as_dict()}
-        typer.echo(json.dumps(document))
+        json_document = {"files": [str(file_path) for file_path in files], **proposal.as_dict()}
+        typer.echo(json.dumps(json_document))
         return
     typer.echo("\n".join(["", *proposal.table(), ""]))
     for note in proposal.notes:
@@ -130,29 +130,34 @@ def _run_sessions(
     hardware: bool,
     quiet_stdout: bool,
 ) -> list[Path]:
-    """Run the trial and the two sessions for the estimate, and return the files of these two.
+    """Run a trial session and the two sessions of the estimate; return the files of these two.
 
     An incomplete session ends the command. The file of the trial is not returned, because its
     controller is too slow for the estimate.
     """
-    stop, group = start_processes(live=False)
+    stop_request, process_group = start_processes(live=False)
     from rigd.identification import with_cautious_controller, with_tuned_controller
     from rigd.identification.experiments import multisine_session, speeds_session, trial_session
     from rigd.runner import ProcessGroup, run_in_foreground
     from rigd.runtime import ignore
 
-    def run(session: "Session", prepare: "Prepare", number: int, group: ProcessGroup) -> Path:
+    def run(
+        session_builder: "Session",
+        prepare: "Prepare",
+        session_number: int,
+        process_group: ProcessGroup,
+    ) -> Path:
         def build(profile: "Profile") -> "Excitation":
-            return session(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
+            return session_builder(profile, torque_percent=torque_percent, stroke_rad=stroke_rad)
 
-        results = run_in_foreground(
+        session_results = run_in_foreground(
             build,
-            group,
-            stop,
+            process_group,
+            stop_request,
             profile_name=profile_name,
             folder=folder,
             repeat=1,
-            seed=None if seed is None else seed + number,
+            seed=None if seed is None else seed + session_number,
             notes=notes,
             fast=fast,
             live=False,
@@ -162,23 +167,27 @@ def _run_sessions(
             prepare=prepare,
             identifies_motor=True,
         )
-        if stop.requested and not any(result.fault for result in results):
+        if stop_request.requested and not any(
+            session_result.fault for session_result in session_results
+        ):
             raise typer.Exit(EXIT_INTERRUPTED)
-        path = results[0].path if results else None
-        if path is None or not results[0].went_well:
+        file_path = session_results[0].path if session_results else None
+        if file_path is None or not session_results[0].went_well:
             raise typer.Exit(EXIT_FAILED)
-        return path
+        return file_path
 
     try:
-        trial = run(trial_session, with_cautious_controller, 0, group)
-        estimate = _estimate_motor([trial], profile_name)[0]
+        trial_path = run(trial_session, with_cautious_controller, 0, process_group)
+        motor_estimate = _estimate_motor([trial_path], profile_name)[0]
 
         def tune(profile: "Profile") -> "Profile":
-            return with_tuned_controller(profile, estimate)
+            return with_tuned_controller(profile, motor_estimate)
 
         return [
-            run(session, tune, number, ProcessGroup(live=False))
-            for number, session in enumerate((multisine_session, speeds_session), start=1)
+            run(session_builder, tune, session_number, ProcessGroup(live=False))
+            for session_number, session_builder in enumerate(
+                (multisine_session, speeds_session), start=1
+            )
         ]
     finally:
         ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
@@ -191,9 +200,9 @@ def _estimate_motor(files: list[Path], profile_name: str) -> "tuple[MotorEstimat
 
     profile = profile_named(profile_name)
     recording = read_recording(files, profile.rig.actuation.delay_s)
-    estimate = estimate_motor(
+    motor_estimate = estimate_motor(
         recording.windows,
         recording.timing,
         tool_inertia_kg_m2=recording.tool_inertia_kg_m2,
     )
-    return estimate, propose(estimate, profile, unusable=recording.unusable)
+    return motor_estimate, propose(motor_estimate, profile, unusable_count=recording.unusable)

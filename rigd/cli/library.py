@@ -88,10 +88,10 @@ def list_sessions(
     if trend:
         trends = mode_trends(_sessions_of_one_specimen(rows))
     if as_json:
-        document: dict[str, Any] = {"sessions": [row.as_dict() for row in rows]}
+        json_document: dict[str, Any] = {"sessions": [row.as_dict() for row in rows]}
         if trend:
-            document["trends"] = [each.as_dict() for each in trends]
-        typer.echo(json.dumps(document))
+            json_document["trends"] = [mode_trend.as_dict() for mode_trend in trends]
+        typer.echo(json.dumps(json_document))
     elif trend:
         typer.echo("\n".join(_trend_lines(trends)))
     else:
@@ -110,27 +110,30 @@ def specimens() -> None:
     """
     from rigd.profile import ProfileError, load_specimen, specimen_files
 
-    for name, path in specimen_files().items():
+    for specimen_name, specimen_path in specimen_files().items():
         try:
-            loaded = load_specimen(path)
+            described = load_specimen(specimen_path)
         except ProfileError as error:
-            text = f"cannot be used: {str(error).splitlines()[0]}"
+            beam_text = f"cannot be used: {str(error).splitlines()[0]}"
         else:
-            beam = loaded.beam
-            text = (
+            beam = described.beam
+            beam_text = (
                 f"{beam.length_m:g} m, {beam.density_kg_per_m:g} kg/m, "
-                f"{beam.bending_stiffness_n_m2:g} N·m²{loaded.note and f', {loaded.note}'} ({path})"
+                f"{beam.bending_stiffness_n_m2:g} N·m²{described.note and f', {described.note}'} "
+                f"({specimen_path})"
             )
-        typer.echo(readable_message(f"{name}: {text}"))
+        typer.echo(readable_message(f"{specimen_name}: {beam_text}"))
 
 
-def _sessions_of_one_specimen(rows: "list[SessionRow]") -> "list[SessionRow]":
-    """Return the sessions whose modes are known; several specimens end the command."""
-    with_modes = [row for row in rows if row.modes]
-    specimens = sorted({row.specimen for row in with_modes})
-    if len(specimens) > 1:
-        names = ", ".join(repr(name) if name else "none" for name in specimens)
-        fail(f"--trend: the sessions are of several specimens ({names}); name one by --specimen.",
+def _sessions_of_one_specimen(session_rows: "list[SessionRow]") -> "list[SessionRow]":
+    """Return the sessions whose modes are known; end the command if they have several specimens."""
+    with_modes = [row for row in session_rows if row.modes]
+    specimen_names = sorted({row.specimen for row in with_modes})
+    if len(specimen_names) > 1:
+        named = ", ".join(
+            repr(specimen_name) if specimen_name else "none" for specimen_name in specimen_names
+        )
+        fail(f"--trend: the sessions are of several specimens ({named}); name one by --specimen.",
              EXIT_WRONG_USE)  # fmt: skip
     return with_modes
 
@@ -145,55 +148,64 @@ def _local_start(row: "SessionRow") -> str:
         return ""
 
 
-def _table_lines(titles: Sequence[str], rows: Sequence[Sequence[str]]) -> Iterator[str]:
+def _table_lines(titles: Sequence[str], table_rows: Sequence[Sequence[str]]) -> Iterator[str]:
     """Yield the lines of a table, without columns whose cells are all empty."""
-    filled_columns = [column for column in range(len(titles)) if any(row[column] for row in rows)]
-    widths = {column: max(len(row[column]) for row in (titles, *rows)) for column in filled_columns}
-    for row in (titles, *rows):
-        yield "  ".join(f"{row[column]:{widths[column]}}" for column in filled_columns).rstrip()
+    filled_columns = [
+        column_index
+        for column_index in range(len(titles))
+        if any(row[column_index] for row in table_rows)
+    ]
+    column_widths = {
+        column_index: max(len(row[column_index]) for row in (titles, *table_rows))
+        for column_index in filled_columns
+    }
+    for row in (titles, *table_rows):
+        yield "  ".join(
+            f"{row[column_index]:{column_widths[column_index]}}" for column_index in filled_columns
+        ).rstrip()
 
 
-def _session_lines(rows: "list[SessionRow]") -> Iterator[str]:
+def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
     """Yield the lines of the list of sessions."""
-    if not rows:
+    if not session_rows:
         yield "No sessions."
         return
-    titles = (
+    column_titles = (
         *("date", "file", "specimen", "operator", "excitation", "outcome", "modes"),
         *("tip slope", "uniform beam", "report"),
     )
     yield from _table_lines(
-        titles,
+        column_titles,
         [
             (
                 _local_start(row),
                 printable(row.path.name),
                 *(
-                    printable(text, _MAX_TEXT_WIDTH)
-                    for text in (row.specimen, row.operator, row.excitation, row.outcome)
+                    printable(cell_text, _MAX_TEXT_WIDTH)
+                    for cell_text in (row.specimen, row.operator, row.excitation, row.outcome)
                 ),
                 ", ".join(map(_mode_text, row.modes)),
                 _validity_text(row),
                 _uniform_beam_text(row),
                 "" if row.report is None else printable(row.report.parent.suffix[1:]),
             )
-            for row in rows
+            for row in session_rows
         ],
     )
-    for row in rows:
+    for row in session_rows:
         if row.problem:
             yield f"{printable(row.path.name)}: {row.problem}"
 
 
 def _mode_text(mode: dict[str, Any]) -> str:
-    """Format a mode's frequency and damping ratio; "?" marks flagged values."""
+    """Format a mode's frequency and damping ratio; a "?" marks values that an analysis doubts."""
     flag_mark = "?" if mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"] else ""
     frequency_hz, damping = mode["frequency_hz"]["value"], mode["damping_ratio"]["value"]
     return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flag_mark}"
 
 
 def _validity_text(row: "SessionRow") -> str:
-    """Return the validity of a session's linear model in short; "" without modes."""
+    """Return in short whether a session's linear model is valid; "" if it has no modes."""
     from rigd.session import Validity
 
     return Validity.of_document(row.validity).short if row.modes else ""
@@ -215,27 +227,31 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
     if not trends:
         yield "No modes are known of these sessions: analyze them first."
         return
-    for number, trend in enumerate(trends, start=1):
-        if number > 1:
+    for mode_number, mode_trend in enumerate(trends, start=1):
+        if mode_number > 1:
             yield ""
-        lowest_hz, highest_hz = _frequency_limits(trend)
+        lowest_hz, highest_hz = _frequency_limits(mode_trend)
         yield from _table_lines(
             (
-                *(f"mode {number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
+                *(f"mode {mode_number}", "frequency (Hz)", "change", "damping (%)", "change", ""),
                 *("tip slope", "file"),
             ),
             [
                 (
-                    _local_start(point.row),
-                    _quantity_text(point.frequency_hz),
-                    _change_text(point.frequency_change, trend.points[0].frequency_hz["value"]),
-                    _quantity_text(point.damping_ratio, 100),
-                    _change_text(point.damping_change, trend.points[0].damping_ratio["value"]),
-                    _interval_plot(point, lowest_hz, highest_hz),
-                    _validity_text(point.row),
-                    printable(point.row.path.name),
+                    _local_start(trend_point.row),
+                    _quantity_text(trend_point.frequency_hz),
+                    _change_text(
+                        trend_point.frequency_change, mode_trend.points[0].frequency_hz["value"]
+                    ),
+                    _quantity_text(trend_point.damping_ratio, 100),
+                    _change_text(
+                        trend_point.damping_change, mode_trend.points[0].damping_ratio["value"]
+                    ),
+                    _interval_plot(trend_point, lowest_hz, highest_hz),
+                    _validity_text(trend_point.row),
+                    printable(trend_point.row.path.name),
                 )
-                for point in trend.points
+                for trend_point in mode_trend.points
             ],
         )
     yield ""
@@ -248,12 +264,12 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
 
 def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
     """Return the lowest and the highest limit of a mode's frequency intervals in Hz."""
-    ends = [
+    interval_ends_hz = [
         end
-        for point in trend.points
-        for end in point.frequency_hz["interval_95"] or [point.frequency_hz["value"]]
+        for trend_point in trend.points
+        for end in trend_point.frequency_hz["interval_95"] or [trend_point.frequency_hz["value"]]
     ]
-    return min(ends), max(ends)
+    return min(interval_ends_hz), max(interval_ends_hz)
 
 
 def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> str:
@@ -269,25 +285,30 @@ def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> 
             _PLOT_WIDTH - 1,
         )
 
-    value = point.frequency_hz["value"]
-    first, last = map(column_of, point.frequency_hz["interval_95"] or (value, value))
-    characters = ["─" if first <= column <= last else " " for column in range(_PLOT_WIDTH)]
-    characters[column_of(value)] = "●"
-    return "".join(characters)
+    frequency_value_hz = point.frequency_hz["value"]
+    first_column, last_column = map(
+        column_of, point.frequency_hz["interval_95"] or (frequency_value_hz, frequency_value_hz)
+    )
+    plot_characters = [
+        "─" if first_column <= column_index <= last_column else " "
+        for column_index in range(_PLOT_WIDTH)
+    ]
+    plot_characters[column_of(frequency_value_hz)] = "●"
+    return "".join(plot_characters)
 
 
 def _quantity_text(quantity: "Quantity", scale: float = 1.0) -> str:
-    """Format a quantity with its 95 % interval; "?" marks a flagged one."""
-    text = with_half_width(quantity["value"], quantity["interval_95"], scale)
-    return f"{text} ?" if quantity["flag"] else text
+    """Format a value with the half-width of its 95 % interval; "?" marks a doubtful one."""
+    value_text = with_half_width(quantity["value"], quantity["interval_95"], scale)
+    return f"{value_text} ?" if quantity["flag"] else value_text
 
 
-def _change_text(change: "ModeChange | None", first: float) -> str:
-    """Format a change in per cent of the first value; "*" marks a significant one."""
-    if change is None or first == 0:
+def _change_text(change: "ModeChange | None", first_value: float) -> str:
+    """Format a mode's change in per cent of its first value; "*" marks a significant change."""
+    if change is None or first_value == 0:
         return ""
-    percent = 100 * change.difference / first
-    return f"{percent:+.2g} %{' *' if change.significant else ''}"
+    change_percent = 100 * change.difference / first_value
+    return f"{change_percent:+.2g} %{' *' if change.significant else ''}"
 
 
 # Single files
@@ -305,22 +326,22 @@ def info(
     """
     from rigd.session import SessionError, describe
 
-    documents: list[dict[str, Any]] = []
-    failed = False
-    for number, path in enumerate(paths):
+    json_documents: list[dict[str, Any]] = []
+    has_failed = False
+    for file_number, file_path in enumerate(paths):
         try:
-            description = describe(path)
+            description = describe(file_path)
         except SessionError as error:
-            failed = True
+            has_failed = True
             complain(str(error))
-            documents.append({"path": str(path), "error": str(error)})
+            json_documents.append({"path": str(file_path), "error": str(error)})
         else:
-            documents.append(description.as_dict())
+            json_documents.append(description.as_dict())
             if not as_json:
-                typer.echo(("\n" if number else "") + "\n".join(description.lines()))
-    if as_json and not (failed and len(paths) == 1):
-        typer.echo(json.dumps(documents[0] if len(paths) == 1 else {"files": documents}))
-    if failed:
+                typer.echo(("\n" if file_number else "") + "\n".join(description.lines()))
+    if as_json and not (has_failed and len(paths) == 1):
+        typer.echo(json.dumps(json_documents[0] if len(paths) == 1 else {"files": json_documents}))
+    if has_failed:
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -343,21 +364,21 @@ def recover(
     from rigd.session import SessionError
     from rigd.session import recover as recover_file
 
-    documents: list[dict[str, Any]] = []
-    failed = False
-    for path in paths:
+    json_documents: list[dict[str, Any]] = []
+    has_failed = False
+    for file_path in paths:
         try:
-            with progress(path.name) as on_progress:
-                recovery = recover_file(path, on_progress)
+            with progress(file_path.name) as on_progress:
+                recovery = recover_file(file_path, on_progress)
         except SessionError as error:
-            failed = True
+            has_failed = True
             complain(str(error))
-            documents.append({"source": str(path), "path": None, "error": str(error)})
+            json_documents.append({"source": str(file_path), "path": None, "error": str(error)})
         else:
-            documents.append(recovery.as_dict())
+            json_documents.append(recovery.as_dict())
             if not as_json:
                 typer.echo("\n".join(recovery.lines()))
     if as_json:
-        typer.echo(json.dumps({"files": documents}))
-    if failed:
+        typer.echo(json.dumps({"files": json_documents}))
+    if has_failed:
         raise typer.Exit(EXIT_FAILED)

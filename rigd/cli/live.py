@@ -30,12 +30,13 @@ def has_screen() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
-def tunnel_advice(view: "LiveAddress") -> str:
+def tunnel_advice(live_view: "LiveAddress") -> str:
     """Return a sentence with the command that opens a live view from another computer."""
-    page, grpc = view.page_port, view.grpc_port
+    page_port, grpc_port = live_view.page_port, live_view.grpc_port
     return (
-        f"From another computer: ssh -L {page}:127.0.0.1:{page} -L {grpc}:127.0.0.1:{grpc} "
-        f"{platform.node()}, and open http://127.0.0.1:{page} there."
+        f"From another computer: ssh -L {page_port}:127.0.0.1:{page_port} -L "
+        f"{grpc_port}:127.0.0.1:{grpc_port} "
+        f"{platform.node()}, and open http://127.0.0.1:{page_port} there."
     )
 
 
@@ -49,21 +50,21 @@ def scratch_folder() -> Iterator[Path]:
             f"No temporary folder can be made ({error.strerror}); set TMPDIR to one with room.",
             EXIT_FAILED,
         )
-    with folder as name:
-        yield Path(name)
+    with folder as folder_name:
+        yield Path(folder_name)
 
 
 @contextlib.contextmanager
 def interrupted_by_end_signals() -> Iterator[None]:
-    """Make SIGTERM and SIGHUP act as Ctrl-C in this context, to remove temporary files."""
-    numbers = (signal.SIGTERM, signal.SIGHUP)
-    previous_handlers = [signal.getsignal(number) for number in numbers]
-    raise_on_signals(*numbers)
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt here, so that temporary files are removed."""
+    signal_numbers = (signal.SIGTERM, signal.SIGHUP)
+    previous_handlers = [signal.getsignal(signal_number) for signal_number in signal_numbers]
+    raise_on_signals(*signal_numbers)
     try:
         yield
     finally:
-        for number, handler in zip(numbers, previous_handlers, strict=True):
-            signal.signal(number, handler)
+        for signal_number, previous_handler in zip(signal_numbers, previous_handlers, strict=True):
+            signal.signal(signal_number, previous_handler)
 
 
 def live(
@@ -130,7 +131,7 @@ def _only_running_view(rig: str | None) -> "LiveAddress | None":
 
     views = find_views(rig)
     if len(views) > 1:
-        rigs = ", ".join(view.rig for view in views)
+        rigs = ", ".join(live_view.rig for live_view in views)
         fail(f"Several live views are running ({rigs}); name one with --profile.", EXIT_FAILED)
     return views[0] if views else None
 
@@ -138,9 +139,9 @@ def _only_running_view(rig: str | None) -> "LiveAddress | None":
 def _wait_for_view(rig: str | None) -> "LiveAddress":
     """Wait until a live view runs, and return its address."""
     typer.echo("Waiting for a live view to start; Ctrl-C quits.", err=True)
-    while (view := _only_running_view(rig)) is None:
+    while (live_view := _only_running_view(rig)) is None:
         time.sleep(_POLL_PERIOD_S)
-    return view
+    return live_view
 
 
 def _start_advice(profile: str | None) -> str:
@@ -148,7 +149,7 @@ def _start_advice(profile: str | None) -> str:
     from rigd.daemon.client import daemons
 
     rig_text = "" if profile is None else f" of the rig {profile}"
-    name = profile or "NAME"
+    profile_name = profile or "NAME"
     for rig, has_view in daemons().items():
         if profile not in (None, rig):
             continue
@@ -162,53 +163,56 @@ def _start_advice(profile: str | None) -> str:
             f"with rigd serve --profile {rig} --live."
         )
     return (
-        f"No live view{rig_text} is running. Start one with rigd run chirp --profile {name} "
-        f"--live, or with rigd serve --profile {name} --live; rigd live --wait waits for it."
+        f"No live view{rig_text} is running. Start one with rigd run chirp --profile "
+        f"{profile_name} "
+        f"--live, or with rigd serve --profile {profile_name} --live; rigd live --wait waits "
+        "for it."
     )
 
 
-def _show_view(view: "LiveAddress") -> None:
+def _show_view(live_view: "LiveAddress") -> None:
     """Show a live view in a window until the window is closed."""
     from rigd.live import Viewer
 
-    with interrupted_by_end_signals(), scratch_folder() as scratch:
-        viewer = Viewer(view, scratch)
+    with interrupted_by_end_signals(), scratch_folder() as scratch_path:
+        viewer = Viewer(live_view, scratch_path)
         typer.echo(
-            f"The live view of {view.rig} is shown; close the window, or press Ctrl-C, to end.",
+            f"The live view of {live_view.rig} is shown; close the window, or press Ctrl-C, "
+            "to end.",
             err=True,
         )
         try:
-            code = _follow_servers(viewer, view)
+            exit_code = _follow_servers(viewer, live_view)
         finally:
             viewer.close()
-    if code:
+    if exit_code:
         fail(f"{viewer.fault} rigd live --web shows the same in a browser.", EXIT_FAILED)
 
 
 def _follow_servers(viewer: "Viewer", shown: "LiveAddress") -> int:
-    """Connect a window to each new server of a live view until the window is closed.
+    """Connect a viewer's window to each new server of a live view until the window is closed.
 
     Returns the exit code of the viewer.
     """
     from rigd.daemon.client import find_views
 
     view_is_running = True
-    while (code := viewer.exit_code) is None:
+    while (exit_code := viewer.exit_code) is None:
         time.sleep(_POLL_PERIOD_S)
-        view = next(iter(find_views(shown.rig)), None)
-        if view is not None and view.server != shown.server:
-            if not viewer.connect(view):
+        live_view = next(iter(find_views(shown.rig)), None)
+        if live_view is not None and live_view.server != shown.server:
+            if not viewer.connect(live_view):
                 continue  # tried again in the next round
-            typer.echo(f"The live view of {view.rig} has restarted.", err=True)
-            shown = view
-        elif view is None and view_is_running:
+            typer.echo(f"The live view of {live_view.rig} has restarted.", err=True)
+            shown = live_view
+        elif live_view is None and view_is_running:
             typer.echo(
                 f"The live view of {shown.rig} has ended; the window stays open and shows the next "
                 "one.",
                 err=True,
             )
-        view_is_running = view is not None
-    return code
+        view_is_running = live_view is not None
+    return exit_code
 
 
 def replay(
@@ -253,12 +257,12 @@ def replay(
             f"rigd replay {path} --web prints an address for a browser; {file_advice}.",
             EXIT_FAILED,
         )
-    with interrupted_by_end_signals(), scratch_folder() as scratch:
-        recording = _as_recording(path, scratch)
+    with interrupted_by_end_signals(), scratch_folder() as scratch_path:
+        recording = _as_recording(path, scratch_path)
         if web:
-            _serve_recording(recording, scratch, path)
+            _serve_recording(recording, scratch_path, path)
         else:
-            _open_window(recording, scratch, path)
+            _open_window(recording, scratch_path, path)
 
 
 def _save_recording(path: Path, out: Path, *, web: bool) -> None:
@@ -293,9 +297,9 @@ def _convert(path: Path, out: Path) -> None:
     from rigd.session import read_session, read_timings
     from rigd.view import draw_session
 
-    session, timings = read_session(path), read_timings(path)
-    with progress(path.name) as on_progress, new_rrd_file(out) as stream:
-        draw_session(stream, session, timings, on_progress=on_progress)
+    session, tick_timings = read_session(path), read_timings(path)
+    with progress(path.name) as on_progress, new_rrd_file(out) as recording_stream:
+        draw_session(recording_stream, session, tick_timings, on_progress=on_progress)
 
 
 def _as_recording(path: Path, scratch: Path) -> Path:
@@ -312,11 +316,11 @@ def _open_window(recording: Path, scratch: Path, path: Path) -> None:
     """Show a recording in a window until the window is closed."""
     from rigd.live import FileWindow
 
-    with FileWindow(recording, scratch) as window:
+    with FileWindow(recording, scratch) as file_window:
         typer.echo(f"{path.name} is shown; close the window, or press Ctrl-C, to end.", err=True)
-        if window.wait():
+        if file_window.wait():
             fail(
-                f"{window.fault} rigd replay {path} --web shows the same in a browser.",
+                f"{file_window.fault} rigd replay {path} --web shows the same in a browser.",
                 EXIT_FAILED,
             )
 

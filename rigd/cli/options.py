@@ -47,31 +47,31 @@ _PROGRESS_DELAY_S = 2.0
 
 
 @contextlib.contextmanager
-def progress(name: str) -> Iterator[Callable[[float], None]]:
+def progress(task_name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress line; yield a function that must be called with the completed fraction.
 
     The line appears after `_PROGRESS_DELAY_S`, on a terminal only.
     """
-    started = time.monotonic()
-    with contextlib.ExitStack() as stack:
-        show: Callable[[float], None] | None = None
+    start_s = time.monotonic()
+    with contextlib.ExitStack() as exit_stack:
+        show_fraction: Callable[[float], None] | None = None
 
         def on_progress(fraction: float) -> None:
-            nonlocal show
-            if show is None and time.monotonic() - started > _PROGRESS_DELAY_S:
-                show = stack.enter_context(_progress_line(name))
-            if show is not None:
-                show(fraction)
+            nonlocal show_fraction
+            if show_fraction is None and time.monotonic() - start_s > _PROGRESS_DELAY_S:
+                show_fraction = exit_stack.enter_context(_progress_line(task_name))
+            if show_fraction is not None:
+                show_fraction(fraction)
 
         yield on_progress
 
 
 @contextlib.contextmanager
-def _progress_line(name: str) -> Iterator[Callable[[float], None]]:
+def _progress_line(task_name: str) -> Iterator[Callable[[float], None]]:
     """Show a progress line at once; yield a function that receives the completed fraction."""
     with progress_bar() as bar:
-        task = bar.add_task(name, total=1.0)
-        yield lambda fraction: bar.update(task, completed=fraction)
+        task_id = bar.add_task(task_name, total=1.0)
+        yield lambda fraction: bar.update(task_id, completed=fraction)
 
 
 # Options
@@ -171,24 +171,31 @@ def session_notes(
     from rigd.session.user_metadata import metadata_keys
 
     notes = {"operator": operator, "specimen": specimen, "note": note}
-    for option, text in notes.items():
-        if not text.isprintable():
-            fail(f"--{option} {text!r}: must be a single line of plain text.", EXIT_WRONG_USE)
+    for option_name, meta_text in notes.items():
+        if not meta_text.isprintable():
+            fail(
+                f"--{option_name} {meta_text!r}: must be a single line of plain text.",
+                EXIT_WRONG_USE,
+            )
     metadata: dict[str, str] = {}
     for option_value in meta or []:
-        name, equals, value = option_value.partition("=")
-        if not equals or name in metadata:
-            problem = "is given twice" if equals else "must be NAME=VALUE (temperature_c=21.4)"
-            fail(f"--meta {option_value!r}: {problem}.", EXIT_WRONG_USE)
-        metadata[name] = value
-    return {name: text for name, text in notes.items() if text} | metadata_keys(metadata)
+        note_name, equals_sign, note_value = option_value.partition("=")
+        if not equals_sign or note_name in metadata:
+            problem_text = (
+                "is given twice" if equals_sign else "must be NAME=VALUE (temperature_c=21.4)"
+            )
+            fail(f"--meta {option_value!r}: {problem_text}.", EXIT_WRONG_USE)
+        metadata[note_name] = note_value
+    return {
+        note_name: meta_text for note_name, meta_text in notes.items() if meta_text
+    } | metadata_keys(metadata)
 
 
-def profile_named(name: str) -> "Profile":
+def profile_named(name_or_file: str) -> "Profile":
     """Load a profile by its name or file.
 
     The slow modules of profiles are imported in the function, for a quick start of other commands.
     """
     from rigd.profile import load_profile
 
-    return load_profile(name)
+    return load_profile(name_or_file)

@@ -24,14 +24,14 @@ def probe(
 
     Example: rigd probe --profile sim --fast
     """
-    stop, group = start_processes(live=False)
+    stop_request, process_group = start_processes(live=False)
     from rigd.runner import probe_in_foreground
     from rigd.runtime import ignore
 
     try:
-        rig_profile, result = probe_in_foreground(
-            group,
-            stop,
+        rig_profile, probe_result = probe_in_foreground(
+            process_group,
+            stop_request,
             profile_name=profile,
             fast=fast,
             hardware=hardware,
@@ -39,12 +39,12 @@ def probe(
         )
     finally:
         ignore()
-    contradiction = result.contradiction(rig_profile)
+    contradiction_text = probe_result.contradiction(rig_profile)
     if as_json:
-        document = {"end": result.end.name.lower(), **result.estimate.as_dict()}
-        typer.echo(json.dumps(document | {"contradiction": contradiction}))
+        json_document = {"end": probe_result.end.name.lower(), **probe_result.estimate.as_dict()}
+        typer.echo(json.dumps(json_document | {"contradiction": contradiction_text}))
     else:
-        typer.echo("\n".join(result.lines(rig_profile)))
-        typer.echo(contradiction or "The rig agrees with its profile.")
-    if contradiction:
+        typer.echo("\n".join(probe_result.lines(rig_profile)))
+        typer.echo(contradiction_text or "The rig agrees with its profile.")
+    if contradiction_text:
         raise typer.Exit(EXIT_FAILED)

@@ -52,14 +52,16 @@ def list_profiles() -> None:
     """
     from rigd.profile import ProfileError, load_profile, profile_files
 
-    for name, (used_file, *hidden) in profile_files().items():
+    for profile_name, (used_file, *hidden_text) in profile_files().items():
         try:
             description = load_profile(used_file.path).description
         except ProfileError as error:
             description = f"cannot be used: {str(error).splitlines()[0]}"
-        typer.echo(printable(f"{name}: {description} ({used_file.path}, {used_file.origin})"))
-        for other in hidden:
-            typer.echo(printable(f"  hides {other.path} ({other.origin})"))
+        typer.echo(
+            printable(f"{profile_name}: {description} ({used_file.path}, {used_file.origin})")
+        )
+        for hidden_file in hidden_text:
+            typer.echo(printable(f"  hides {hidden_file.path} ({hidden_file.origin})"))
 
 
 @profiles_app.command()
@@ -106,11 +108,11 @@ def copy(
     path = folder / f"{file_stem}.toml"
     copy_profile(profile, path, new_name)
     files = profile_files()[file_stem]
-    position = [file.path.resolve() for file in files].index(path.resolve())
-    if position:
+    search_position = [profile_file.path.resolve() for profile_file in files].index(path.resolve())
+    if search_position:
         typer.echo(f"Note: {files[0].path} ({files[0].origin}) hides it here.", err=True)
-    for other in files[position + 1 :]:
-        typer.echo(f"Note: it hides {other.path} ({other.origin}).", err=True)
+    for hiding_file in files[search_position + 1 :]:
+        typer.echo(f"Note: it hides {hiding_file.path} ({hiding_file.origin}).", err=True)
     typer.echo(f"{path}: written. Next: edit it, then rigd check --profile {file_stem}")
 
 
@@ -142,15 +144,16 @@ def new(
     check_new(output)
     draft = Draft(base, read_eds(eds), output)
     write_new(output, _ask_for_values(draft) if is_terminal() else draft.text())
-    for remark in draft.remarks:
-        typer.echo(f"Note: {remark}", err=True)
+    for draft_remark in draft.remarks:
+        typer.echo(f"Note: {draft_remark}", err=True)
     unanswered = draft.unanswered_questions()
     missing_features = [finding.accept for finding in draft.unaccepted_findings()]
     if unanswered or missing_features:
         typer.echo(f"To fill in (marked TO FILL IN in {output}):", err=True)
-    for question in unanswered:
+    for open_question in unanswered:
         typer.echo(
-            f"  {question.key} = {draft.value_text(question.key)}: {question.text}", err=True
+            f"  {open_question.key} = {draft.value_text(open_question.key)}: {open_question.text}",
+            err=True,
         )
     if missing_features:
         typer.echo(
@@ -167,7 +170,7 @@ def is_terminal() -> bool:
 
 
 def _ask_for_values(draft: "Draft") -> str:
-    """Ask for values that no file states until the profile is valid, and return its text."""
+    """Ask the user for values that no file states until the profile is valid; return its text."""
     from rigd.profile import ProfileError
 
     typer.echo(
@@ -175,8 +178,8 @@ def _ask_for_values(draft: "Draft") -> str:
     )
     try:
         while True:
-            for question in draft.questions():
-                _ask_for_value(draft, question.key, question.text)
+            for open_question in draft.questions():
+                _ask_for_value(draft, open_question.key, open_question.text)
             try:
                 draft.text()
             except ProfileError as error:
@@ -191,25 +194,25 @@ def _ask_for_values(draft: "Draft") -> str:
 
 def _ask_for_acceptance(draft: "Draft") -> None:
     """Ask the user whether to accept each missing feature of the drive; Enter means no."""
-    declined: set[str] = set()
+    declined_names: set[str] = set()
     # One answer may imply another: without a watchdog its reaction is irrelevant.
     while missing_features := [
-        each for each in draft.unaccepted_findings() if each.accept not in declined
+        finding for finding in draft.unaccepted_findings() if finding.accept not in declined_names
     ]:
         typer.echo(missing_features[0].sentence, err=True)
-        name = missing_features[0].accept
-        if typer.confirm(f"Run it without ({name})?", default=False, err=True):
-            draft.accept(name)
+        feature_name = missing_features[0].accept
+        if typer.confirm(f"Run it without ({feature_name})?", default=False, err=True):
+            draft.accept(feature_name)
         else:
-            declined.add(name)
+            declined_names.add(feature_name)
 
 
 def _ask_for_value(draft: "Draft", key: str, text: str) -> None:
     """Ask the user for the value of a key until the answer is valid."""
     while True:
-        reply = typer.prompt(text, default=draft.value_text(key), err=True)
+        typed_reply = typer.prompt(text, default=draft.value_text(key), err=True)
         try:
-            draft.answer(key, reply.strip())
+            draft.answer(key, typed_reply.strip())
             return
         except ValueError as error:
             typer.echo(f"{key}: {error}.", err=True)

@@ -96,18 +96,21 @@ def excitation_command(parameters: Parameters) -> Parameters:
 
 def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
     """Add the subcommand of an excitation to a command; `perform` runs its sessions."""
-    kind = parameters.__name__
+    excitation_kind = parameters.__name__
     own_parameters = list(inspect.signature(parameters).parameters.values())
     common_parameters = list(inspect.signature(perform).parameters.values())[2:]
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
         common_options = {
-            parameter.name: options.pop(parameter.name) for parameter in common_parameters
+            command_parameter.name: options.pop(command_parameter.name)
+            for command_parameter in common_parameters
         }
         given_parameters = {
-            name: value for name, value in parameters(**options).items() if value is not None
+            parameter_name: parameter_value
+            for parameter_name, parameter_value in parameters(**options).items()
+            if parameter_value is not None
         }
-        perform(kind, given_parameters, **common_options)
+        perform(excitation_kind, given_parameters, **common_options)
 
     command.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
@@ -116,10 +119,12 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
         ]
     )
     command.__annotations__ = {p.name: p.annotation for p in (*own_parameters, *common_parameters)}
-    text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
+    help_text = (parameters.__doc__ or "").replace("rigd run", f"rigd {app.info.name}")
     # Otherwise the angle -0.3 would be read as an option.
-    command_settings = {"ignore_unknown_options": True} if kind in ("move", "touch") else None
-    app.command(kind, help=text, context_settings=command_settings)(command)
+    command_settings = (
+        {"ignore_unknown_options": True} if excitation_kind in ("move", "touch") else None
+    )
+    app.command(excitation_kind, help=help_text, context_settings=command_settings)(command)
 
 
 def run_sessions(
@@ -145,23 +150,23 @@ def run_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Run sessions of an excitation one after the other, and report how they ended."""
-    notes = session_notes(operator, specimen, note, meta)
-    fit = watch_fit or kind == "until"
-    stop, group = start_processes(live=live, touch=kind == "touch", fit=fit)
+    session_metadata = session_notes(operator, specimen, note, meta)
+    fits_live = watch_fit or kind == "until"
+    stop_request, process_group = start_processes(live=live, touch=kind == "touch", fit=fits_live)
     from rigd.runner import SeriesFailedError, run_in_foreground
     from rigd.runner.planning import excitation_for
     from rigd.runtime import ignore
 
     try:
-        results = run_in_foreground(
+        session_results = run_in_foreground(
             partial(excitation_for, kind=kind, parameters=parameters),
-            group,
-            stop,
+            process_group,
+            stop_request,
             profile_name=profile,
             folder=output,
             repeat=repeat,
             seed=seed,
-            notes=notes,
+            notes=session_metadata,
             fast=fast,
             live=live,
             force=force,
@@ -181,12 +186,12 @@ def run_sessions(
     finally:
         ignore()  # nothing is left to stop; another Ctrl-C must not change the exit code
     if as_json:
-        _write_json(results)
-    if any(result.fault for result in results):
+        _write_json(session_results)
+    if any(session_result.fault for session_result in session_results):
         raise typer.Exit(EXIT_FAILED)
-    if stop.requested:
+    if stop_request.requested:
         raise typer.Exit(EXIT_INTERRUPTED)
-    if not all(result.went_well for result in results):
+    if not all(session_result.went_well for session_result in session_results):
         raise typer.Exit(EXIT_FAILED)
 
 
@@ -260,9 +265,9 @@ def multisine(
 
     Example: rigd run multisine --amplitude 0.01 --period 20
     """
-    options = locals()
-    options["seed"] = options.pop("phase_seed")
-    return options
+    excitation_options = locals()
+    excitation_options["seed"] = excitation_options.pop("phase_seed")
+    return excitation_options
 
 
 @excitation_command
@@ -443,12 +448,16 @@ def until(
     Example: rigd run until --damping 1% --at-most 60
     """
     precisions = [
-        *(("damping", text) for text in damping or ()),
-        *(("frequency", text) for text in frequency or ()),
+        *(("damping", precision_text) for precision_text in damping or ()),
+        *(("frequency", precision_text) for precision_text in frequency or ()),
         *(("zeta", zeta), ("alpha", alpha), ("gamma", gamma), ("lambda", lambda_)),
     ]
     return {
-        "targets": "; ".join(f"{name} {text}" for name, text in precisions if text is not None),
+        "targets": "; ".join(
+            f"{parameter_name} {precision_text}"
+            for parameter_name, precision_text in precisions
+            if precision_text is not None
+        ),
         "at_most_s": at_most_s,
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,

@@ -48,10 +48,10 @@ def simulate(
     from rigd.devices import simulator as simulator_of
 
     simulator = simulator_of()
-    options = simulator.SimulatorOptions(
+    simulator_options = simulator.SimulatorOptions(
         lock_step=lock_step,
         log=log,
-        faults=tuple(simulator.parse_fault(spec) for spec in fault or ()),
+        faults=tuple(simulator.parse_fault(fault_spec) for fault_spec in fault or ()),
         quiet=quiet,
         eds=eds,
     )
@@ -62,7 +62,7 @@ def simulate(
         rig = with_obstacles(rig, obstacle)
     if seed is not None and rig.simulation is not None:
         rig = replace(rig, simulation=replace(rig.simulation, seed=seed))
-    raise typer.Exit(simulator.run_simulator(rig, options))
+    raise typer.Exit(simulator.run_simulator(rig, simulator_options))
 
 
 def inject(

@@ -66,7 +66,7 @@ class SessionCommands(TyperGroup):
 def start_processes(
     *, live: bool, touch: bool = False, fit: bool = False
 ) -> "tuple[StopRequest, ProcessGroup]":
-    """Catch Ctrl-C as a request to stop, and start the processes of the first session.
+    """Make Ctrl-C a request to stop the session, and start the processes of the first session.
 
     The processes import their modules while the command line imports others and plans.
     """
@@ -74,13 +74,13 @@ def start_processes(
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 
-    stop = StopRequest()
-    stop.catch()
+    stop_request = StopRequest()
+    stop_request.catch()
     try:
         extra_processes = [
-            process for process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
+            extra_process for extra_process, is_needed in ((TOUCH, touch), (FIT, fit)) if is_needed
         ]
-        return stop, ProcessGroup(live=live, extra_processes=extra_processes)
+        return stop_request, ProcessGroup(live=live, extra_processes=extra_processes)
     except OSError as error:
         fail(
             f"The processes of a session cannot be started ({error.strerror}); check the limits "
@@ -110,23 +110,28 @@ def start_sessions(
     """Run sessions of an excitation by the daemon, and report how they ended."""
     from rigd.session.user_metadata import META_PREFIX
 
-    notes: dict[str, Any] = {}
-    for key, text in session_notes(operator, specimen, note, meta).items():
+    session_metadata: dict[str, Any] = {}
+    for key, note_text in session_notes(operator, specimen, note, meta).items():
         if key.startswith(META_PREFIX):  # an older daemon does not know the member
-            notes.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = text
+            session_metadata.setdefault("meta", {})[key.removeprefix(META_PREFIX)] = note_text
         else:
-            notes[key] = text
-    for name, value in {**parameters, "tip_slope_rad": tip_slope_rad}.items():
-        if isinstance(value, float) and not isfinite(value):
-            fail(f"{name} = {value} is not a finite number; give one.", EXIT_WRONG_USE)
+            session_metadata[key] = note_text
+    for parameter_name, parameter_value in {**parameters, "tip_slope_rad": tip_slope_rad}.items():
+        if isinstance(parameter_value, float) and not isfinite(parameter_value):
+            fail(
+                f"{parameter_name} = {parameter_value} is not a finite number; give one.",
+                EXIT_WRONG_USE,
+            )
     request = {
         "excitation": kind,
         "parameters": {
-            name: str(value.absolute()) if isinstance(value, Path) else value
-            for name, value in parameters.items()
+            parameter_name: str(parameter_value.absolute())
+            if isinstance(parameter_value, Path)
+            else parameter_value
+            for parameter_name, parameter_value in parameters.items()
         },
         "repeat": repeat,
-        "notes": notes,
+        "notes": session_metadata,
         "force": force,
     }
     if watch_fit:  # an older daemon does not know the member
@@ -136,8 +141,8 @@ def start_sessions(
     if tip_slope_rad is not None:  # likewise
         request["tip_slope_rad"] = tip_slope_rad
     with daemon_of(profile) as client:
-        daemon = client.ask("status")["daemon"]
-        typer.echo(daemon["what_moves"], err=True)
+        daemon_status = client.ask("status")["daemon"]
+        typer.echo(daemon_status["what_moves"], err=True)
         if not detach:
             client.ask("watch")
         with _Interrupts.caught() as interrupts:
@@ -159,7 +164,7 @@ def start_sessions(
                 return
             _print_plan(reply["plan"], err=as_json)
             # An older daemon makes no quick looks, or does not report for which sessions.
-            quick_looks = daemon.get("quick_looks", False)
+            quick_looks = daemon_status.get("quick_looks", False)
             series = _follow_series(
                 client, reply["series"], interrupts, as_json=as_json, quick_looks=quick_looks
             )
@@ -173,7 +178,7 @@ def start_sessions(
 
 
 class _Interrupts:
-    """Counts Ctrl-C: the first requests a stop, the second ends the command."""
+    """Counts presses of Ctrl-C: the first requests a stop, the second ends the command."""
 
     def __init__(self) -> None:
         self.count = 0
@@ -190,14 +195,19 @@ class _Interrupts:
             signal.signal(signal.SIGINT, previous_handler)
 
     def note(self) -> None:
-        """Count one Ctrl-C."""
+        """Register one press of Ctrl-C."""
         self.count += 1
 
 
 def _follow_series(
-    client: "Client", number: int, interrupts: _Interrupts, *, as_json: bool, quick_looks: bool
+    client: "Client",
+    series_number: int,
+    interrupts: _Interrupts,
+    *,
+    as_json: bool,
+    quick_looks: bool,
 ) -> dict[str, Any]:
-    """Show the progress of a series until its end, and return its final event."""
+    """Show the progress of a series of sessions until its end, and return its final event."""
     from rigd.engine.shared_state import Phase
     from rigd.runner import ProgressLine, result_line
     from rigd.runner.quick_looks import QuickLook
@@ -206,7 +216,7 @@ def _follow_series(
     ended_sessions = 0
     awaited_quick_looks: set[str] = set()
     quick_look_paths: dict[str, str] = {}
-    fits: dict[str, Any] = {}
+    fits_by_path: dict[str, Any] = {}
     final_event: dict[str, Any] | None = None
     interrupts_at_end, deadline_s = 0, 0.0
     progress_line = ProgressLine()
@@ -222,63 +232,71 @@ def _follow_series(
                 )
             if final_event is None and interrupts.count > 1:
                 raise typer.Exit(EXIT_INTERRUPTED)
-            event = client.event(_EVENT_TIMEOUT_S) or {}
-            match event.get("event"):
+            daemon_event = client.event(_EVENT_TIMEOUT_S) or {}
+            match daemon_event.get("event"):
                 # No bar between two sessions, where it would mix with the printed path.
-                case "progress" if event["session"] > ended_sessions:
+                case "progress" if daemon_event["session"] > ended_sessions:
                     progress_line.update(
-                        Phase[event["phase"].upper()],
-                        event["tick"],
-                        event["total"],
-                        missed=event["missed"],
-                        late=event["late"],
-                        session_number_text=f"{event['session']}/{event['repeat']}"
-                        if event["repeat"] > 1
+                        Phase[daemon_event["phase"].upper()],
+                        daemon_event["tick"],
+                        daemon_event["total"],
+                        missed=daemon_event["missed"],
+                        late=daemon_event["late"],
+                        session_number_text=f"{daemon_event['session']}/{daemon_event['repeat']}"
+                        if daemon_event["repeat"] > 1
                         else "",
                     )
-                case "message" if "session" in event:
+                case "message" if "session" in daemon_event:
                     pass  # the end of a session is reported by the event of that name
-                case "message" if event["level"] != "info":
-                    progress_line.say(f"{event['level'].capitalize()}: {event['text']}")
-                case "message" if event.get("notable") or event["text"].startswith("Live view"):
-                    progress_line.say(event["text"])
+                case "message" if daemon_event["level"] != "info":
+                    progress_line.say(
+                        f"{daemon_event['level'].capitalize()}: {daemon_event['text']}"
+                    )
+                case "message" if daemon_event.get("notable") or daemon_event["text"].startswith(
+                    "Live view"
+                ):
+                    progress_line.say(daemon_event["text"])
                 case "session":
-                    progress_line.say(result_line(event))
+                    progress_line.say(result_line(daemon_event))
                     progress_line.close()  # standard output may be the same terminal
-                    if event["path"] is not None:
+                    if daemon_event["path"] is not None:
                         if not as_json:
-                            typer.echo(event["path"])
-                        if event.get("look_follows", quick_looks):
-                            awaited_quick_looks.add(event["path"])
-                        if "fit" in event:
-                            fits[event["path"]] = event["fit"]
-                    progress_line, ended_sessions = ProgressLine(), event["number"]
-                case "quick_look" if event["path"] in awaited_quick_looks:
-                    awaited_quick_looks.discard(event["path"])
-                    quick_look = QuickLook.of_event(event)
+                            typer.echo(daemon_event["path"])
+                        if daemon_event.get("look_follows", quick_looks):
+                            awaited_quick_looks.add(daemon_event["path"])
+                        if "fit" in daemon_event:
+                            fits_by_path[daemon_event["path"]] = daemon_event["fit"]
+                    progress_line, ended_sessions = ProgressLine(), daemon_event["number"]
+                case "quick_look" if daemon_event["path"] in awaited_quick_looks:
+                    awaited_quick_looks.discard(daemon_event["path"])
+                    quick_look = QuickLook.of_event(daemon_event)
                     if quick_look.path is not None:
-                        quick_look_paths[event["path"]] = str(quick_look.path)
-                    for text in quick_look.lines:
-                        progress_line.say(text)
-                case "series" if event["series"] == number:
-                    final_event, interrupts_at_end = event, interrupts.count
+                        quick_look_paths[daemon_event["path"]] = str(quick_look.path)
+                    for log_text in quick_look.lines:
+                        progress_line.say(log_text)
+                case "series" if daemon_event["series"] == series_number:
+                    final_event, interrupts_at_end = daemon_event, interrupts.count
                     deadline_s = time.monotonic() + _QUICK_LOOK_PATIENCE_S
                     if awaited_quick_looks:
                         progress_line.say("Quick look at the session; Ctrl-C skips it.")
     finally:
         progress_line.close()
-    sessions = [
-        each
-        | {"look": quick_look_paths.get(each["path"])}
-        | ({"fit": fits[each["path"]]} if each["path"] in fits else {})
-        for each in final_event["sessions"]
+    session_results = [
+        session_entry
+        | {"look": quick_look_paths.get(session_entry["path"])}
+        | (
+            {"fit": fits_by_path[session_entry["path"]]}
+            if session_entry["path"] in fits_by_path
+            else {}
+        )
+        for session_entry in final_event["sessions"]
     ]
-    return final_event | {"sessions": sessions}
+    return final_event | {"sessions": session_results}
 
 
 def _print_plan(plan: dict[str, Any], *, err: bool) -> None:
     """Print the plan of a session, with `err` to standard error."""
     from rigd.runner import plan_lines
 
-    for line in plan_lines(plan):
-        typer.echo(line, err=err)
+    for plan_line in plan_lines(plan):
+        typer.echo(plan_line, err=err)

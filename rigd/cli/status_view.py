@@ -32,15 +32,15 @@ def print_status(status: dict[str, Any]) -> None:
 
 def status_table(status: dict[str, Any]) -> RenderableType:
     """Return the daemon's reply to the request ``status`` as a rich table."""
-    summary = Table(box=None, pad_edge=False, show_header=False)
-    summary.add_column(style="dim", no_wrap=True)
-    summary.add_column(overflow="fold")
-    for name, value in _summary_rows(status):
-        summary.add_row(name, value)
-    parts: list[RenderableType] = [summary]
+    summary_table = Table(box=None, pad_edge=False, show_header=False)
+    summary_table.add_column(style="dim", no_wrap=True)
+    summary_table.add_column(overflow="fold")
+    for row_name, row_value in _summary_rows(status):
+        summary_table.add_row(row_name, row_value)
+    status_parts: list[RenderableType] = [summary_table]
     rig = status["rig"]
     if rig is not None:
-        recording = status["state"] in ("running", "stopping")
+        is_recording = status["state"] in ("running", "stopping")
         side_by_side = Table.grid(padding=(0, 2, 0, 0))
         side_by_side.add_row(
             Group("", _signal_table(rig), "", _health_table(rig)),
@@ -48,43 +48,49 @@ def status_table(status: dict[str, Any]) -> RenderableType:
                 "",
                 _process_table(rig["processes"]),
                 "",
-                _topic_table(rig["topics"], recording=recording),
+                _topic_table(rig["topics"], recording=is_recording),
             ),
         )
-        parts.append(side_by_side)
-    parts.append(_transition_table(status["history"]))
-    return Group(*parts)
+        status_parts.append(side_by_side)
+    status_parts.append(_transition_table(status["history"]))
+    return Group(*status_parts)
 
 
 def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     """Yield the names and values at the top of the status: rig, state, series and addresses."""
-    daemon, series, progress = (status[name] for name in ("daemon", "series", "progress"))
+    daemon, session_series, progress = (
+        status[status_key] for status_key in ("daemon", "series", "progress")
+    )
     yield "rig", Text(f"{daemon['profile']} ({daemon['moving']}), daemon {daemon['pid']}")
-    action = f" ({status['doing']})" if status["doing"] else ""
-    activity = status["state"]
-    if activity == "running" and progress is not None:
-        activity = progress.get("activity", activity)  # an older daemon has none
-    state = Text(f"{activity}{action}", style=_STATE_STYLES.get(status["state"], ""))
-    state.append(
+    action_text = f" ({status['doing']})" if status["doing"] else ""
+    activity_text = status["state"]
+    if activity_text == "running" and progress is not None:
+        activity_text = progress.get("activity", activity_text)  # an older daemon has none
+    state_text = Text(f"{activity_text}{action_text}", style=_STATE_STYLES.get(status["state"], ""))
+    state_text.append(
         f" since {_local_time(status['since_utc_ns'])}: {status['reason']}", style="default"
     )
-    yield "state", state
+    yield "state", state_text
     if status["zero_lost"]:
         yield "zero", Text("lost with the connection: run rigd zero", style="bold yellow")
-    controller = status["controller"]
+    controller_text = status["controller"]
     yield (
         "control",
         Text(
-            "free" if controller is None else f"process {controller['pid']} of {controller['user']}"
+            "free"
+            if controller_text is None
+            else f"process {controller_text['pid']} of {controller_text['user']}"
         ),
     )
-    if series is not None:
-        yield "series", Text(_series_text(series))
+    if session_series is not None:
+        yield "series", Text(_series_text(session_series))
     if progress is not None:
         yield "session", Text(progress_text(progress))
     # An older daemon reports no fit; a fit without lines belongs to a lost record.
-    if series is not None and (lines := (series.get("fit") or {}).get("text")):
-        yield "fit", Text("\n".join(lines))
+    if session_series is not None and (
+        address_lines := (session_series.get("fit") or {}).get("text")
+    ):
+        yield "fit", Text("\n".join(address_lines))
     rig = status["rig"]
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])
@@ -106,28 +112,32 @@ def progress_text(progress: dict[str, Any]) -> str:
 
 def _series_text(series: dict[str, Any]) -> str:
     """Return a line on a running or ended series of sessions."""
-    title = f"{series['excitation']} {series['session']} of {series['repeat']}"
+    series_title = f"{series['excitation']} {series['session']} of {series['repeat']}"
     if series["running"]:
-        return f"{title}: {series['path'] or 'being planned'}"
-    complete = [session for session in series["sessions"] if session["outcome"] == "complete"]
+        return f"{series_title}: {series['path'] or 'being planned'}"
+    complete_sessions = [
+        session for session in series["sessions"] if session["outcome"] == "complete"
+    ]
     why = f" ({series['reason']})" if series["reason"] else ""
-    return f"{title}, ended: {len(complete)} complete{why}"
+    return f"{series_title}, ended: {len(complete_sessions)} complete{why}"
 
 
 def _empty_table(title: str, *columns: str) -> Table:
     """Return an empty table with a left-aligned first column and right-aligned other ones."""
-    table = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline")
-    table.add_column(title, no_wrap=True)
-    for column in columns:
-        table.add_column(column, justify="right", no_wrap=True)
-    return table
+    empty_table = Table(
+        box=None, pad_edge=False, padding=(0, 1, 0, 0), header_style="bold underline"
+    )
+    empty_table.add_column(title, no_wrap=True)
+    for column_title in columns:
+        empty_table.add_column(column_title, justify="right", no_wrap=True)
+    return empty_table
 
 
 def _signal_table(rig: dict[str, Any]) -> Table:
     """Return the table of the rig's present signals and their peaks in the record."""
-    table = _empty_table("signal", "now", "peak")
+    signal_table = _empty_table("signal", "now", "peak")
     signals = rig["signals"] or {}
-    for name, unit, digits, now, peak in (
+    for signal_name, unit_text, decimal_count, now, peak_value in (
         ("angle", "rad", 5, rig["angle_rad"], None),
         (
             "tracking error",
@@ -151,20 +161,20 @@ def _signal_table(rig: dict[str, Any]) -> Table:
             signals.get("peak_torque_command_nm"),
         ),
     ):
-        table.add_row(
-            f"{name}, {unit}",
-            "" if now is None else f"{now:+.{digits}f}",
-            "" if peak is None else f"{peak:.{digits}f}",
+        signal_table.add_row(
+            f"{signal_name}, {unit_text}",
+            "" if now is None else f"{now:+.{decimal_count}f}",
+            "" if peak_value is None else f"{peak_value:.{decimal_count}f}",
         )
-    return table
+    return signal_table
 
 
 def _health_table(rig: dict[str, Any]) -> Table:
     """Return the table of the health of loop, recorder, bus and view, with coloured problems."""
-    table = _empty_table("health", "")
-    for name, text, style in _health_rows(rig):
-        table.add_row(name, Text(text, style=style))
-    return table
+    health_table = _empty_table("health", "")
+    for row_name, row_text, row_style in _health_rows(rig):
+        health_table.add_row(row_name, Text(row_text, style=row_style))
+    return health_table
 
 
 def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
@@ -178,18 +188,22 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
         latency_text = f"{signals['lateness_p50_us']:.0f}, {signals['lateness_p99_us']:.0f} µs"
         yield "wake-up latency p50, p99", latency_text, ""
         yield "execution time p99", f"{signals['work_p99_us']:.0f} µs", ""
-    lost = f"{health['missed']}, {health['late']}, {health['lost']}"
-    style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
-    yield "missed, late, lost", lost, style
+    lost_text = f"{health['missed']}, {health['late']}, {health['lost']}"
+    text_style = "bold red" if health["lost"] else "yellow" if health["missed"] else ""
+    yield "missed, late, lost", lost_text, text_style
     if health["bus_load_percent"] is not None:
-        load = health["bus_load_percent"]
-        yield "bus load", f"{load:.1f} %", "yellow" if load > _BUSY_PERCENT else ""
+        load_percent = health["bus_load_percent"]
+        yield "bus load", f"{load_percent:.1f} %", "yellow" if load_percent > _BUSY_PERCENT else ""
     if health["bus_errors"] is not None:
-        errors = health["bus_errors"]
-        yield "bus errors", str(errors), "yellow" if errors else ""
+        bus_errors = health["bus_errors"]
+        yield "bus errors", str(bus_errors), "yellow" if bus_errors else ""
     if health["sensor_status"] is not None:
-        status = health["sensor_status"]
-        yield "sensor", f"status {status:#06x}" if status else "OK", "red" if status else ""
+        sensor_status = health["sensor_status"]
+        yield (
+            "sensor",
+            f"status {sensor_status:#06x}" if sensor_status else "OK",
+            "red" if sensor_status else "",
+        )
     if health["disk_free_mb"] is not None:
         yield "free on the disk", f"{1e-3 * health['disk_free_mb']:.1f} GB", ""
     if health["view_dropped"]:
@@ -198,30 +212,30 @@ def _health_rows(rig: dict[str, Any]) -> Iterator[tuple[str, str, str]]:
 
 def _process_table(processes: list[dict[str, Any]]) -> Table:
     """Return the table of the rig's processes with their state and last heartbeat."""
-    table = _empty_table("process", "pid", "state", "heartbeat, s ago")
+    process_table = _empty_table("process", "pid", "state", "heartbeat, s ago")
     for process in processes:
-        style = process["state"] in ("hung", "ended")
-        table.add_row(
+        state_style = process["state"] in ("hung", "ended")
+        process_table.add_row(
             process["name"],
             str(process["pid"]),
-            Text(process["state"], style="bold red" if style else ""),
+            Text(process["state"], style="bold red" if state_style else ""),
             f"{process['still_s']:.1f}" if process["state"] not in ("waiting", "done") else "",
         )
-    return table
+    return process_table
 
 
 def _topic_table(topics: list[dict[str, Any]], *, recording: bool) -> Table:
-    """Return the table of recorded topics with their rate and the recorder's backlog."""
-    table = _empty_table("topic", "records", "Hz", "of Hz", "backlog")
+    """Return the table of recorded message topics with their rate and the recorder's backlog."""
+    topic_table = _empty_table("topic", "records", "Hz", "of Hz", "backlog")
     for topic in topics:
-        table.add_row(
+        topic_table.add_row(
             topic["name"],
             str(topic["written"]),
             _rate_text(topic["rate_hz"]),
             _rate_text(topic["expected_hz"]) if recording else "",
             str(topic["waiting"]),
         )
-    return table
+    return topic_table
 
 
 def _rate_text(rate_hz: float | None) -> str:
@@ -231,17 +245,17 @@ def _rate_text(rate_hz: float | None) -> str:
 
 def _transition_table(transitions: list[dict[str, Any]]) -> Table:
     """Return the table of the daemon's last changes of state with their reasons."""
-    table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0))
-    table.add_column("when", no_wrap=True)
-    table.add_column("from → to", no_wrap=True)
-    table.add_column("why", overflow="fold")
+    transition_table = Table(box=SIMPLE_HEAD, pad_edge=False, padding=(0, 2, 0, 0))
+    transition_table.add_column("when", no_wrap=True)
+    transition_table.add_column("from → to", no_wrap=True)
+    transition_table.add_column("why", overflow="fold")
     for transition in transitions[-_MAX_SHOWN_TRANSITIONS:]:
-        table.add_row(
+        transition_table.add_row(
             _local_time(transition["utc_ns"]),
             f"{transition['from']} → {transition['to']}",
             Text(transition["reason"]),
         )
-    return table
+    return transition_table
 
 
 def _local_time(utc_ns: int) -> str:

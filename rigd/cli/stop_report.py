@@ -25,47 +25,51 @@ def stop_and_report(profile: str | None, *, wait: bool) -> int:
     wait
         Whether to wait until the sessions have ended.
     """
-    report = stop_all(profile, wait=wait)
-    if profile is not None and not report.found:
+    stop_report = stop_all(profile, wait=wait)
+    if profile is not None and not stop_report.found:
         from rigd.profile import load_profile
 
-        name = load_profile(profile).name
-        if name != profile:
-            report = stop_all(name, wait=wait)
-    _print_report(report)
-    return 0 if report.sure else EXIT_FAILED
+        rig_name = load_profile(profile).name
+        if rig_name != profile:
+            stop_report = stop_all(rig_name, wait=wait)
+    _print_report(stop_report)
+    return 0 if stop_report.sure else EXIT_FAILED
 
 
 def _print_report(report: "StopReport") -> None:
     """Print the result of a stop to standard output, and problems to standard error."""
-    lines = [f"Stopped: {text}." for text in report.stopped]
-    lines += [f"{text} is being stopped." for text in report.stopping]
-    lines += report.quiet
+    report_lines = [f"Stopped: {message_text}." for message_text in report.stopped]
+    report_lines += [f"{message_text} is being stopped." for message_text in report.stopping]
+    report_lines += report.quiet
     if report.sure and not report.stopping:
         if len(report.stopped) == 1:
-            lines.append("The session has ended; the torque is off.")
+            report_lines.append("The session has ended; the torque is off.")
         elif report.stopped:
-            lines.append(f"All {len(report.stopped)} sessions have ended; the torque is off.")
+            report_lines.append(
+                f"All {len(report.stopped)} sessions have ended; the torque is off."
+            )
         elif not report.quiet:
             owner_text = " of yours" if report.others else ""
-            lines.append(
+            report_lines.append(
                 f"No session{owner_text} is running. Searched: {', '.join(report.searched)}."
             )
     problems = [
-        f"Not stopped: {text}; only that user or root can stop it." for text in report.others
+        f"Not stopped: {message_text}; only that user or root can stop it."
+        for message_text in report.others
     ]
     problems += [
-        f"Error: {text} was asked to stop, but its session did not end; check rigd status and "
+        f"Error: {message_text} was asked to stop, but its session did not end; check rigd "
+        "status and "
         "the rig, and press the wired stop (STO) if anything moves."
-        for text in report.running
+        for message_text in report.running
     ]
-    problems += [f"Error: {text}" for text in report.doubts]
+    problems += [f"Error: {message_text}" for message_text in report.doubts]
     if report.doubts and not report.running:
         problems.append(
             "Whether another session runs is not known: check the rig, and press the wired stop "
             "(STO) if anything moves."
         )
-    for texts, stream in ((lines, sys.stdout), (problems, sys.stderr)):
-        if texts:
-            stream.write("".join(f"{text}\n" for text in texts))
-            stream.flush()
+    for message_texts, output_stream in ((report_lines, sys.stdout), (problems, sys.stderr)):
+        if message_texts:
+            output_stream.write("".join(f"{message_text}\n" for message_text in message_texts))
+            output_stream.flush()

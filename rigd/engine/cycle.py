@@ -618,7 +618,7 @@ def make_reading_monitors(profile: Profile, devices: Devices) -> ReadingMonitors
         inertia_kg_m2=rig.motor.inertia_kg_m2,
         breakaway_nm=profile.standstill_torque_nm,
         delay_ticks=max(1, round(rig.actuation.delay_s * rig.rate_hz)),
-        scales=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
+        scale_watch=ScaleWatch(rig.motor.inertia_kg_m2, profile.limits.torque_ratio),
     )
     simulation = rig.simulation
     is_noisy = [True] * 6

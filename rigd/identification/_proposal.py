@@ -20,18 +20,20 @@ light motor. With a slower one the beam would move the motor; even 40 rad/s is t
 lightest motors."""
 
 
-def with_cautious_controller(profile: Profile) -> Profile:
+def with_cautious_controller(rig_profile: Profile) -> Profile:
     """Return a profile with the slowest stable controller, which tolerates wrong motor data.
 
     The check of the scales (``limits.torque_ratio``) is off, since the sessions measure them.
     """
-    profile = replace(profile, limits=replace(profile.limits, torque_ratio=inf))
+    rig_profile = replace(rig_profile, limits=replace(rig_profile.limits, torque_ratio=inf))
     for pole_rad_s in _CAUTIOUS_POLES_RAD_S:
-        if pole_rad_s < profile.control.pole_rad_s:
-            slow_profile = replace(profile, control=replace(profile.control, pole_rad_s=pole_rad_s))
+        if pole_rad_s < rig_profile.control.pole_rad_s:
+            slow_profile = replace(
+                rig_profile, control=replace(rig_profile.control, pole_rad_s=pole_rad_s)
+            )
             if _is_stable(slow_profile):
                 return slow_profile
-    return profile
+    return rig_profile
 
 
 def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
@@ -48,16 +50,22 @@ def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
     estimate
         Estimate of the rig's motor.
     """
-    scale = estimate.torque_scale.value
-    motor = replace(
+    torque_scale = estimate.torque_scale.value
+    fitted_motor = replace(
         profile.rig.motor,
-        inertia_kg_m2=estimate.inertia_kg_m2.value / scale,
-        viscous_nm_s_per_rad=max(0.0, estimate.viscous_nm_s_per_rad.value) / scale,
+        inertia_kg_m2=estimate.inertia_kg_m2.value / torque_scale,
+        viscous_nm_s_per_rad=max(0.0, estimate.viscous_nm_s_per_rad.value) / torque_scale,
     )
-    control = replace(profile.control, feedforward_gain=profile.control.feedforward_gain / scale)
-    limits = replace(profile.limits, torque_ratio=inf)
-    fitted = replace(profile, design_motor=motor, control=control, limits=limits)
-    return fitted if _is_stable(fitted) else with_cautious_controller(fitted)
+    control_settings = replace(
+        profile.control, feedforward_gain=profile.control.feedforward_gain / torque_scale
+    )
+    relaxed_limits = replace(profile.limits, torque_ratio=inf)
+    fitted_profile = replace(
+        profile, design_motor=fitted_motor, control=control_settings, limits=relaxed_limits
+    )
+    return (
+        fitted_profile if _is_stable(fitted_profile) else with_cautious_controller(fitted_profile)
+    )
 
 
 def _is_stable(profile: Profile) -> bool:
@@ -100,8 +108,8 @@ class ProposalRow:
     @property
     def is_below_least(self) -> bool:
         """Whether the estimate is significantly below the smallest allowed value."""
-        lowest = self.least - _SIGNIFICANT_STDS * (self.measured.std or 0.0)
-        return self.least > 0.0 and self.measured.value < lowest
+        smallest_plausible = self.least - _SIGNIFICANT_STDS * (self.measured.std or 0.0)
+        return self.least > 0.0 and self.measured.value < smallest_plausible
 
     @property
     def differs(self) -> bool | None:
@@ -119,11 +127,14 @@ class ProposalRow:
         An estimate insignificantly below the smallest allowed value is replaced by that value.
         """
         std = self.measured.std or 0.0
-        value, deviation = _format_with_std(self.measured.value, std)
-        if not self.is_below_least and float(value) < self.least:
-            value = f"{self.least:g}"
-        name = self.key.rpartition(".")[2]
-        return f'{name} = {{ value = {value}, source = "measured" }}  # ± {deviation} {self.unit}'
+        value_text, std_text = _format_with_std(self.measured.value, std)
+        if not self.is_below_least and float(value_text) < self.least:
+            value_text = f"{self.least:g}"
+        key_name = self.key.rpartition(".")[2]
+        return (
+            f'{key_name} = {{ value = {value_text}, source = "measured" }}  # ± {std_text} '
+            f"{self.unit}"
+        )
 
 
 @dataclass(frozen=True, slots=True)
@@ -139,45 +150,51 @@ class Proposal:
 
     def table(self) -> list[str]:
         """Return the lines of a table that compares estimate and profile."""
-        titles = ("", "measured", "± std", "profile", "source", "")
-        cells = [titles]
+        column_titles = ("", "measured", "± std", "profile", "source", "")
+        table_cells = [column_titles]
         for row in self.rows:
             if row.measured.std is None:
-                value, deviation = "not identifiable", ""
+                value_text, std_text = "not identifiable", ""
             else:
-                value, deviation = _format_with_std(row.measured.value, row.measured.std)
-            verdict = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
-            cells.append(
+                value_text, std_text = _format_with_std(row.measured.value, row.measured.std)
+            verdict_text = {True: "DIFFERS", False: "agrees", None: ""}[row.differs]
+            table_cells.append(
                 (
                     row.key,
-                    f"{value} {row.unit}" if deviation else value,
-                    deviation,
+                    f"{value_text} {row.unit}" if std_text else value_text,
+                    std_text,
                     f"{row.profile_value:g}",
                     row.source,
-                    verdict,
+                    verdict_text,
                 )
             )
-        widths = [max(len(line[column]) for line in cells) for column in range(len(titles))]
-        lines = ("  ".join(c.ljust(w) for c, w in zip(line, widths, strict=True)) for line in cells)
-        return [line.rstrip() for line in lines]
+        column_widths = [
+            max(len(cell_row[column_index]) for cell_row in table_cells)
+            for column_index in range(len(column_titles))
+        ]
+        table_lines = (
+            "  ".join(c.ljust(w) for c, w in zip(cell_row, column_widths, strict=True))
+            for cell_row in table_cells
+        )
+        return [cell_row.rstrip() for cell_row in table_lines]
 
     def toml(self) -> list[str]:
         """Return the lines with the estimates for the profile, under their sections."""
-        lines: list[str] = []
-        section = ""
+        toml_lines: list[str] = []
+        present_section = ""
         for row in self.rows:
             if row.measured.std is None:
                 continue
             row_section = row.key.rpartition(".")[0]
-            if row_section != section:
-                section = row_section
-                lines += [""] * bool(lines) + [f"[{section}]"]
-            lines.append(row.toml())
-        return lines
+            if row_section != present_section:
+                present_section = row_section
+                toml_lines += [""] * bool(toml_lines) + [f"[{present_section}]"]
+            toml_lines.append(row.toml())
+        return toml_lines
 
     def as_dict(self) -> dict[str, Any]:
         """Return the proposal as a JSON document."""
-        scale = self.estimate.torque_scale
+        torque_scale = self.estimate.torque_scale
         return {
             "parameters": {
                 row.key: {
@@ -190,7 +207,7 @@ class Proposal:
                 }
                 for row in self.rows
             },
-            "torque_scale": {"value": scale.value, "std": scale.std},
+            "torque_scale": {"value": torque_scale.value, "std": torque_scale.std},
             "passes": self.estimate.windows,
             "dropped": self.estimate.dropped,
             "misfit": self.estimate.misfit,
@@ -200,7 +217,7 @@ class Proposal:
         }
 
 
-def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> Proposal:
+def propose(estimate: MotorEstimate, profile: Profile, *, unusable_count: int = 0) -> Proposal:
     """Compare a motor's estimate with the profile, and propose new values.
 
     Parameters
@@ -209,23 +226,23 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         Estimate of the profile's motor.
     profile
         Profile for which values are proposed.
-    unusable
+    unusable_count
         Number of passes that were omitted before the estimate.
     """
     rig = profile.rig
-    motor = rig.motor
-    compared: list[tuple[str, MotorQuantity, float]] = [
-        ("motor.inertia_kg_m2", estimate.inertia_kg_m2, motor.inertia_kg_m2),
+    rig_motor = rig.motor
+    compared_numbers: list[tuple[str, MotorQuantity, float]] = [
+        ("motor.inertia_kg_m2", estimate.inertia_kg_m2, rig_motor.inertia_kg_m2),
         (
             "motor.viscous_nm_s_per_rad",
             estimate.viscous_nm_s_per_rad,
-            motor.viscous_nm_s_per_rad,
+            rig_motor.viscous_nm_s_per_rad,
         ),
-        ("motor.coulomb_nm", estimate.coulomb_nm, motor.coulomb_nm),
+        ("motor.coulomb_nm", estimate.coulomb_nm, rig_motor.coulomb_nm),
         (
             "motor.rated_torque_nm",
-            _scaled(motor.rated_torque_nm, estimate.torque_scale),
-            motor.rated_torque_nm,
+            _scaled(rig_motor.rated_torque_nm, estimate.torque_scale),
+            rig_motor.rated_torque_nm,
         ),
         ("actuation.delay_s", estimate.actuation_delay_s, rig.actuation.delay_s),
         (
@@ -238,20 +255,20 @@ def propose(estimate: MotorEstimate, profile: Profile, *, unusable: int = 0) -> 
         # It converts the drive's own rated torque for the comparison: both change by one factor.
         unit_nm = rig.cia402.rated_torque_unit_nm
         key = "cia402.rated_torque_unit_nm"
-        compared.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
+        compared_numbers.append((key, _scaled(unit_nm, estimate.torque_scale), unit_nm))
     torque_at_sync = rig.cia402 is not None and rig.cia402.torque_delivery == "at_sync"
     smallest_values = {"actuation.delay_s": 1 / rig.rate_hz} if torque_at_sync else {}
-    rows = tuple(
+    proposal_rows = tuple(
         ProposalRow(*row, profile.sources.get(row[0], "assumed"), smallest_values.get(row[0], 0.0))
-        for row in compared
+        for row in compared_numbers
     )
-    notes = _notes(estimate, profile, unusable)
-    if any(row.is_below_least for row in rows if row.key in smallest_values):
-        notes.append(
+    operator_notes = _notes(estimate, profile, unusable_count)
+    if any(row.is_below_least for row in proposal_rows if row.key in smallest_values):
+        operator_notes.append(
             "The torque acts before the next SYNC: this drive takes it on arrival, whatever the "
             'type of its RPDO. Set cia402.torque_delivery = "on_arrival" together with the delay.'
         )
-    return Proposal(estimate, rows, tuple(notes))
+    return Proposal(estimate, proposal_rows, tuple(operator_notes))
 
 
 def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
@@ -260,54 +277,55 @@ def _scaled(factor: float, quantity: MotorQuantity) -> MotorQuantity:
     return MotorQuantity(factor * quantity.value, std)
 
 
-def _notes(estimate: MotorEstimate, profile: Profile, unusable: int) -> list[str]:
+def _notes(estimate: MotorEstimate, profile: Profile, unusable_count: int) -> list[str]:
     """Return the sentences for the operator on what the estimate does not determine."""
-    scale = estimate.torque_scale
-    if scale.std is None:
-        notes = [
+    torque_scale = estimate.torque_scale
+    if torque_scale.std is None:
+        operator_notes = [
             "The torque constant is not identifiable: the coupling torque is too small, or follows "
             "the shaft like a rigid inertia (no antenna mounted?). The torque is taken as the "
             "drive states it, and inertia and friction refer to that."
         ]
     else:
-        value, deviation = _format_with_std(scale.value, scale.std)
-        notes = [
-            f"The motor exerts {value} ± {deviation} times the torque commanded, against the "
+        value_text, std_text = _format_with_std(torque_scale.value, torque_scale.std)
+        operator_notes = [
+            f"The motor exerts {value_text} ± {std_text} times the torque commanded, against the "
             "sensor; motor.rated_torque_nm is corrected by that. Inertia and friction refer to the "
             "sensor's N·m: paste all lines together."
         ]
-    notes.append(
+    operator_notes.append(
         "Only the sum of delays from command to angle is known: actuation.delay_s is this sum "
         f"minus encoder.delay_s = {profile.rig.encoder.delay_s:g} s, and sensor.delay_s = "
         f"{profile.rig.sensor.delay_s:g} s is assumed correct."
     )
-    notes.append(
+    operator_notes.append(
         "control.friction_compensation_nm switches the friction feed-forward on; 0 leaves it off."
     )
     if estimate.misfit > _MAX_UNREMARKED_MISFIT:
-        notes.append(
+        operator_notes.append(
             f"The motor's equation leaves {estimate.misfit:.1f} times what scatter explains (up to "
             f"{estimate.friction_departure_nm:.2g} N·m of the mean torque of a pass): friction is "
             "not only viscous and Coulomb, or a delay of the profile is not true. The deviations "
             "are widened for it."
         )
-    omitted = unusable + estimate.dropped
-    if omitted:
-        notes.append(
-            f"{omitted} of {omitted + estimate.windows} passes were left out: {unusable} with "
+    omitted_count = unusable_count + estimate.dropped
+    if omitted_count:
+        operator_notes.append(
+            f"{omitted_count} of {omitted_count + estimate.windows} passes were left out: "
+            f"{unusable_count} with "
             f"missed ticks or held readings, {estimate.dropped} in which the shaft may have stood "
             "still."
         )
-    return notes
+    return operator_notes
 
 
-def _format_with_std(value: float, std: float) -> tuple[str, str]:
+def _format_with_std(estimate_value: float, std: float) -> tuple[str, str]:
     """Format a value and its standard deviation, to two significant digits of the latter."""
     if std <= 0.0:
-        return f"{value:.6g}", "0"
-    exponent = floor(log10(max(abs(value), std)))
-    digits = max(0, exponent - floor(log10(std)) + 1)
+        return f"{estimate_value:.6g}", "0"
+    exponent = floor(log10(max(abs(estimate_value), std)))
+    significant_digits = max(0, exponent - floor(log10(std)) + 1)
     if -3 <= exponent < 4:
-        decimals = max(0, digits - exponent)
-        return f"{value:.{decimals}f}", f"{std:.2g}"
-    return f"{value:.{digits}e}", f"{std:.2g}"
+        decimals = max(0, significant_digits - exponent)
+        return f"{estimate_value:.{decimals}f}", f"{std:.2g}"
+    return f"{estimate_value:.{significant_digits}e}", f"{std:.2g}"

@@ -63,21 +63,24 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
         If a file is of another excitation, its rate or delays are not those of the first, or two
         files have samples in common.
     """
-    windows: list[PassReadings] = []
-    unusable = 0
-    first: tuple[Timing, float] | None = None
+    pass_readings: list[PassReadings] = []
+    unusable_count = 0
+    first_data: tuple[Timing, float] | None = None
     digests: dict[Path, frozenset[bytes]] = {}
-    for session_number, path in enumerate(paths):
-        session = read_session(path)
-        samples = session.samples
-        digest = sample_digests(samples["angle_rad"], samples["coupling_torque_nm"])
-        for other, other_digest in digests.items():
-            if digest & other_digest:
+    for session_number, session_path in enumerate(paths):
+        session = read_session(session_path)
+        sample_records = session.samples
+        tick_digests = sample_digests(
+            sample_records["angle_rad"], sample_records["coupling_torque_nm"]
+        )
+        for other_path, other_digest in digests.items():
+            if tick_digests & other_digest:
                 raise MotorEstimateError(
-                    f"{path}: it has samples of {other}, noise included, which would count twice; "
+                    f"{session_path}: it has samples of {other_path}, noise included, which "
+                    "would count twice; "
                     "give each session once."
                 )
-        digests[path] = digest
+        digests[session_path] = tick_digests
         rig_data = (
             Timing(
                 session.number("rate_hz"),
@@ -87,24 +90,25 @@ def read_recording(paths: Sequence[Path], actuation_delay_s: float) -> Recording
             ),
             session.number("tool_inertia_kg_m2", 0.0),
         )
-        if first is None:
-            first = rig_data
-        if rig_data != first:
+        if first_data is None:
+            first_data = rig_data
+        if rig_data != first_data:
             raise MotorEstimateError(
-                f"{path}: its rate, delays or tool inertia are not those of {paths[0]}; give "
+                f"{session_path}: its rate, delays or tool inertia are not those of "
+                f"{paths[0]}; give "
                 "sessions of one rig."
             )
-        usable, expected = _read_passes(session, session_number, rig_data[0].rate_hz)
-        windows += usable
-        unusable += expected - len(usable)
-    if first is None:
+        usable_passes, pass_count = _read_passes(session, session_number, rig_data[0].rate_hz)
+        pass_readings += usable_passes
+        unusable_count += pass_count - len(usable_passes)
+    if first_data is None:
         raise MotorEstimateError("No session file is given.")
-    if all(window.top_hz == HIGHEST_FREQUENCY_HZ[SPEEDS] for window in windows):
+    if all(pass_window.top_hz == HIGHEST_FREQUENCY_HZ[SPEEDS] for pass_window in pass_readings):
         raise MotorEstimateError(
             "Constant speeds alone do not determine inertia, delay and torque scale; give the "
             f"session {MULTISINE} of the same rig, too."
         )
-    return Recording(windows, *first, unusable)
+    return Recording(pass_readings, *first_data, unusable_count)
 
 
 def _read_passes(
@@ -117,26 +121,31 @@ def _read_passes(
             f"{session.path}: was not recorded by rigd identify motor, so its passes are unknown; "
             "give the files that it wrote."
         )
-    excitation = session.metadata["excitation"]
-    samples = session.samples
-    ticks = samples["tick"].astype(np.int64)
-    is_unusable = (samples["status"] & _UNUSABLE_STATUS) != 0
-    passes = passes_of_schedule(schedule, rate_hz)
-    windows = []
-    for speed_pass in passes:
-        first, end = np.searchsorted(ticks, (speed_pass.first, speed_pass.end)).tolist()
-        if end - first < speed_pass.end - speed_pass.first or is_unusable[first:end].any():
+    excitation_name = session.metadata["excitation"]
+    sample_records = session.samples
+    tick_numbers = sample_records["tick"].astype(np.int64)
+    is_unusable = (sample_records["status"] & _UNUSABLE_STATUS) != 0
+    speed_passes = passes_of_schedule(schedule, rate_hz)
+    pass_readings = []
+    for speed_pass in speed_passes:
+        first_index, end = np.searchsorted(
+            tick_numbers, (speed_pass.first, speed_pass.end)
+        ).tolist()
+        if (
+            end - first_index < speed_pass.end - speed_pass.first
+            or is_unusable[first_index:end].any()
+        ):
             continue
-        window = samples[first:end]
-        windows.append(
+        window_samples = sample_records[first_index:end]
+        pass_readings.append(
             PassReadings(
-                angle_rad=window["angle_rad"],
-                torque_command_nm=window["torque_command_nm"],
-                coupling_torque_nm=window["coupling_torque_nm"],
+                angle_rad=window_samples["angle_rad"],
+                torque_command_nm=window_samples["torque_command_nm"],
+                coupling_torque_nm=window_samples["coupling_torque_nm"],
                 speed_rad_s=speed_pass.speed_rad_s,
-                top_hz=HIGHEST_FREQUENCY_HZ[excitation],
+                top_hz=HIGHEST_FREQUENCY_HZ[excitation_name],
                 session=session_number,
                 key=(session_number, speed_pass.speed_rad_s),
             )
         )
-    return windows, len(passes)
+    return pass_readings, len(speed_passes)

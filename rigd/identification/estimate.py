@@ -83,49 +83,60 @@ class _MotionEquations:
 
 
 def _equations(
-    stack: _MotionRepeats, timing: Timing, delay_s: float, scale: float, unknowns: int
+    motion_repeats: _MotionRepeats,
+    timing: Timing,
+    delay_s: float,
+    torque_scale: float,
+    unknown_count: int,
 ) -> _MotionEquations:
-    """Return the linear equations of a stack, integrated with the test functions.
+    """Return the motor's linear equations for repeats of a motion, integrated with test functions.
 
-    `delay_s` and `scale` are the present estimates of the command's delay and the torque scale.
+    `delay_s` and `torque_scale` are the present estimates of the command's delay and torque scale.
     Times count from the window's first angle.
     """
     period_s = 1.0 / timing.rate_hz
-    repeats, n = stack.angle_rad.shape
+    repeat_count, n = motion_repeats.angle_rad.shape
     length_s = n * period_s
-    bins = int(stack.top_hz * length_s) + 1
-    omega = 2.0 * pi / length_s * np.arange(bins)
+    bin_count = int(motion_repeats.top_hz * length_s) + 1
+    omega = 2.0 * pi / length_s * np.arange(bin_count)
     tick_s: Real = np.arange(n, dtype=np.float64) * period_s
 
-    def transform(weight: Real, signal: Real, shift_s: float) -> Complex:
-        spectrum = np.fft.rfft(weight * signal, axis=-1)[..., :bins]
-        result: Complex = period_s * np.exp(-1j * omega * shift_s) * spectrum
-        return result
+    def transform(window_weight: Real, signal: Real, shift_s: float) -> Complex:
+        spectrum = np.fft.rfft(window_weight * signal, axis=-1)[..., :bin_count]
+        shifted_spectrum: Complex = period_s * np.exp(-1j * omega * shift_s) * spectrum
+        return shifted_spectrum
 
-    angle = stack.angle_rad - stack.angle_rad.mean(axis=1, keepdims=True)
+    angle_rad = motion_repeats.angle_rad - motion_repeats.angle_rad.mean(axis=1, keepdims=True)
     w, w1, w2 = _test_window(tick_s, length_s)
-    angle_0, angle_1, angle_2 = (transform(weight, angle, 0.0) for weight in (w, w1, w2))
-    speed = -(angle_1 - 1j * omega * angle_0)
-    acceleration = angle_2 - 2j * omega * angle_1 - omega**2 * angle_0
-    constant = np.broadcast_to(transform(w, np.ones(n), 0.0), (repeats, bins))
+    angle_0, angle_1, angle_2 = (
+        transform(window_weight, angle_rad, 0.0) for window_weight in (w, w1, w2)
+    )
+    speed_spectrum = -(angle_1 - 1j * omega * angle_0)
+    acceleration_spectrum = angle_2 - 2j * omega * angle_1 - omega**2 * angle_0
+    constant_spectrum = np.broadcast_to(transform(w, np.ones(n), 0.0), (repeat_count, bin_count))
 
     age_s = timing.angle_delay_s - timing.torque_delay_s
-    y = transform(_test_window(tick_s + age_s, length_s)[0], stack.coupling_torque_nm, age_s)
+    y = transform(
+        _test_window(tick_s + age_s, length_s)[0], motion_repeats.coupling_torque_nm, age_s
+    )
 
     # A command lasts a period: it is integrated over the period around its middle.
     command_s = delay_s + 0.5 * period_s
     w, w1, _ = _test_window(tick_s + command_s, length_s)
     hold_response = np.sinc(omega * period_s / (2.0 * pi))
-    command = hold_response * transform(w, stack.torque_command_nm, command_s)
-    slope = hold_response * transform(w1, stack.torque_command_nm, command_s) - 1j * omega * command
+    command_spectrum = hold_response * transform(w, motion_repeats.torque_command_nm, command_s)
+    delay_slope = (
+        hold_response * transform(w1, motion_repeats.torque_command_nm, command_s)
+        - 1j * omega * command_spectrum
+    )
 
-    x = np.zeros((repeats, bins, unknowns), dtype=complex)
-    x[..., SCALE_INDEX] = command
-    x[..., INERTIA_INDEX] = -acceleration
-    x[..., VISCOUS_INDEX] = -speed
-    x[..., COULOMB_INDEX] = -stack.direction * constant
-    x[..., DELAY_INDEX] = scale * slope
-    x[..., ZERO_INDEX + stack.session] = -constant
+    x = np.zeros((repeat_count, bin_count, unknown_count), dtype=complex)
+    x[..., SCALE_INDEX] = command_spectrum
+    x[..., INERTIA_INDEX] = -acceleration_spectrum
+    x[..., VISCOUS_INDEX] = -speed_spectrum
+    x[..., COULOMB_INDEX] = -motion_repeats.direction * constant_spectrum
+    x[..., DELAY_INDEX] = torque_scale * delay_slope
+    x[..., ZERO_INDEX + motion_repeats.session] = -constant_spectrum
     return _MotionEquations(y, x)
 
 
@@ -135,11 +146,11 @@ def _test_window(t: Real, length_s: float) -> tuple[Real, Real, Real]:
     The window is smooth to its third derivative and zero outside of 0 to `length_s`.
     """
     rise_s = _RISE_FRACTION * length_s
-    distance = np.minimum(t, length_s - t)
-    x = np.clip(distance / rise_s, 0.0, 1.0)
-    sign = np.where(t < 0.5 * length_s, 1.0, -1.0)
+    edge_distance_s = np.minimum(t, length_s - t)
+    x = np.clip(edge_distance_s / rise_s, 0.0, 1.0)
+    slope_sign = np.where(t < 0.5 * length_s, 1.0, -1.0)
     w = x**4 * (35.0 - 84.0 * x + 70.0 * x**2 - 20.0 * x**3)
-    w1 = sign * 140.0 * (x * (1.0 - x)) ** 3 / rise_s
+    w1 = slope_sign * 140.0 * (x * (1.0 - x)) ** 3 / rise_s
     w2 = 420.0 * (x * (1.0 - x)) ** 2 * (1.0 - 2.0 * x) / rise_s**2
     return w, w1, w2
 
@@ -179,130 +190,160 @@ class _MotorFit:
 def _fit_equation(
     stacks: Sequence[_MotionRepeats], timing: Timing, *, hold_scale: bool
 ) -> _MotorFit | None:
-    """Return the weighted least-squares fit of all stacks, or None if it does not converge.
+    """Return the weighted fit of the motor's equation to all motions, or None if it diverges.
 
     The fit is iterated for the delay and the weights. Each stack has at least two repeats. With
     `hold_scale` the commanded torque counts as the true one.
     """
-    unknowns = ZERO_INDEX + 1 + max(stack.session for stack in stacks)
-    free = np.arange(unknowns) != SCALE_INDEX if hold_scale else np.full(unknowns, fill_value=True)
-    delay_s, scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
-    weights: list[Real] = []
+    unknown_count = ZERO_INDEX + 1 + max(motion_repeats.session for motion_repeats in stacks)
+    is_free = (
+        np.arange(unknown_count) != SCALE_INDEX
+        if hold_scale
+        else np.full(unknown_count, fill_value=True)
+    )
+    delay_s, torque_scale = timing.actuation_delay_s + timing.angle_delay_s, 1.0
+    bin_weights: list[Real] = []
     for _ in range(_MAX_ITERATIONS):
-        rows = [_equations(stack, timing, delay_s, scale, unknowns) for stack in stacks]
-        weights = weights or [np.ones(row.y.shape[1]) for row in rows]
-        solution = _solve_mean_equations(rows, weights, free)
-        residuals = [row.y - row.x @ solution for row in rows]
+        stack_equations = [
+            _equations(motion_repeats, timing, delay_s, torque_scale, unknown_count)
+            for motion_repeats in stacks
+        ]
+        bin_weights = bin_weights or [np.ones(row.y.shape[1]) for row in stack_equations]
+        solution = _solve_mean_equations(stack_equations, bin_weights, is_free)
+        fit_residuals = [row.y - row.x @ solution for row in stack_equations]
         change_s = float(solution[DELAY_INDEX])
         if abs(change_s) < _DELAY_TOLERANCE_S:
             try:
-                return _finish_fit(rows, weights, residuals, free, solution, delay_s)
+                return _finish_fit(
+                    stack_equations, bin_weights, fit_residuals, is_free, solution, delay_s
+                )
             except np.linalg.LinAlgError:  # an unknown has no effect in the record
                 return None
-        delay_s, scale = delay_s + change_s, float(solution[SCALE_INDEX])
-        if not (abs(delay_s) < _LONGEST_DELAY_S and scale > 0.0):
+        delay_s, torque_scale = delay_s + change_s, float(solution[SCALE_INDEX])
+        if not (abs(delay_s) < _LONGEST_DELAY_S and torque_scale > 0.0):
             return None
-        weights = _inverse_variances(residuals, stacks)
+        bin_weights = _inverse_variances(fit_residuals, stacks)
     return None
 
 
 def _solve_mean_equations(
-    rows: Sequence[_MotionEquations], weights: Sequence[Real], free: NDArray[np.bool_]
+    stack_equations: Sequence[_MotionEquations], weights: Sequence[Real], is_free: NDArray[np.bool_]
 ) -> Real:
     """Return the least-squares solution of the repeats' mean equations.
 
-    The torque scale is 1 if it is not `free`.
+    The torque scale is 1 if it is not `is_free`.
     """
-    solution = np.zeros(free.size)
+    solution = np.zeros(is_free.size)
     solution[SCALE_INDEX] = 1.0
-    matrix, target = [], []
-    for row, weight in zip(rows, weights, strict=True):
-        root = np.sqrt(weight)
+    weighted_blocks, weighted_targets = [], []
+    for row, bin_weights in zip(stack_equations, weights, strict=True):
+        weight_root = np.sqrt(bin_weights)
         x, y = row.x.mean(axis=0), row.y.mean(axis=0)
-        if not free[SCALE_INDEX]:
+        if not is_free[SCALE_INDEX]:
             y = y - x[:, SCALE_INDEX]
-        matrix += [root[:, None] * x[:, free].real, root[:, None] * x[:, free].imag]
-        target += [root * y.real, root * y.imag]
-    columns = np.concatenate(matrix)
-    size = np.maximum(np.linalg.norm(columns, axis=0), np.finfo(float).tiny)
-    solution[free] = np.linalg.lstsq(columns / size, np.concatenate(target), rcond=None)[0] / size
+        weighted_blocks += [
+            weight_root[:, None] * x[:, is_free].real,
+            weight_root[:, None] * x[:, is_free].imag,
+        ]
+        weighted_targets += [weight_root * y.real, weight_root * y.imag]
+    equation_columns = np.concatenate(weighted_blocks)
+    column_norms = np.maximum(np.linalg.norm(equation_columns, axis=0), np.finfo(float).tiny)
+    solution[is_free] = (
+        np.linalg.lstsq(
+            equation_columns / column_norms, np.concatenate(weighted_targets), rcond=None
+        )[0]
+        / column_norms
+    )
     return solution
 
 
 def _inverse_variances(
     residuals: Sequence[Complex], stacks: Sequence[_MotionRepeats]
 ) -> list[Real]:
-    """Return the weights of each stack's mean equations, shape (frequencies,) each.
+    """Return the weights of the mean equations of each motion's repeats, by frequency.
 
     A weight is the inverse variance of the mean of the repeats. The variance of single repeats is
     pooled over the stacks of a session, which have the same noise, and over neighbouring
     frequencies.
     """
     variances: dict[int, Real] = {}
-    for session in {stack.session for stack in stacks}:
-        free_indices = [r for r, s in zip(residuals, stacks, strict=True) if s.session == session]
-        deviations = sum(np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in free_indices)
-        variance = np.asarray(deviations) / sum(len(r) - 1 for r in free_indices)
-        width = min(_SMOOTHED_BINS, variance.size)
-        kernel = np.ones(width)
-        ends = np.convolve(np.ones(variance.size), kernel, "same")
-        variances[session] = np.convolve(variance, kernel, "same") / ends
+    for session_number in {motion_repeats.session for motion_repeats in stacks}:
+        free_indices = [
+            r for r, s in zip(residuals, stacks, strict=True) if s.session == session_number
+        ]
+        repeat_deviations = sum(
+            np.sum(np.abs(r - r.mean(axis=0)) ** 2, axis=0) for r in free_indices
+        )
+        bin_variances = np.asarray(repeat_deviations) / sum(len(r) - 1 for r in free_indices)
+        kernel_width = min(_SMOOTHED_BINS, bin_variances.size)
+        smoothing_kernel = np.ones(kernel_width)
+        edge_counts = np.convolve(np.ones(bin_variances.size), smoothing_kernel, "same")
+        variances[session_number] = (
+            np.convolve(bin_variances, smoothing_kernel, "same") / edge_counts
+        )
     return [
-        len(r) / np.maximum(variances[stack.session], np.finfo(float).tiny)
-        for r, stack in zip(residuals, stacks, strict=True)
+        len(r) / np.maximum(variances[motion_repeats.session], np.finfo(float).tiny)
+        for r, motion_repeats in zip(residuals, stacks, strict=True)
     ]
 
 
 def _finish_fit(
-    rows: Sequence[_MotionEquations],
+    stack_equations: Sequence[_MotionEquations],
     weights: Sequence[Real],
     residuals: Sequence[Complex],
-    free: NDArray[np.bool_],
+    is_free: NDArray[np.bool_],
     solution: Real,
     delay_s: float,
 ) -> _MotorFit:
     """Remove the bias by noise from the solution, and estimate its uncertainty."""
-    free_indices = np.flatnonzero(free)
-    normal = np.zeros((free_indices.size, free_indices.size))
-    bias = np.zeros(free_indices.size)
-    for row, weight, residual in zip(rows, weights, residuals, strict=True):
-        repeats = len(row.y)
+    free_indices = np.flatnonzero(is_free)
+    normal_matrix = np.zeros((free_indices.size, free_indices.size))
+    noise_bias = np.zeros(free_indices.size)
+    for row, bin_weight, bin_residuals in zip(stack_equations, weights, residuals, strict=True):
+        repeat_count = len(row.y)
         x = row.x[..., free_indices]
-        mean = x.mean(axis=0)
-        normal += np.einsum("mp,m,mq->pq", mean.conj(), weight, mean).real
-        deviation = x - mean
-        bias_weight = weight / (repeats * (repeats - 1))
-        bias += np.einsum("rmp,m,rm->p", deviation.conj(), bias_weight, residual).real
-    inverse = np.linalg.inv(normal)
+        mean_equation = x.mean(axis=0)
+        normal_matrix += np.einsum(
+            "mp,m,mq->pq", mean_equation.conj(), bin_weight, mean_equation
+        ).real
+        repeat_deviation = x - mean_equation
+        bias_weight = bin_weight / (repeat_count * (repeat_count - 1))
+        noise_bias += np.einsum(
+            "rmp,m,rm->p", repeat_deviation.conj(), bias_weight, bin_residuals
+        ).real
+    inverse_matrix = np.linalg.inv(normal_matrix)
 
     # Each stack's part in the variance, from the scatter of its repeats' effects on the solution.
-    variance_parts, degrees = [], []
-    squares, term_count = 0.0, 0
+    variance_parts, freedom_degrees = [], []
+    weighted_squares, term_count = 0.0, 0
     departure_nm = 0.0
-    for row, weight, residual in zip(rows, weights, residuals, strict=True):
-        repeats = len(row.y)
-        mean = row.x[..., free_indices].mean(axis=0)
-        effects = np.einsum("mp,m,rm->rp", mean.conj(), weight, residual).real @ inverse
-        variance_parts.append(effects.var(axis=0, ddof=1) / repeats)
-        degrees.append(repeats - 1)
-        mean_residual = residual.mean(axis=0)
-        squares += float(np.sum(weight * np.abs(mean_residual) ** 2))
+    for row, bin_weight, bin_residuals in zip(stack_equations, weights, residuals, strict=True):
+        repeat_count = len(row.y)
+        mean_equation = row.x[..., free_indices].mean(axis=0)
+        noise_effects = (
+            np.einsum("mp,m,rm->rp", mean_equation.conj(), bin_weight, bin_residuals).real
+            @ inverse_matrix
+        )
+        variance_parts.append(noise_effects.var(axis=0, ddof=1) / repeat_count)
+        freedom_degrees.append(repeat_count - 1)
+        mean_residual = bin_residuals.mean(axis=0)
+        weighted_squares += float(np.sum(bin_weight * np.abs(mean_residual) ** 2))
         term_count += mean_residual.size
-        constant = abs(row.x[0, 0, COULOMB_INDEX])
-        departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant))
+        constant_column = abs(row.x[0, 0, COULOMB_INDEX])
+        departure_nm = max(departure_nm, abs(float(mean_residual[0].real)) / float(constant_column))
     parts_of_variance = np.array(variance_parts)
-    variance = parts_of_variance.sum(axis=0)
-    degrees_of_freedom = variance**2 / np.sum(
-        parts_of_variance**2 / np.array(degrees)[:, None], axis=0
+    unknown_variances = parts_of_variance.sum(axis=0)
+    degrees_of_freedom = unknown_variances**2 / np.sum(
+        parts_of_variance**2 / np.array(freedom_degrees)[:, None], axis=0
     )
-    misfit = squares / max(1.0, term_count - 0.5 * free_indices.size)
+    misfit = weighted_squares / max(1.0, term_count - 0.5 * free_indices.size)
     widening = _STD_MARGIN * _student_factor(degrees_of_freedom) * sqrt(max(1.0, misfit))
 
-    values, stds = solution.copy(), np.zeros(free.size)
-    values[free_indices] -= inverse @ bias
-    values[DELAY_INDEX] += delay_s
-    stds[free_indices] = widening * np.sqrt(variance)
-    return _MotorFit(values, stds, misfit, departure_nm)
+    unbiased_values, stds = solution.copy(), np.zeros(is_free.size)
+    unbiased_values[free_indices] -= inverse_matrix @ noise_bias
+    unbiased_values[DELAY_INDEX] += delay_s
+    stds[free_indices] = widening * np.sqrt(unknown_variances)
+    return _MotorFit(unbiased_values, stds, misfit, departure_nm)
 
 
 def _student_factor(degrees_of_freedom: Real) -> Real:
@@ -420,58 +461,65 @@ def estimate_motor(
     MotorEstimateError
         If there are too few windows, or the fit does not converge.
     """
-    moving = [window for window in windows if _moves_throughout(window, timing.rate_hz)]
-    stacks = _group_repeats(moving, len(windows))
-    fit = _fit_equation(stacks, timing, hold_scale=False)
-    scale_known = (
+    moving_windows = [
+        pass_readings
+        for pass_readings in windows
+        if _moves_throughout(pass_readings, timing.rate_hz)
+    ]
+    repeat_stacks = _group_repeats(moving_windows, len(windows))
+    fit = _fit_equation(repeat_stacks, timing, hold_scale=False)
+    is_scale_known = (
         fit is not None
         and fit.stds[SCALE_INDEX] < _MAX_SCALE_STD
         and _PLAUSIBLE_SCALES[0] < fit.values[SCALE_INDEX] < _PLAUSIBLE_SCALES[1]
     )
-    if not scale_known:
-        fit = _fit_equation(stacks, timing, hold_scale=True)
+    if not is_scale_known:
+        fit = _fit_equation(repeat_stacks, timing, hold_scale=True)
     if fit is None:
         raise MotorEstimateError(
             "The motor's data are not identifiable from the record: the fit does not converge. "
             "Check actuation.delay_s of the profile, from which the search begins, and the "
             "record."
         )
-    values, stds = fit.values, fit.stds
-    inertia = float(values[INERTIA_INDEX])
-    if inertia <= 0.0:
+    fitted_values, stds = fit.values, fit.stds
+    inertia_kg_m2 = float(fitted_values[INERTIA_INDEX])
+    if inertia_kg_m2 <= 0.0:
         raise MotorEstimateError(
-            f"The fit ends at an inertia of {inertia:.3g} kg·m²: the record does not show the "
+            f"The fit ends at an inertia of {inertia_kg_m2:.3g} kg·m²: the record does not "
+            "show the "
             "motor's own motion. Check sensor.projection, encoder.delay_s and sensor.delay_s."
         )
-    torque_jump_fraction = tool_inertia_kg_m2 / (inertia + tool_inertia_kg_m2)
+    torque_jump_fraction = tool_inertia_kg_m2 / (inertia_kg_m2 + tool_inertia_kg_m2)
     jump_std_s = torque_jump_fraction / timing.rate_hz / sqrt(12.0)
     return MotorEstimate(
-        inertia_kg_m2=MotorQuantity(inertia, float(stds[INERTIA_INDEX])),
+        inertia_kg_m2=MotorQuantity(inertia_kg_m2, float(stds[INERTIA_INDEX])),
         viscous_nm_s_per_rad=MotorQuantity(
-            float(values[VISCOUS_INDEX]), float(stds[VISCOUS_INDEX])
+            float(fitted_values[VISCOUS_INDEX]), float(stds[VISCOUS_INDEX])
         ),
-        coulomb_nm=MotorQuantity(float(values[COULOMB_INDEX]), float(stds[COULOMB_INDEX])),
+        coulomb_nm=MotorQuantity(float(fitted_values[COULOMB_INDEX]), float(stds[COULOMB_INDEX])),
         torque_scale=MotorQuantity(
-            float(values[SCALE_INDEX]), float(stds[SCALE_INDEX]) if scale_known else None
+            float(fitted_values[SCALE_INDEX]), float(stds[SCALE_INDEX]) if is_scale_known else None
         ),
         actuation_delay_s=MotorQuantity(
-            float(values[DELAY_INDEX]) - timing.angle_delay_s,
+            float(fitted_values[DELAY_INDEX]) - timing.angle_delay_s,
             sqrt(float(stds[DELAY_INDEX]) ** 2 + jump_std_s**2),
         ),
-        windows=len(moving),
-        dropped=len(windows) - len(moving),
+        windows=len(moving_windows),
+        dropped=len(windows) - len(moving_windows),
         misfit=fit.misfit,
         friction_departure_nm=fit.friction_departure_nm,
     )
 
 
-def _moves_throughout(window: PassReadings, rate_hz: float) -> bool:
+def _moves_throughout(pass_readings: PassReadings, rate_hz: float) -> bool:
     """Return whether the shaft moves in the nominal direction during the whole window."""
     half_ticks = max(1, round(_HALF_SPEED_WINDOW_S * rate_hz))
-    angle = window.angle_rad
-    speed = (angle[2 * half_ticks :] - angle[: -2 * half_ticks]) * rate_hz / (2 * half_ticks)
-    forward_speed = speed * np.sign(window.speed_rad_s)
-    return bool(np.min(forward_speed) > _MIN_SPEED_FRACTION * abs(window.speed_rad_s))
+    angle_rad = pass_readings.angle_rad
+    speed_rad_s = (
+        (angle_rad[2 * half_ticks :] - angle_rad[: -2 * half_ticks]) * rate_hz / (2 * half_ticks)
+    )
+    forward_speed_rad_s = speed_rad_s * np.sign(pass_readings.speed_rad_s)
+    return bool(np.min(forward_speed_rad_s) > _MIN_SPEED_FRACTION * abs(pass_readings.speed_rad_s))
 
 
 def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_MotionRepeats]:
@@ -479,27 +527,33 @@ def _group_repeats(windows: Sequence[PassReadings], window_count: int) -> list[_
 
     `window_count` is the number of windows before those with a standstill were removed.
     """
-    groups: dict[Hashable, list[PassReadings]] = {}
-    for window in windows:
-        groups.setdefault(window.key, []).append(window)
-    complete_groups = [group for group in groups.values() if len(group) >= LEAST_REPEATS]
-    if {np.sign(group[0].speed_rad_s) for group in complete_groups} != {1.0, -1.0}:
+    window_groups: dict[Hashable, list[PassReadings]] = {}
+    for pass_readings in windows:
+        window_groups.setdefault(pass_readings.key, []).append(pass_readings)
+    complete_groups = [
+        repeat_group
+        for repeat_group in window_groups.values()
+        if len(repeat_group) >= LEAST_REPEATS
+    ]
+    if {np.sign(repeat_group[0].speed_rad_s) for repeat_group in complete_groups} != {1.0, -1.0}:
         raise MotorEstimateError(
             f"Too few passes: {len(windows)} of {window_count} have neither gaps nor a standstill, "
             f"but an estimate takes at least {LEAST_REPEATS} of the same kind in each direction."
         )
-    sessions = {
-        number: index
-        for index, number in enumerate(sorted({g[0].session for g in complete_groups}))
+    session_indices = {
+        session_number: session_index
+        for session_index, session_number in enumerate(
+            sorted({g[0].session for g in complete_groups})
+        )
     }
     return [
         _MotionRepeats(
-            np.array([window.angle_rad for window in group]),
-            np.array([window.torque_command_nm for window in group]),
-            np.array([window.coupling_torque_nm for window in group]),
-            float(np.sign(group[0].speed_rad_s)),
-            group[0].top_hz,
-            sessions[group[0].session],
+            np.array([pass_readings.angle_rad for pass_readings in repeat_group]),
+            np.array([pass_readings.torque_command_nm for pass_readings in repeat_group]),
+            np.array([pass_readings.coupling_torque_nm for pass_readings in repeat_group]),
+            float(np.sign(repeat_group[0].speed_rad_s)),
+            repeat_group[0].top_hz,
+            session_indices[repeat_group[0].session],
         )
-        for group in complete_groups
+        for repeat_group in complete_groups
     ]

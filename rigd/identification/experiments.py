@@ -115,19 +115,21 @@ def passes_of_schedule(schedule: PassSchedule, rate_hz: float) -> list[SpeedPass
     rate_hz
         Rate of the samples.
     """
-    turn_ticks, settle_ticks, window = (
+    turn_ticks, settle_ticks, window_ticks = (
         round(time_s * rate_hz)
         for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
-    passes = []
-    for cycle in range(schedule.cycles):
-        for speed in schedule.speeds_rad_s:
-            for signed_speed in (speed, -speed):
-                tick += turn_ticks + settle_ticks
-                passes.append(SpeedPass(tick, tick + window, signed_speed, cycle))
-                tick += window
-    return passes
+    start_tick = round(schedule.rest_s * rate_hz) + round(schedule.approach_s * rate_hz)
+    speed_passes = []
+    for cycle_number in range(schedule.cycles):
+        for relative_speed in schedule.speeds_rad_s:
+            for signed_speed in (relative_speed, -relative_speed):
+                start_tick += turn_ticks + settle_ticks
+                speed_passes.append(
+                    SpeedPass(start_tick, start_tick + window_ticks, signed_speed, cycle_number)
+                )
+                start_tick += window_ticks
+    return speed_passes
 
 
 def trial_session(profile: Profile, *, torque_percent: float, stroke_rad: float) -> Excitation:
@@ -176,17 +178,19 @@ def _multisine_excitation(
 ) -> Excitation:
     """Return the excitation `TRIAL` or `MULTISINE`: passes with a multisine."""
     limit_nm = _torque_limit(profile, torque_percent)
-    loop = close_loop(profile.loop_model())
-    schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
-    passes_rad = _passes_reference(schedule, profile)
-    multisine = _multisine_reference(schedule, loop, _SPEED_MODULATION[excitation_name])
-    passes_nm = _peak_torque(loop, passes_rad)
-    peak_nm = _peak_torque(loop, passes_rad + multisine)
-    fraction = 1.0
+    closed_loop = close_loop(profile.loop_model())
+    pass_schedule = _fit_schedule(excitation_name, (1.0,), profile, stroke_rad)
+    passes_rad = _passes_reference(pass_schedule, profile)
+    multisine_rad = _multisine_reference(
+        pass_schedule, closed_loop, _SPEED_MODULATION[excitation_name]
+    )
+    passes_nm = _peak_torque(closed_loop, passes_rad)
+    peak_nm = _peak_torque(closed_loop, passes_rad + multisine_rad)
+    multisine_fraction = 1.0
     if peak_nm > limit_nm:
         # The peak is a convex function of the fraction, below the straight line between the two.
-        fraction = (limit_nm - passes_nm) / (peak_nm - passes_nm)
-    if fraction < _MIN_MULTISINE_FRACTION:
+        multisine_fraction = (limit_nm - passes_nm) / (peak_nm - passes_nm)
+    if multisine_fraction < _MIN_MULTISINE_FRACTION:
         needed_nm = passes_nm + _MIN_MULTISINE_FRACTION * (peak_nm - passes_nm)
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: of {limit_nm:.3g} N·m the passes alone take "
@@ -195,10 +199,10 @@ def _multisine_excitation(
         )
     return _checked_excitation(
         excitation_name,
-        schedule,
+        pass_schedule,
         profile,
-        loop,
-        passes_rad + fraction * multisine,
+        closed_loop,
+        passes_rad + multisine_fraction * multisine_rad,
         torque_percent,
         stroke_rad,
     )
@@ -222,10 +226,10 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
         If the profile's loop cannot be closed.
     """
     limit_nm = _torque_limit(profile, torque_percent)
-    loop = close_loop(profile.loop_model())
-    schedule = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
-    reference = _passes_reference(schedule, profile)
-    peak_nm = _peak_torque(loop, reference)
+    closed_loop = close_loop(profile.loop_model())
+    pass_schedule = _fit_schedule(SPEEDS, _RELATIVE_SPEEDS, profile, stroke_rad)
+    reference_rad = _passes_reference(pass_schedule, profile)
+    peak_nm = _peak_torque(closed_loop, reference_rad)
     if peak_nm > limit_nm:
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: the turns take {peak_nm:.3g} N·m and only "
@@ -233,7 +237,7 @@ def speeds_session(profile: Profile, *, torque_percent: float, stroke_rad: float
             f"{_rounded_percent(profile, peak_nm)} % or a shorter --stroke-rad."
         )
     return _checked_excitation(
-        SPEEDS, schedule, profile, loop, reference, torque_percent, stroke_rad
+        SPEEDS, pass_schedule, profile, closed_loop, reference_rad, torque_percent, stroke_rad
     )
 
 
@@ -242,9 +246,9 @@ def read_schedule(metadata: Mapping[str, str]) -> PassSchedule | None:
     if metadata.get("excitation") not in HIGHEST_FREQUENCY_HZ:
         return None
     try:
-        speeds = tuple(float(text) for text in metadata["speeds_rad_s"].split())
-        times = {name: float(metadata[name]) for name in _DURATION_FIELDS}
-        return PassSchedule(speeds, int(metadata["cycles"]), **times)
+        speeds_rad_s = tuple(float(speed_text) for speed_text in metadata["speeds_rad_s"].split())
+        durations_s = {field_name: float(metadata[field_name]) for field_name in _DURATION_FIELDS}
+        return PassSchedule(speeds_rad_s, int(metadata["cycles"]), **durations_s)
     except (KeyError, ValueError):
         return None
 
@@ -254,7 +258,7 @@ _DURATION_FIELDS = ("rest_s", "approach_s", "turn_s", "settle_s", "window_s", "e
 
 
 def _torque_limit(profile: Profile, torque_percent: float) -> float:
-    """Return the allowed torque in N·m, or raise ExcitationError if the percentage is invalid."""
+    """Return the allowed motor torque in N·m; raise ExcitationError for an invalid percentage."""
     if not 0.0 < torque_percent <= 100.0:
         raise ExcitationError(
             f"--torque-percent {torque_percent:g}: must be more than 0 and at most 100 % of the "
@@ -281,107 +285,133 @@ def _fit_schedule(
             f"--stroke-rad {stroke_rad:g}: must be more than 0 and at most limits.angle_rad = "
             f"{limits.angle_rad:g} rad."
         )
-    cycles = _CYCLE_COUNTS[excitation_name]
+    cycle_count = _CYCLE_COUNTS[excitation_name]
     travel_s = float(np.ptp(_passes_path(PassSchedule(relative_speeds, 1), profile.rig.rate_hz)))
-    speed = min(
+    fastest_rad_s = min(
         _MAX_SPEED_RAD_S,
         _SPEED_LIMIT_FRACTION * limits.velocity_rad_s,
         2 * _STROKE_FRACTION * stroke_rad / travel_s,
     )
-    return PassSchedule(tuple(fraction * speed for fraction in relative_speeds), cycles)
+    return PassSchedule(
+        tuple(relative_speed * fastest_rad_s for relative_speed in relative_speeds), cycle_count
+    )
 
 
 def _passes_path(schedule: PassSchedule, rate_hz: float) -> Real:
     """Return the angle in rad during all passes; it begins at 0 at the end of the approach."""
-    turn_ticks, settle_ticks, window = (
+    turn_ticks, settle_ticks, window_ticks = (
         round(time_s * rate_hz)
         for time_s in (schedule.turn_s, schedule.settle_s, schedule.window_s)
     )
-    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
-    segments: list[Real] = []
-    previous = 0.0
-    for speed in [s for v in schedule.speeds_rad_s for s in (v, -v)] * schedule.cycles:
-        segments.append(previous + (speed - previous) * change)
-        segments.append(np.full(settle_ticks + window, speed))
-        previous = speed
-    segments.append(previous * (1.0 - change))
-    speeds = np.concatenate(segments)
-    path: Real = np.concatenate([[0.0], np.cumsum(0.5 * (speeds[1:] + speeds[:-1]))]) / rate_hz
-    return path
+    speed_rise = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
+    speed_segments: list[Real] = []
+    previous_speed = 0.0
+    for pass_speed in [s for v in schedule.speeds_rad_s for s in (v, -v)] * schedule.cycles:
+        speed_segments.append(previous_speed + (pass_speed - previous_speed) * speed_rise)
+        speed_segments.append(np.full(settle_ticks + window_ticks, pass_speed))
+        previous_speed = pass_speed
+    speed_segments.append(previous_speed * (1.0 - speed_rise))
+    speed_samples = np.concatenate(speed_segments)
+    path_rad: Real = (
+        np.concatenate([[0.0], np.cumsum(0.5 * (speed_samples[1:] + speed_samples[:-1]))]) / rate_hz
+    )
+    return path_rad
 
 
 def _passes_reference(schedule: PassSchedule, profile: Profile) -> Real:
     """Return the reference angle in rad without a multisine: rest, approach, passes, end."""
     rate_hz = profile.rig.rate_hz
-    path = _passes_path(schedule, rate_hz)
-    path -= 0.5 * (path.max() + path.min())
-    rest_ticks, approach_ticks, end = (
+    path_rad = _passes_path(schedule, rate_hz)
+    path_rad -= 0.5 * (path_rad.max() + path_rad.min())
+    rest_ticks, approach_ticks, end_ticks = (
         round(time_s * rate_hz) for time_s in (schedule.rest_s, schedule.approach_s, schedule.end_s)
     )
-    approach_rad = path[0] * _smooth_rise(np.arange(approach_ticks) / approach_ticks)
-    reference = np.concatenate([np.zeros(rest_ticks), approach_rad, path, np.full(end, path[-1])])
-    _add_offsets(reference, schedule, profile)
-    return reference
+    approach_rad = path_rad[0] * _smooth_rise(np.arange(approach_ticks) / approach_ticks)
+    reference_rad = np.concatenate(
+        [np.zeros(rest_ticks), approach_rad, path_rad, np.full(end_ticks, path_rad[-1])]
+    )
+    _add_offsets(reference_rad, schedule, profile)
+    return reference_rad
 
 
-def _add_offsets(reference: Real, schedule: PassSchedule, profile: Profile) -> None:
-    """Add to each cycle of a reference its own offset of some encoder steps.
+def _add_offsets(reference_rad: Real, schedule: PassSchedule, profile: Profile) -> None:
+    """Add to each cycle of a reference angle its own offset of some encoder steps, in place.
 
     The offset changes in the turn before the cycle.
     """
     rate_hz = profile.rig.rate_hz
     turn_ticks = round(schedule.turn_s * rate_hz)
-    previous = round((schedule.turn_s + schedule.settle_s) * rate_hz)
-    change = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
-    offset = 0.0
+    previous_first = round((schedule.turn_s + schedule.settle_s) * rate_hz)
+    offset_rise = _smooth_rise(np.arange(turn_ticks) / turn_ticks)
+    offset_rad = 0.0
     last_cycle = -1
     for speed_pass in passes_of_schedule(schedule, rate_hz):
         if speed_pass.cycle == last_cycle:
             continue
         last_cycle = speed_pass.cycle
-        fraction = _GOLDEN_FRACTION * (last_cycle + 1)
-        next_offset = (
-            _OFFSET_STEPS * profile.rig.encoder.resolution_rad * (fraction - floor(fraction) - 0.5)
+        cycle_fraction = _GOLDEN_FRACTION * (last_cycle + 1)
+        next_offset_rad = (
+            _OFFSET_STEPS
+            * profile.rig.encoder.resolution_rad
+            * (cycle_fraction - floor(cycle_fraction) - 0.5)
         )
-        first_sample = speed_pass.first - previous
-        reference[first_sample : first_sample + turn_ticks] += (next_offset - offset) * change
-        reference[first_sample + turn_ticks :] += next_offset - offset
-        offset = next_offset
+        first_sample = speed_pass.first - previous_first
+        reference_rad[first_sample : first_sample + turn_ticks] += (
+            next_offset_rad - offset_rad
+        ) * offset_rise
+        reference_rad[first_sample + turn_ticks :] += next_offset_rad - offset_rad
+        offset_rad = next_offset_rad
 
 
-def _multisine_reference(schedule: PassSchedule, loop: ClosedLoop, modulation: float) -> Real:
+def _multisine_reference(
+    schedule: PassSchedule, closed_loop: ClosedLoop, modulation: float
+) -> Real:
     """Return the reference angle in rad of the multisine alone.
 
     The response of the loop to it changes the speed of the passes by the fraction `modulation`.
     """
-    rate_hz = loop.model.rate_hz
-    window = round(schedule.window_s * rate_hz)
-    step_hz = rate_hz / window
-    numbers = np.arange(
+    rate_hz = closed_loop.model.rate_hz
+    window_ticks = round(schedule.window_s * rate_hz)
+    step_hz = rate_hz / window_ticks
+    harmonic_numbers = np.arange(
         ceil(_MULTISINE_BAND_HZ[0] / step_hz), floor(_MULTISINE_BAND_HZ[1] / step_hz) + 1
     )
-    frequency_hz = numbers.astype(np.float64) * step_hz
-    phase = -pi * np.arange(numbers.size) * np.arange(1, numbers.size + 1) / numbers.size
-    speed = np.zeros(window // 2 + 1, dtype=complex)
-    speed[numbers] = np.exp(1j * phase)
-    peak = float(np.max(np.abs(np.fft.irfft(speed, window))))
-    speed *= modulation * schedule.speeds_rad_s[0] / peak
-    spectrum = np.zeros_like(speed)
-    spectrum[numbers] = speed[numbers] / (2j * pi * frequency_hz) / loop.response(frequency_hz)
-    period = np.fft.irfft(spectrum, window)
+    frequency_hz = harmonic_numbers.astype(np.float64) * step_hz
+    phases_rad = (
+        -pi
+        * np.arange(harmonic_numbers.size)
+        * np.arange(1, harmonic_numbers.size + 1)
+        / harmonic_numbers.size
+    )
+    speed_spectrum = np.zeros(window_ticks // 2 + 1, dtype=complex)
+    speed_spectrum[harmonic_numbers] = np.exp(1j * phases_rad)
+    peak_speed = float(np.max(np.abs(np.fft.irfft(speed_spectrum, window_ticks))))
+    speed_spectrum *= modulation * schedule.speeds_rad_s[0] / peak_speed
+    reference_spectrum = np.zeros_like(speed_spectrum)
+    reference_spectrum[harmonic_numbers] = (
+        speed_spectrum[harmonic_numbers]
+        / (2j * pi * frequency_hz)
+        / closed_loop.response(frequency_hz)
+    )
+    period_rad = np.fft.irfft(reference_spectrum, window_ticks)
 
     turn_ticks, settle_ticks = round(schedule.turn_s * rate_hz), round(schedule.settle_s * rate_hz)
     half_turn_ticks = turn_ticks // 2
-    rise = _smooth_rise(np.arange(half_turn_ticks) / half_turn_ticks)
-    envelope = np.concatenate([rise, np.ones(settle_ticks + window), 1.0 - rise])
-    windowed = np.resize(np.roll(period, half_turn_ticks + settle_ticks), envelope.size) * envelope
-    passes = passes_of_schedule(schedule, rate_hz)
-    sample_count = passes[-1].end + turn_ticks + round(schedule.end_s * rate_hz)
-    reference = np.zeros(sample_count)
-    for speed_pass in passes:
+    rise_samples = _smooth_rise(np.arange(half_turn_ticks) / half_turn_ticks)
+    envelope_samples = np.concatenate(
+        [rise_samples, np.ones(settle_ticks + window_ticks), 1.0 - rise_samples]
+    )
+    windowed_rad = (
+        np.resize(np.roll(period_rad, half_turn_ticks + settle_ticks), envelope_samples.size)
+        * envelope_samples
+    )
+    speed_passes = passes_of_schedule(schedule, rate_hz)
+    sample_count = speed_passes[-1].end + turn_ticks + round(schedule.end_s * rate_hz)
+    reference_rad = np.zeros(sample_count)
+    for speed_pass in speed_passes:
         first_sample = speed_pass.first - settle_ticks - half_turn_ticks
-        reference[first_sample : first_sample + windowed.size] += windowed
-    return reference
+        reference_rad[first_sample : first_sample + windowed_rad.size] += windowed_rad
+    return reference_rad
 
 
 def _smooth_rise(x: Real) -> Real:
@@ -392,34 +422,34 @@ def _smooth_rise(x: Real) -> Real:
     return x**3 * (10.0 - 15.0 * x + 6.0 * x**2)
 
 
-def _peak_torque(loop: ClosedLoop, reference: Real) -> float:
-    """Return the largest predicted torque in N·m of a reference."""
-    return float(np.max(np.abs(loop.simulate(reference).torque_nm)))
+def _peak_torque(closed_loop: ClosedLoop, reference_rad: Real) -> float:
+    """Return the motor's largest predicted torque in N·m for a reference angle in rad."""
+    return float(np.max(np.abs(closed_loop.simulate(reference_rad).torque_nm)))
 
 
 def _checked_excitation(
     excitation_name: str,
     schedule: PassSchedule,
     profile: Profile,
-    loop: ClosedLoop,
-    reference: Real,
+    closed_loop: ClosedLoop,
+    reference_rad: Real,
     torque_percent: float,
     stroke_rad: float,
 ) -> Excitation:
-    """Return the excitation with a reference, or raise if its predicted angle is too large."""
-    peak_rad = float(np.max(np.abs(loop.simulate(reference).angle_rad)))
+    """Return the excitation with a reference; raise ExcitationError if its angle is too large."""
+    peak_rad = float(np.max(np.abs(closed_loop.simulate(reference_rad).angle_rad)))
     if peak_rad > stroke_rad:
         raise ExcitationError(
             f"--stroke-rad {stroke_rad:g}: the predicted peak angle is {peak_rad:.3g} rad; allow "
             "more."
         )
     rate_hz = profile.rig.rate_hz
-    reference.flags.writeable = False
+    reference_rad.flags.writeable = False
     rest_ticks = round(schedule.rest_s * rate_hz)
-    end = reference.size - round(schedule.end_s * rate_hz)
-    parameters = {
+    end = reference_rad.size - round(schedule.end_s * rate_hz)
+    stored_parameters = {
         **asdict(schedule),
-        "speeds_rad_s": " ".join(repr(speed) for speed in schedule.speeds_rad_s),
+        "speeds_rad_s": " ".join(repr(speed_rad_s) for speed_rad_s in schedule.speeds_rad_s),
         "torque_percent": torque_percent,
         "stroke_rad": stroke_rad,
         # Settings of the controller, which differ from the profile's file after the trial.
@@ -428,9 +458,9 @@ def _checked_excitation(
         "control_pole_rad_s": profile.control.pole_rad_s,
         "control_feedforward_gain": profile.control.feedforward_gain,
     }
-    segments = {
+    segment_ticks = {
         "rest": (0, rest_ticks),
         "sweep": (rest_ticks, end),
-        "ring_down": (end, reference.size),
+        "ring_down": (end, reference_rad.size),
     }
-    return Excitation(excitation_name, parameters, rate_hz, reference, segments)
+    return Excitation(excitation_name, stored_parameters, rate_hz, reference_rad, segment_ticks)

@@ -31,7 +31,7 @@ It corresponds to 10 s at the publisher's 20 polls per second."""
 
 
 class DrawingStream:
-    """Sends the drawings of successive sessions to the present Rerun server.
+    """Sends what the live view draws of successive sessions to the present Rerun server.
 
     Parameters
     ----------
@@ -58,20 +58,20 @@ class DrawingStream:
         self.connections = 0
         self.stalled = False
 
-    def begin(self, recording_id: str, frame: "Callable[[], Iterable[Drawing]]") -> None:
-        """Start a new recording, to which viewers switch.
+    def begin(self, recording_id: str, frame_drawings: "Callable[[], Iterable[Drawing]]") -> None:
+        """Start a new Rerun recording for a session; open viewers switch to it.
 
         Parameters
         ----------
         recording_id
             Identifier of the recording.
-        frame
+        frame_drawings
             Function that returns the first drawings of each connection.
         """
-        self._recording_id, self._frame = recording_id, frame
+        self._recording_id, self._frame = recording_id, frame_drawings
 
     def ready(self) -> bool:
-        """Connect to the server if necessary, and return whether it accepts drawings now."""
+        """Connect to the Rerun server if necessary, and return whether it accepts drawings now."""
         if not self._server_program.poll():
             self._discard()
             return False
@@ -91,14 +91,14 @@ class DrawingStream:
         return self._stream is not None and not self.stalled
 
     def send(self, drawings: "Iterable[Drawing]") -> bool:
-        """Send drawings, and return whether the connection still exists.
+        """Send drawings to the viewers, and return whether the server's connection still exists.
 
         If the server stalls, the SDK buffers the drawings until it recovers.
         """
         if self._stream is None:
             return False
-        for draw in drawings:
-            draw(self._stream)
+        for draw_item in drawings:
+            draw_item(self._stream)
         self._flush(_FLUSH_TIMEOUT_S)
         return self._stream is not None
 
@@ -128,19 +128,23 @@ class DrawingStream:
             self._stalled_polls = 0
 
     def _close(self) -> None:
-        """Close the stream, which has sent all its drawings."""
+        """Close the connection to the Rerun server after all drawings were sent."""
         assert self._stream is not None
         # The SDK's clean-up would wait for streams that are still closing, and they for it.
-        release = not any(thread.is_alive() for thread in self._closing_threads)
-        _in_background(_close_stream, [self._stream], release)
+        releases_resources = not any(
+            closing_thread.is_alive() for closing_thread in self._closing_threads
+        )
+        _in_background(_close_stream, [self._stream], releases_resources)
         self._stream = None
 
     def _discard(self) -> None:
-        """Close the stream after its server has ended or was replaced."""
+        """Close the connection to a Rerun server that has ended or was replaced."""
         if self._stream is not None:
             # In the background, because the SDK tries to reach the server for up to 10 s.
             self._closing_threads = [
-                thread for thread in self._closing_threads if thread.is_alive()
+                closing_thread
+                for closing_thread in self._closing_threads
+                if closing_thread.is_alive()
             ]
             self._closing_threads.append(_in_background(_close_stream, [self._stream], False))
         self._stream = None
@@ -148,19 +152,21 @@ class DrawingStream:
         self._stalled_polls = 0
 
     def _connect(self) -> None:
-        """Connect to the present server, and send the frame of the scene."""
+        """Connect to the present server, and send the drawings that every viewer needs first."""
         import rerun as rr
 
-        address = self._server_program.address
-        assert address is not None
-        self._stream = stream = rr.RecordingStream(APPLICATION_ID, recording_id=self._recording_id)
-        stream.connect_grpc(address.proxy_url)
-        self._server = address.server
+        server_address = self._server_program.address
+        assert server_address is not None
+        self._stream = rerun_stream = rr.RecordingStream(
+            APPLICATION_ID, recording_id=self._recording_id
+        )
+        rerun_stream.connect_grpc(server_address.proxy_url)
+        self._server = server_address.server
         self.connections += 1
         has_layout = self._server_with_layout == self._server
-        target: Any = _StreamWithoutLayout(stream) if has_layout else stream
-        for draw in self._frame():
-            draw(target)
+        drawing_target: Any = _StreamWithoutLayout(rerun_stream) if has_layout else rerun_stream
+        for draw_item in self._frame():
+            draw_item(drawing_target)
         self._flush(_FLUSH_TIMEOUT_S)
         if self._stream is not None:
             self._server_with_layout = self._server
@@ -185,13 +191,13 @@ class _StreamWithoutLayout:
 
 def _in_background(function: Callable[..., None], *arguments: object) -> threading.Thread:
     """Start a function in a daemon thread, and return the thread."""
-    thread = threading.Thread(target=function, args=arguments, daemon=True)
-    thread.start()
-    return thread
+    new_thread = threading.Thread(target=function, args=arguments, daemon=True)
+    new_thread.start()
+    return new_thread
 
 
 def _close_stream(streams: "list[RecordingStream]", release: bool) -> None:
-    """Disconnect the stream in a list and drop its last reference.
+    """Disconnect the Rerun stream in a list of one, and remove it from the list.
 
     With `release` the SDK also releases the stream's resources.
     """

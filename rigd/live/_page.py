@@ -178,13 +178,13 @@ class _PageServer(ThreadingHTTPServer):
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:  # noqa: ANN401
         """Serve a connection, and close it if it lasts too long."""
-        timer = threading.Timer(_MAX_CONNECTION_S, _shut_down, (request,))
-        timer.daemon = True
-        timer.start()
+        deadline_timer = threading.Timer(_MAX_CONNECTION_S, _close_connection, (request,))
+        deadline_timer.daemon = True
+        deadline_timer.start()
         try:
             super().process_request_thread(request, client_address)
         finally:
-            timer.cancel()
+            deadline_timer.cancel()
             self.free_connections.release()
 
     def handle_error(self, request: object, client_address: object) -> None:
@@ -199,8 +199,8 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def do_GET(self) -> None:
         """Send the requested document, or refuse a request under another host name."""
-        host = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
-        if host in _PERMITTED_HOSTS:
+        host_name = self.headers.get("Host", "").rpartition(":")[0] or self.headers.get("Host", "")
+        if host_name in _PERMITTED_HOSTS:
             self._send_document()
         else:
             self._send_text(HTTPStatus.FORBIDDEN, f"Open this page as http://{LOOPBACK}:PORT.")
@@ -211,41 +211,41 @@ class _PageHandler(BaseHTTPRequestHandler):
     def _send_document(self) -> None:
         """Send the requested document, a redirection, or an error."""
         url = urllib.parse.urlsplit(self.path)
-        name, address = url.path.lstrip("/"), self.server.address()
-        if name not in _SERVED_FILES:
+        document_name, address = url.path.lstrip("/"), self.server.address()
+        if document_name not in _SERVED_FILES:
             self._send_text(HTTPStatus.NOT_FOUND, "Not found.")
         elif address is None:
             self._send_retry()
-        elif name == _STATE_DOCUMENT:
+        elif document_name == _STATE_DOCUMENT:
             self._send(json.dumps({"server": address.server}).encode(), "application/json")
-        elif not name and "url" not in urllib.parse.parse_qs(url.query):
+        elif not document_name and "url" not in urllib.parse.parse_qs(url.query):
             # Relative, because the browser may use a tunnel on another port.
             self.send_response(HTTPStatus.FOUND)
             self.send_header("Location", f"/?{urllib.parse.urlsplit(address.viewer_url).query}")
             self.end_headers()
         else:
-            self._forward(name)
+            self._forward(document_name)
 
-    def _forward(self, name: str) -> None:
+    def _forward(self, file_name: str) -> None:
         """Send a file of Rerun's own page server, without links to other computers."""
         rerun_connection = http.client.HTTPConnection(
             LOOPBACK, self.server.upstream(), timeout=_REQUEST_TIMEOUT_S
         )
         try:
-            rerun_connection.request("GET", f"/{name}")
-            reply = rerun_connection.getresponse()
-            content_type = reply.headers.get("Content-Type", "application/octet-stream")
-            if not name:
-                self._send(confine_to_loopback(reply.read().decode()).encode(), content_type)
+            rerun_connection.request("GET", f"/{file_name}")
+            rerun_reply = rerun_connection.getresponse()
+            content_type = rerun_reply.headers.get("Content-Type", "application/octet-stream")
+            if not file_name:
+                self._send(confine_to_loopback(rerun_reply.read().decode()).encode(), content_type)
                 return
-            self.send_response(reply.status)
+            self.send_response(rerun_reply.status)
             self.send_header("Content-Type", content_type)
             # The length, although the transfer is chunked.
-            if (size := reply.headers.get("rerun-final-length")) is not None:
-                self.send_header("Content-Length", size)
+            if (content_length := rerun_reply.headers.get("rerun-final-length")) is not None:
+                self.send_header("Content-Length", content_length)
             self._end_headers()
-            while block := reply.read(_BLOCK_BYTES):
-                self.wfile.write(block)
+            while file_block := rerun_reply.read(_BLOCK_BYTES):
+                self.wfile.write(file_block)
         except (OSError, http.client.HTTPException):
             # The server is being replaced, or the browser is gone.
             with suppress(OSError):
@@ -255,12 +255,14 @@ class _PageHandler(BaseHTTPRequestHandler):
 
     def _send_retry(self) -> None:
         """Send an error after which the browser repeats its request in a second."""
-        self._send_text(HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", retry=True)
+        self._send_text(
+            HTTPStatus.SERVICE_UNAVAILABLE, "The live view is starting.", asks_retry=True
+        )
 
-    def _send_text(self, status: HTTPStatus, text: str, *, retry: bool = False) -> None:
-        """Send a text; with `retry` the browser repeats its request in a second."""
+    def _send_text(self, status: HTTPStatus, text: str, *, asks_retry: bool = False) -> None:
+        """Send a text; with `asks_retry` the browser repeats its request in a second."""
         self.send_response(status)
-        if retry:
+        if asks_retry:
             self.send_header("Refresh", "1")
         self.send_header("Content-Type", "text/plain; charset=utf-8")
         self._end_headers()
@@ -281,12 +283,12 @@ class _PageHandler(BaseHTTPRequestHandler):
         self.end_headers()
 
 
-def _shut_down(connection: socket.socket) -> None:
+def _close_connection(connection: socket.socket) -> None:
     """Shut down a connection in both directions."""
     with suppress(OSError):  # it has just ended by itself
         connection.shutdown(socket.SHUT_RDWR)
 
 
 def confine_to_loopback(page: str) -> str:
-    """Return the text of Rerun's page without links to other computers, with the reload script."""
+    """Return Rerun's HTML page without links to other computers, with the reload script added."""
     return _REMOTE_LINK.sub("", page).replace("</body>", f"{_RELOAD_SCRIPT}</body>", 1)

@@ -58,9 +58,9 @@ class RerunProgram:
 
     Parameters
     ----------
-    options
+    rerun_options
         Options of the program's command line.
-    environment
+    extra_environment
         Environment variables in addition to those of this process.
 
     Raises
@@ -70,16 +70,16 @@ class RerunProgram:
     """
 
     def __init__(
-        self, options: Sequence[str], environment: Mapping[str, str] | None = None
+        self, rerun_options: Sequence[str], extra_environment: Mapping[str, str] | None = None
     ) -> None:
-        command = [_program_path(), *("--bind", LOOPBACK), *options]
+        command = [_program_path(), *("--bind", LOOPBACK), *rerun_options]
         try:
             self._process = subprocess.Popen(
                 command,
                 env={
                     **without_rerun_variables(os.environ),
                     **_OFFLINE_ENVIRONMENT,
-                    **(environment or {}),
+                    **(extra_environment or {}),
                 },
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.PIPE,
@@ -148,22 +148,22 @@ class RerunProgram:
         """Read the program's log to its end, for ports and errors (run in a thread)."""
         assert self._process.stdout is not None
         with self._process.stdout as log:
-            for line in log:
-                self._last_lines.append(line.strip()[:200])
+            for log_line in log:
+                self._last_lines.append(log_line.strip()[:200])
                 # A backtrace follows this line, so it is not among the last lines.
-                self._without_graphics |= _NO_GRAPHICS_LINE.search(line) is not None
-                for pattern in (_GRPC_PORT_LINE, _PAGE_PORT_LINE):
-                    if match := pattern.search(line):
-                        self._ports[pattern] = int(match[1])
+                self._without_graphics |= _NO_GRAPHICS_LINE.search(log_line) is not None
+                for port_pattern in (_GRPC_PORT_LINE, _PAGE_PORT_LINE):
+                    if port_match := port_pattern.search(log_line):
+                        self._ports[port_pattern] = int(port_match[1])
 
 
 def _program_path() -> str:
     """Return the path of Rerun's program, or raise RerunError if it is not installed."""
     # The `rerun` command on the path is a script: killing it would leave the program running.
-    package = importlib.util.find_spec("rerun_cli")
-    if package is None or package.origin is None:
+    package_spec = importlib.util.find_spec("rerun_cli")
+    if package_spec is None or package_spec.origin is None:
         raise RerunError("The Python package rerun-sdk is not installed; the live view needs it.")
-    return str(Path(package.origin).with_name("rerun"))
+    return str(Path(package_spec.origin).with_name("rerun"))
 
 
 _prctl = ctypes.CDLL(None).prctl

@@ -48,10 +48,10 @@ class SessionRecordReader:
         Session to read.
     channels
         Shared memory of the rig's processes.
-    seen
+    seen_samples
         Number of samples that an earlier publisher has shown, counted as `LiveSession.begins`.
         Those that are still in the ring are read again for the scene.
-    last
+    last_response
         Frequency response of the last session of the same specimen, or None.
 
     Attributes
@@ -68,17 +68,19 @@ class SessionRecordReader:
         self,
         session: LiveSession,
         channels: Channels,
-        seen: int = 0,
-        last: LastResponse | None = None,
+        seen_samples: int = 0,
+        last_response: LastResponse | None = None,
     ) -> None:
-        self.scene = Scene(session.subject, last_response=last)
+        self.scene = Scene(session.subject, last_response=last_response)
         self.t_ns = 0
         self.read_duration_s = 0.0
         self._rate_hz = session.subject.rate_hz
-        self._seen_samples = seen
+        self._seen_samples = seen_samples
         self._readers = {
-            topic: _RingReader(ring, first, seen if topic is SAMPLE else 0)
-            for topic, ring, first in zip(TOPICS, channels.rings, session.begins, strict=True)
+            topic: _RingReader(ring_buffer, first_record, seen_samples if topic is SAMPLE else 0)
+            for topic, ring_buffer, first_record in zip(
+                TOPICS, channels.rings, session.begins, strict=True
+            )
             if topic.live
         }
 
@@ -97,29 +99,29 @@ class SessionRecordReader:
         """Whether the session has ended and all its records were read."""
         return all(reader.exhausted for reader in self._readers.values())
 
-    def end(self, ends: Sequence[int]) -> None:
-        """Set the number of records in each ring at the end of the session."""
-        for topic, end in zip(TOPICS, ends, strict=True):
+    def end(self, record_counts: Sequence[int]) -> None:
+        """Set the number of records that each ring buffer has at the end of the session."""
+        for topic, end in zip(TOPICS, record_counts, strict=True):
             if topic in self._readers:
                 self._readers[topic].end = end
 
     def read_new(self) -> NewDrawings:
         """Read the new records, and return their drawings."""
-        scene, readers = self.scene, self._readers
-        notes: list[Drawing] = []
-        drawings: list[Drawing] = []
-        count = first_shown = 0
-        for events in readers[EVENT].records(read_events):
-            notes += scene.events([Note(e.t_ns, e.level, e.message) for e in events])
-        for timings in readers[TIMING].records(decode_timings):
-            drawings += scene.timings(timings)
-        for samples in readers[SAMPLE].records(decode_samples):
-            drawings += scene.samples(samples)
-            self.t_ns = int(samples["t_ns"][-1])
-            count += len(samples)
-            first_shown += min(len(samples), max(0, self.next - self._seen_samples))
-        self.read_duration_s = count / self._rate_hz
-        return NewDrawings(notes, drawings, first_shown)
+        scene, ring_readers = self.scene, self._readers
+        note_drawings: list[Drawing] = []
+        signal_drawings: list[Drawing] = []
+        sample_count = first_shown = 0
+        for event_records in ring_readers[EVENT].records(read_events):
+            note_drawings += scene.events([Note(e.t_ns, e.level, e.message) for e in event_records])
+        for timing_records in ring_readers[TIMING].records(decode_timings):
+            signal_drawings += scene.timings(timing_records)
+        for sample_records in ring_readers[SAMPLE].records(decode_samples):
+            signal_drawings += scene.samples(sample_records)
+            self.t_ns = int(sample_records["t_ns"][-1])
+            sample_count += len(sample_records)
+            first_shown += min(len(sample_records), max(0, self.next - self._seen_samples))
+        self.read_duration_s = sample_count / self._rate_hz
+        return NewDrawings(note_drawings, signal_drawings, first_shown)
 
 
 class _RingReader:
@@ -153,16 +155,16 @@ class _RingReader:
 
     def records(self, decode: Callable[[bytes], Records]) -> Iterator[Records]:
         """Yield the unread records in decoded blocks."""
-        observer, written = self._observer, self._ring.written
-        last = written if self.end is None else min(self.end, written)
+        observer, written_records = self._observer, self._ring.written
+        last_record = written_records if self.end is None else min(self.end, written_records)
         while True:
             observer.take(0)  # skip overwritten records
-            if observer.next >= last:
+            if observer.next >= last_record:
                 return
-            block = observer.take(last - observer.next)
-            if not block:
+            record_block = observer.take(last_record - observer.next)
+            if not record_block:
                 continue
             try:
-                yield decode(block)
+                yield decode(record_block)
             except ValueError:  # overwritten while it was copied
-                self._damaged_records += len(block) // self._ring.record_size
+                self._damaged_records += len(record_block) // self._ring.record_size

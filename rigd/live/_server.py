@@ -67,13 +67,13 @@ class RerunServer:
         RerunError
             If the server ends or accepts no connections.
         """
-        deadline = time.monotonic() + 2 * _START_TIMEOUT_S
+        deadline_s = time.monotonic() + 2 * _START_TIMEOUT_S
         while not self.poll():
             if not self._program.running:
                 if not self._grpc_port:
                     raise RerunError(f"The Rerun server ended: {self._program.last_log_lines}.")
                 self._restart()
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline_s:
                 self.close()
                 raise RerunError(
                     f"The Rerun server does not answer: {self._program.last_log_lines}."

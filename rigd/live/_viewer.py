@@ -26,7 +26,7 @@ _POLL_PERIOD_S: Final = 0.05
 
 
 class _RerunContext:
-    """Context manager of a running Rerun program, which ends when the context is left."""
+    """Context manager that ends a running Rerun program when the context is left."""
 
     _program: RerunProgram
 
@@ -37,9 +37,9 @@ class _RerunContext:
 
     def wait(self) -> int:
         """Wait until the program ends, for example a closed window, and return its exit code."""
-        while (code := self._program.exit_code) is None:
+        while (exit_code := self._program.exit_code) is None:
             time.sleep(_POLL_PERIOD_S)
-        return code
+        return exit_code
 
     def close(self) -> None:
         """End Rerun's program."""
@@ -61,13 +61,17 @@ class _Window(_RerunContext):
     """
 
     def __init__(
-        self, content_options: tuple[str, ...], memory: str, scratch: Path, options: tuple[str, ...]
+        self,
+        content_options: tuple[str, ...],
+        memory_limit: str,
+        scratch: Path,
+        options: tuple[str, ...],
     ) -> None:
         self._program = RerunProgram(
             (
                 *content_options,
                 *("--port", "0"),
-                *("--memory-limit", memory),
+                *("--memory-limit", memory_limit),
                 "--hide-welcome-screen",
                 *options,
             ),
@@ -162,7 +166,7 @@ class PageOfFile(_RerunContext):
 
     def _await_server(self) -> None:
         """Wait until the server accepts connections; use another port if this one is taken."""
-        deadline = time.monotonic() + _START_TIMEOUT_S
+        deadline_s = time.monotonic() + _START_TIMEOUT_S
         any_port = False
         while not (self._program.grpc_port and self._program.page_port):
             if not self._program.running:
@@ -171,7 +175,7 @@ class PageOfFile(_RerunContext):
                 # Most likely another process has taken the port.
                 any_port = True
                 self._serve(0)
-            if time.monotonic() > deadline:
+            if time.monotonic() > deadline_s:
                 raise RerunError(
                     f"The Rerun server does not answer: {self._program.last_log_lines}."
                 )
@@ -237,8 +241,8 @@ class Viewer(_Window):
     @property
     def control_url(self) -> str:
         """URL at which the viewer accepts commands, or "" if it is not known yet."""
-        port = self._program.grpc_port
-        return proxy_url(_LOOPBACK_NAMES[0], port) if port else ""
+        grpc_port = self._program.grpc_port
+        return proxy_url(_LOOPBACK_NAMES[0], grpc_port) if grpc_port else ""
 
     def connect(self, address: LiveAddress) -> bool:
         """Connect the window to a live view whose server was replaced, and return whether it did.
@@ -259,10 +263,10 @@ class Viewer(_Window):
         self._connecting.join(_SWITCH_TIMEOUT_S)
         return any(successes)
 
-    def _next_url(self, address: LiveAddress) -> str:
+    def _next_url(self, live_address: LiveAddress) -> str:
         """Return a URL of the live view's server that differs from the previous one."""
         return proxy_url(
-            _LOOPBACK_NAMES[self._connections % len(_LOOPBACK_NAMES)], address.grpc_port
+            _LOOPBACK_NAMES[self._connections % len(_LOOPBACK_NAMES)], live_address.grpc_port
         )
 
 
@@ -271,16 +275,18 @@ def _switch_server(control_url: str, url: str, successes: list[bool]) -> None:
     from rerun.experimental import ViewerClient
 
     try:
-        client = ViewerClient.connect(control_url)
-        state = client.get_state()
+        viewer_client = ViewerClient.connect(control_url)
+        viewer_state = viewer_client.get_state()
         earlier_recordings = [
-            r.store_id for r in state.recordings if r.store_id != state.active_recording
+            r.store_id
+            for r in viewer_state.recordings
+            if r.store_id != viewer_state.active_recording
         ]
         if earlier_recordings:
-            client.close(store_ids=earlier_recordings)
+            viewer_client.close(store_ids=earlier_recordings)
         with contextlib.suppress(ConnectionError):  # the viewer received nothing from this server
-            client.close(url)
-        client.open(url)
+            viewer_client.close(url)
+        viewer_client.open(url)
     except (OSError, RuntimeError):  # the viewer is busy or about to end
         return
     successes.append(True)

@@ -82,8 +82,8 @@ class LiveAddress:
     @property
     def viewer_url(self) -> str:
         """URL to which the page redirects browsers: the page with the server's address."""
-        query = urllib.parse.urlencode({"url": self.proxy_url})
-        return f"{self.page_url}/?{query}"
+        url_query = urllib.parse.urlencode({"url": self.proxy_url})
+        return f"{self.page_url}/?{url_query}"
 
     @property
     def alive(self) -> bool:
@@ -117,10 +117,13 @@ def announce(address: LiveAddress) -> None:
 
 def withdraw(address: LiveAddress) -> None:
     """Delete the file of a view's address, unless another process has replaced it."""
-    path = _address_path(address.rig)
-    stored = _read_address_file(path)
-    if stored is not None and (stored.pid, stored.born) == (address.pid, address.born):
-        path.unlink(missing_ok=True)
+    address_path = _address_path(address.rig)
+    stored_address = _read_address_file(address_path)
+    if stored_address is not None and (stored_address.pid, stored_address.born) == (
+        address.pid,
+        address.born,
+    ):
+        address_path.unlink(missing_ok=True)
 
 
 def find(rig: str) -> LiveAddress | None:
@@ -131,8 +134,8 @@ def find(rig: str) -> LiveAddress | None:
 
 def running() -> list[LiveAddress]:
     """Return the addresses of all running live views of this user."""
-    addresses = map(_read_address_file, address_files(f"{_FILE_PREFIX}*{_FILE_SUFFIX}"))
-    return [address for address in addresses if address is not None and address.alive]
+    live_addresses = map(_read_address_file, address_files(f"{_FILE_PREFIX}*{_FILE_SUFFIX}"))
+    return [address for address in live_addresses if address is not None and address.alive]
 
 
 def _address_path(rig: str) -> Path:
@@ -145,21 +148,25 @@ def _read_address_file(path: Path) -> LiveAddress | None:
 
     The contents are checked because they are shown on terminals.
     """
-    contents = read_address(path)
+    address_fields = read_address(path)
     try:
-        address = LiveAddress(**contents)
+        address = LiveAddress(**address_fields)
     except TypeError:
         return None
-    return address if _is_valid(contents) else None
+    return address if _is_valid(address_fields) else None
 
 
-def _is_valid(contents: dict[str, object]) -> bool:
+def _is_valid(address_fields: dict[str, object]) -> bool:
     """Return whether the fields read from an address file have valid values."""
-    rig = contents.pop("rig")
-    ports = (contents["grpc_port"], contents["page_port"])
+    rig = address_fields.pop("rig")
+    port_numbers = (address_fields["grpc_port"], address_fields["page_port"])
     return (
         isinstance(rig, str)
         and rig.isprintable()
-        and all(type(number) is int for number in contents.values())
-        and all(0 < port < 1 << 16 for port in ports if isinstance(port, int))
+        and all(type(process_number) is int for process_number in address_fields.values())
+        and all(
+            0 < port_number < 1 << 16
+            for port_number in port_numbers
+            if isinstance(port_number, int)
+        )
     )

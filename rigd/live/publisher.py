@@ -116,12 +116,12 @@ class _Publisher:
             _arm_watchdog()
             self._show_new_records()
             try:
-                message = self._parent.poll(self._pause_s)
+                supervisor_message = self._parent.poll(self._pause_s)
             except EOFError:
                 break
-            match message:
+            match supervisor_message:
                 case LiveSession():
-                    self._begin_session(message)
+                    self._begin_session(supervisor_message)
                 case LiveTouches(touches):
                     if self._shown_session is not None:
                         self._shown_session.show_touches(touches)
@@ -129,7 +129,7 @@ class _Publisher:
                     if self._shown_session is not None:
                         self._shown_session.show_fit(fit)
                 case LiveEnd():
-                    self._finish_session(message)
+                    self._finish_session(supervisor_message)
         self._show_orphaned()
 
     def linger(self, linger_s: float) -> None:
@@ -145,12 +145,14 @@ class _Publisher:
 
     @property
     def _pause_s(self) -> float:
-        """Seconds to wait for a message of the supervisor before the next step."""
-        shown = self._shown_session
-        if shown is not None and not shown.has_ended:
+        """Time in s to wait for a message of the supervisor before the next drawings."""
+        shown_session = self._shown_session
+        if shown_session is not None and not shown_session.has_ended:
             # In a session that runs faster than real time, records would accumulate.
-            return _SEND_PERIOD_S if shown.reader.read_duration_s < _CATCH_UP_S else 0.0
-        must_wait = self._drawing_stream.stalled or (shown is not None and bool(shown.backlog))
+            return _SEND_PERIOD_S if shown_session.reader.read_duration_s < _CATCH_UP_S else 0.0
+        must_wait = self._drawing_stream.stalled or (
+            shown_session is not None and bool(shown_session.backlog)
+        )
         return _SEND_PERIOD_S if must_wait else _IDLE_PERIOD_S
 
     def _begin_session(self, session: LiveSession) -> None:
@@ -176,16 +178,18 @@ class _Publisher:
 
     def _show_orphaned(self) -> None:
         """Show a session whose supervisor has ended until its torque is off."""
-        shown, shared_state = self._shown_session, self._channels.shared_state
-        if shown is None or shown.has_ended:
+        shown_session, shared_state = self._shown_session, self._channels.shared_state
+        if shown_session is None or shown_session.has_ended:
             return
-        shown.supervisor_lost = True
+        shown_session.supervisor_lost = True
         end = time.monotonic() + _MAX_ORPHANED_S
         while shared_state[StateField.PHASE] != Phase.OFF and time.monotonic() < end:
             _arm_watchdog()
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
-        self._finish_session(LiveEnd(tuple(ring.written for ring in self._channels.rings)))
+        self._finish_session(
+            LiveEnd(tuple(ring_buffer.written for ring_buffer in self._channels.rings))
+        )
 
     def _show_new_records(self) -> None:
         """Show the new records of the session, and count those that cannot be shown."""
@@ -202,35 +206,46 @@ class _Publisher:
 
     def _announce_address(self) -> None:
         """Send the view's address to the supervisor if the server was started or replaced."""
-        address = self._server_program.address
-        if address is not None and address.server != self._announced_server:
-            self._announced_server = address.server
-            self._parent.send(address)
+        live_address = self._server_program.address
+        if live_address is not None and live_address.server != self._announced_server:
+            self._announced_server = live_address.server
+            self._parent.send(live_address)
 
 
 class _ShownSession:
-    """Session that the publisher shows, or showed last, with its queue of drawings."""
+    """Session that the live view shows, or showed last, with the drawings to be sent."""
 
-    def __init__(self, session: LiveSession, channels: Channels, last: LastResponse | None) -> None:
+    def __init__(
+        self, session: LiveSession, channels: Channels, earlier_response: LastResponse | None
+    ) -> None:
         shared_state = self._shared_state = channels.shared_state
-        begin, seen = session.begins[TOPICS.index(SAMPLE)], shared_state[StateField.LIVE_SEEN]
+        first_sample, seen_samples = (
+            session.begins[TOPICS.index(SAMPLE)],
+            shared_state[StateField.LIVE_SEEN],
+        )
         # Continue the count of a previous publisher of the same session.
-        self._dropped_before = shared_state[StateField.LIVE_DROPPED] if seen > begin else 0
-        self.reader = SessionRecordReader(session, channels, seen, last)
+        self._dropped_before = (
+            shared_state[StateField.LIVE_DROPPED] if seen_samples > first_sample else 0
+        )
+        self.reader = SessionRecordReader(session, channels, seen_samples, earlier_response)
         self.backlog = Backlog(round(_MAX_QUEUED_S * session.subject.rate_hz))
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
         self._state_watch = StateWatch(channels)
         self._unsent_samples = 0
-        folder, name = session.folder, session.subject.name
-        self._quick_look_path = None if folder is None else quick_look_path(folder / f"{name}.mcap")
+        session_folder, session_name = session.folder, session.subject.name
+        self._quick_look_path = (
+            None
+            if session_folder is None
+            else quick_look_path(session_folder / f"{session_name}.mcap")
+        )
 
     @property
     def dropped(self) -> int:
         """Number of the session's samples that could not be shown."""
-        dropped = self.reader.dropped + self.backlog.dropped + self._unsent_samples
-        return self._dropped_before + dropped
+        dropped_samples = self.reader.dropped + self.backlog.dropped + self._unsent_samples
+        return self._dropped_before + dropped_samples
 
     def queue_new_records(self) -> None:
         """Queue drawings of the new records or, after the session, of its quick look."""
@@ -238,50 +253,52 @@ class _ShownSession:
             self._add_quick_look()
             return
         new_drawings = self.reader.read_new()
-        drawings = new_drawings.drawings
+        queued_drawings = new_drawings.drawings
         now_s = time.monotonic()
         if self._health_reader.is_due(now_s):
-            health = self._health_reader.read(now_s, self.dropped)
-            drawings += self.reader.scene.health(self.reader.t_ns, health)
-        state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
-        drawings += self.reader.scene.state(self.reader.t_ns, state)
+            rig_health = self._health_reader.read(now_s, self.dropped)
+            queued_drawings += self.reader.scene.health(self.reader.t_ns, rig_health)
+        banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
+        queued_drawings += self.reader.scene.state(self.reader.t_ns, banner_state)
         self.backlog.put_required(new_drawings.notes)
-        self.backlog.put(drawings, new_drawings.samples)
+        self.backlog.put(queued_drawings, new_drawings.samples)
         self._store_counts()
 
     def _store_counts(self) -> None:
-        """Write the counts to the shared state, for a publisher that replaces this one."""
+        """Store the counts of shown and dropped samples for a publisher that replaces this one."""
         shared_state = self._shared_state
         shared_state[StateField.LIVE_DROPPED] = self.dropped
-        shown = self.reader.next - self.backlog.samples
-        shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown)
+        shown_samples = self.reader.next - self.backlog.samples
+        shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown_samples)
 
     def show_touches(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Queue the drawings and log lines of estimated touches."""
-        scene, t_ns = self.reader.scene, self.reader.t_ns
-        lines = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
-        self.backlog.put_required([*scene.touches(touches), *scene.events(lines)])
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
+        log_notes = [Note(t_ns, "info", touch_line(touch)) for touch in touches]
+        self.backlog.put_required([*view_scene.touches(touches), *view_scene.events(log_notes)])
 
     def show_fit(self, fit: "Mapping[str, Any]") -> None:
         """Queue the drawings and log lines of a fit of the record so far."""
-        scene, t_ns = self.reader.scene, self.reader.t_ns
-        lines = [Note(t_ns, "info", line) for line in fit["text"]]
-        self.backlog.put_required([*scene.fit(fit), *scene.events(lines)])
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
+        log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
+        self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
 
     def finish(self, end: LiveEnd) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
         self.reader.end(end.ends)
         self.queue_new_records()
-        scene, t_ns = self.reader.scene, self.reader.t_ns
-        state = ended(end.outcome, end.reason)
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
+        banner_state = ended(end.outcome, end.reason)
         if self.supervisor_lost:
             is_torque_off = self._shared_state[StateField.PHASE] == Phase.OFF
-            state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
-            self.backlog.put_required(scene.events([Note(t_ns, "error", state.reason)]))
+            banner_state = SUPERVISOR_LOST_TORQUE_OFF if is_torque_off else SUPERVISOR_LOST
+            self.backlog.put_required(view_scene.events([Note(t_ns, "error", banner_state.reason)]))
         elif end.outcome:
-            self.backlog.put_required(scene.events([outcome_note(t_ns, end.outcome, end.reason)]))
+            self.backlog.put_required(
+                view_scene.events([outcome_note(t_ns, end.outcome, end.reason)])
+            )
         # They follow all queued drawings, which show a running session.
-        self.backlog.put([*scene.finish(), *scene.state(t_ns, state)], 0)
+        self.backlog.put([*view_scene.finish(), *view_scene.state(t_ns, banner_state)], 0)
         self.has_ended = True
         self._add_quick_look()
 
@@ -293,9 +310,9 @@ class _ShownSession:
         quick_look, self._quick_look_path = read_quick_look(self._quick_look_path), None
         if quick_look is None:
             return
-        scene, t_ns = self.reader.scene, self.reader.t_ns
+        view_scene, t_ns = self.reader.scene, self.reader.t_ns
         self.backlog.put_required(
-            scene.events([Note(t_ns, "info", line) for line in quick_look["text"]])
+            view_scene.events([Note(t_ns, "info", text_line) for text_line in quick_look["text"]])
         )
 
     def send(self, drawing_stream: DrawingStream, *, connected: bool) -> None:
@@ -307,9 +324,9 @@ class _ShownSession:
         if connected:
             self.backlog.drop_required()
         if self.backlog:
-            drawings, samples = self.backlog.take()
+            drawings, sample_count = self.backlog.take()
             if not drawing_stream.send(drawings):
-                self._unsent_samples += samples
+                self._unsent_samples += sample_count
             if not self.has_ended:
                 self._store_counts()
 
@@ -332,7 +349,7 @@ Only beyond it the oldest of them are dropped."""
 
 
 class Backlog:
-    """Queue of a session's drawings that are not yet sent to the viewers.
+    """Queue of what the live view still has to draw of a session.
 
     Parameters
     ----------
@@ -357,48 +374,53 @@ class Backlog:
         self.dropped = 0
 
     def __bool__(self) -> bool:
-        """Return whether any drawings are queued."""
+        """Return whether any drawings still have to be sent to the viewers."""
         return bool(self._queue or self._required_drawings)
 
-    def put(self, drawings: "list[Drawing]", samples: int) -> None:
+    def put(self, drawings: "list[Drawing]", sample_count: int) -> None:
         """Queue drawings, and drop the oldest ones if there are too many samples.
 
         Parameters
         ----------
         drawings
             Drawings in the order in which they are sent.
-        samples
+        sample_count
             Number of samples that they show.
         """
         if drawings:
-            self._queue.append((drawings, samples))
-            self.samples += samples
+            self._queue.append((drawings, sample_count))
+            self.samples += sample_count
         while self.samples > self._max_samples and len(self._queue) > 1:
-            _, lost = self._queue.popleft()
-            self.samples -= lost
-            self.dropped += lost
+            _, lost_samples = self._queue.popleft()
+            self.samples -= lost_samples
+            self.dropped += lost_samples
 
     def put_required(self, drawings: "Iterable[Drawing]") -> None:
-        """Queue drawings that must not be dropped, such as events."""
+        """Queue drawings that are sent even if the queue is full, such as those of events."""
         self._required_drawings.extend(drawings)
 
     def drop_required(self) -> None:
-        """Remove the drawings of `put_required`, which the frame of a new connection contains."""
+        """Remove the drawings of `put_required`; a new connection has received them already."""
         self._required_drawings.clear()
 
     def take(self) -> "tuple[list[Drawing], int]":
         """Return all queued drawings and the number of samples they show, and clear the queue."""
-        drawings = [*self._required_drawings, *(draw for batch, _ in self._queue for draw in batch)]
-        samples, self.samples = self.samples, 0
+        drawings = [
+            *self._required_drawings,
+            *(draw_item for drawing_batch, _ in self._queue for draw_item in drawing_batch),
+        ]
+        sample_count, self.samples = self.samples, 0
         self._required_drawings.clear()
         self._queue.clear()
-        return drawings, samples
+        return drawings, sample_count
 
 
 # Response of the last session
 
 
-def last_response(session: "LiveSession", shown_last: LastResponse | None) -> LastResponse | None:
+def last_response(
+    session: "LiveSession", shown_response: LastResponse | None
+) -> LastResponse | None:
     """Return the frequency response measured in the last session of the same specimen.
 
     It is read from the newest quick look in the session's folder, unless the response that this
@@ -408,7 +430,7 @@ def last_response(session: "LiveSession", shown_last: LastResponse | None) -> La
     ----------
     session
         Session that begins.
-    shown_last
+    shown_response
         Frequency response of the session that this view showed last, or None.
 
     Returns
@@ -417,26 +439,28 @@ def last_response(session: "LiveSession", shown_last: LastResponse | None) -> La
         Response for comparison, or None if there is none.
     """
     specimen = session.subject.specimen
-    if shown_last is not None and shown_last.specimen != specimen:
-        shown_last = None
+    if shown_response is not None and shown_response.specimen != specimen:
+        shown_response = None
     if session.folder is None:
-        return shown_last
-    newest = last_quick_look(
+        return shown_response
+    newest_pair = last_quick_look(
         session.folder,
         specimen,
         excluded_session=session.subject.name,
         is_usable=itemgetter("response"),
     )
-    if newest is None:
-        return shown_last
-    path, quick_look = newest
+    if newest_pair is None:
+        return shown_response
+    document_path, quick_look = newest_pair
     # Names of session files begin with the time of the session.
-    if shown_last is not None and path.stem < shown_last.session:
-        return shown_last
+    if shown_response is not None and document_path.stem < shown_response.session:
+        return shown_response
     frequency_hz, magnitude, phase_rad = (
         np.array(quick_look["response"][key]) for key in ("frequency_hz", "magnitude", "phase_rad")
     )
-    return LastResponse(path.stem, specimen, frequency_hz, magnitude * np.exp(1j * phase_rad))
+    return LastResponse(
+        document_path.stem, specimen, frequency_hz, magnitude * np.exp(1j * phase_rad)
+    )
 
 
 # State and health of a session
@@ -454,7 +478,7 @@ _ACTIVITY_BANNERS: Final = {  # Banner for each activity of the rig
 
 
 class StateWatch:
-    """Derives the state that the view's banner shows from the shared state of the processes.
+    """Derives the session's state, shown in the view's banner, from the processes' shared state.
 
     Parameters
     ----------
@@ -475,17 +499,19 @@ class StateWatch:
             Time of a monotonic clock.
         """
         shared_state = self._shared_state
-        phase = Phase(shared_state[StateField.PHASE])
+        session_phase = Phase(shared_state[StateField.PHASE])
         silent_s = self._supervisor.stalled_for(shared_state[StateField.SUPERVISOR_BEAT], now_s)
         if silent_s > _SUPERVISOR_TIMEOUT_S:
-            if phase in _TORQUE_PHASES:
+            if session_phase in _TORQUE_PHASES:
                 return SUPERVISOR_SILENT
-            if shared_state[StateField.GO] and phase is Phase.OFF:
+            if shared_state[StateField.GO] and session_phase is Phase.OFF:
                 return SUPERVISOR_SILENT_TORQUE_OFF
-        current = activity(shared_state)
-        if current is Activity.PREPARING:
-            return preparing("" if phase is Phase.OFF else f"{phase.words}.".capitalize())
-        return _ACTIVITY_BANNERS[current]
+        current_activity = activity(shared_state)
+        if current_activity is Activity.PREPARING:
+            return preparing(
+                "" if session_phase is Phase.OFF else f"{session_phase.words}.".capitalize()
+            )
+        return _ACTIVITY_BANNERS[current_activity]
 
 
 POLL_S: Final = 0.25
@@ -529,31 +555,36 @@ class HealthReader:
         self._next_reading_s = now_s + POLL_S
         # Until tick 0 the shared state has the counts of the previous session.
         has_begun = bool(shared_state[StateField.GO])
-        scheduled, missed, late, lost = (
-            shared_state[field] if has_begun else 0
-            for field in (StateField.SCHEDULED, StateField.MISSED, StateField.LATE, StateField.LOST)
+        scheduled_ticks, missed_ticks, late_ticks, lost_samples = (
+            shared_state[state_field] if has_begun else 0
+            for state_field in (
+                StateField.SCHEDULED,
+                StateField.MISSED,
+                StateField.LATE,
+                StateField.LOST,
+            )
         )
         load_ppm = shared_state.known(StateField.BUS_LOAD_PPM)
         return Health(
-            missed_ticks=missed,
-            late_ticks=late,
-            lost_ticks=lost,
+            missed_ticks=missed_ticks,
+            late_ticks=late_ticks,
+            lost_ticks=lost_samples,
             recorder_lag_ticks=self._samples.waiting,
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,
             bus_errors=shared_state.known(StateField.BUS_ERRORS),
             sensor_status=shared_state.known(StateField.SENSOR_STATUS),
-            rate_hz=self._rate_hz(now_s, scheduled),
+            rate_hz=self._rate_hz(now_s, scheduled_ticks),
         )
 
-    def _rate_hz(self, now_s: float, scheduled: int) -> float | None:
+    def _rate_hz(self, now_s: float, scheduled_ticks: int) -> float | None:
         """Return the measured rate of the loop in Hz, or None between sessions."""
-        ticks = self._ticks
-        if ticks and scheduled < ticks[-1][1]:
-            ticks.clear()  # another session
-        ticks.append((now_s, scheduled))
-        (first_time_s, first_count), (last_time_s, last_count) = ticks[0], ticks[-1]
+        tick_counts = self._ticks
+        if tick_counts and scheduled_ticks < tick_counts[-1][1]:
+            tick_counts.clear()  # another session
+        tick_counts.append((now_s, scheduled_ticks))
+        (first_time_s, first_count), (last_time_s, last_count) = tick_counts[0], tick_counts[-1]
         # While the count is constant, there is no session, or it is in preparation.
         return (
             (last_count - first_count) / (last_time_s - first_time_s)

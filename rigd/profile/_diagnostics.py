@@ -73,14 +73,14 @@ _MAX_ITEMS = 12
 
 
 def missing_source_message(key: str, source: object) -> str:
-    """Return the message for a number with a missing or invalid source."""
+    """Return the message for a number whose ``source``, its origin, is missing or invalid."""
     if source is None:
         return f"{key} has no source; add source = {_quoted_choice(SOURCES)}."
     return f"{key} has source = {_text(source)}; choose {_quoted_choice(SOURCES)}."
 
 
 def invalid_unknown_message(key: str, entry: Mapping[str, Any]) -> str:
-    """Return the message for the source "unknown" of a key that has a value or requires one."""
+    """Return the message for a key with source "unknown" that has a value or requires one."""
     if key in MAY_BE_UNKNOWN:
         return (
             f'{key} = {_text(entry["value"])}{_unit(key)} has a value, and source = "unknown"; '
@@ -92,18 +92,18 @@ def invalid_unknown_message(key: str, entry: Mapping[str, Any]) -> str:
     )
 
 
-def bare_number_message(key: str, value: object) -> str:
-    """Return the message for a number without a source."""
+def bare_number_message(key: str, bare_value: object) -> str:
+    """Return the message for a profile's number whose origin (key ``source``) is not stated."""
     return (
-        f"{key} = {_text(value)}{_unit(key)} does not say where it comes from; write "
-        f'{{ value = {_text(value)}, source = "…" }} with {_quoted_choice(SOURCES)}.'
+        f"{key} = {_text(bare_value)}{_unit(key)} does not say where it comes from; write "
+        f'{{ value = {_text(bare_value)}, source = "…" }} with {_quoted_choice(SOURCES)}.'
     )
 
 
-def implausible_numbers(values: Mapping[str, Any]) -> Iterator[str]:
+def implausible_numbers(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for numbers that are within their range but impossible for any rig."""
-    for key, value in values.items():
-        for number in value if isinstance(value, tuple) else (value,):
+    for key, key_value in profile_values.items():
+        for number in key_value if isinstance(key_value, tuple) else (key_value,):
             if isinstance(number, int | float) and not is_usable_size(number):
                 yield (
                     f"{key} = {_text(number)}{_unit(key)} is of no size that a rig can have; check "
@@ -111,69 +111,81 @@ def implausible_numbers(values: Mapping[str, Any]) -> Iterator[str]:
                 )
 
 
-def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for values that are within their ranges but contradict each other."""
-    if not _RIG_NAME.fullmatch(values["name"]):
+    if not _RIG_NAME.fullmatch(profile_values["name"]):
         yield (
-            f"name = {_text(values['name'])} is not fit for file names; take letters, digits, "
+            f"name = {_text(profile_values['name'])} is not fit for file names; take "
+            "letters, digits, "
             "spaces and . _ - only, at most 64, and begin with a letter or digit."
         )
-    rated_nm, peak_nm = values["motor.rated_torque_nm"], values["motor.peak_torque_nm"]
+    rated_nm, peak_nm = (
+        profile_values["motor.rated_torque_nm"],
+        profile_values["motor.peak_torque_nm"],
+    )
     if peak_nm < rated_nm:
         yield (
             f"motor.peak_torque_nm = {peak_nm:g} N·m is below motor.rated_torque_nm = "
             f"{rated_nm:g} N·m; the peak is at least the rated torque."
         )
-    continuous_nm = values["motor.continuous_torque_nm"]
+    continuous_nm = profile_values["motor.continuous_torque_nm"]
     if peak_nm >= rated_nm and continuous_nm > peak_nm:
         yield (
             f"motor.continuous_torque_nm = {continuous_nm:g} N·m is above motor.peak_torque_nm = "
             f"{peak_nm:g} N·m; continuous torque must not exceed peak torque."
         )
-    limit_nm = values["limits.torque_command_nm"]
+    limit_nm = profile_values["limits.torque_command_nm"]
     if limit_nm < peak_nm:
         yield (
             f"limits.torque_command_nm = {limit_nm:g} N·m is below motor.peak_torque_nm = "
             f"{peak_nm:g} N·m, where commands saturate; the controller's command limit must be "
             "higher."
         )
-    angle, stop = values["limits.angle_rad"], values["limits.stop_angle_rad"]
-    if stop <= angle:
+    angle_limit_rad, stop_angle_rad = (
+        profile_values["limits.angle_rad"],
+        profile_values["limits.stop_angle_rad"],
+    )
+    if stop_angle_rad <= angle_limit_rad:
         yield (
-            f"limits.stop_angle_rad = {stop:g} rad is not above limits.angle_rad = {angle:g} rad; "
+            f"limits.stop_angle_rad = {stop_angle_rad:g} rad is not above limits.angle_rad = "
+            f"{angle_limit_rad:g} rad; "
             "the shaft could not come to rest before it is stopped by force."
         )
-    yield from _unreachable_limits(values)
-    yield from _drag_contradictions(values)
-    yield from _hum_contradictions(values)
-    warning, drift_limit_nm = values["session.tare_drift_nm"], values["limits.tare_drift_nm"]
-    if drift_limit_nm < warning:
+    yield from _unreachable_limits(profile_values)
+    yield from _drag_contradictions(profile_values)
+    yield from _hum_contradictions(profile_values)
+    drift_warning_nm, drift_limit_nm = (
+        profile_values["session.tare_drift_nm"],
+        profile_values["limits.tare_drift_nm"],
+    )
+    if drift_limit_nm < drift_warning_nm:
         yield (
             f"limits.tare_drift_nm = {drift_limit_nm:g} N·m, which ends a session, is below "
-            f"session.tare_drift_nm = {warning:g} N·m, which warns; it must be the greater one."
+            f"session.tare_drift_nm = {drift_warning_nm:g} N·m, which warns; it must be the "
+            "greater one."
         )
-    yield from first_mode_contradictions(values)
-    if not any(values["sensor.projection"]):
+    yield from first_mode_contradictions(profile_values)
+    if not any(profile_values["sensor.projection"]):
         yield "sensor.projection is all zero; give the row that makes motor torque of the wrench."
-    yield from _shear_contradictions(values)
-    yield from _obstacle_problems(values)
-    for name in values["metadata.required"]:
+    yield from _shear_contradictions(profile_values)
+    yield from _obstacle_problems(profile_values)
+    for key_name in profile_values["metadata.required"]:
         try:
-            if name not in NOTES:
-                check_name(name)
+            if key_name not in NOTES:
+                check_name(key_name)
         except MetadataError as error:
             yield f"metadata.required: {error}"
     try:
         design_pid(
-            values["motor.inertia_kg_m2"],
-            values["motor.viscous_nm_s_per_rad"],
-            values["control.pole_rad_s"],
+            profile_values["motor.inertia_kg_m2"],
+            profile_values["motor.viscous_nm_s_per_rad"],
+            profile_values["control.pole_rad_s"],
         )
     except ControlDesignError as error:
         yield str(error)
 
 
-def first_mode_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def first_mode_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield a message if the beam's first mode has an implausible frequency.
 
     The reason is often a wrong unit.
@@ -181,9 +193,9 @@ def first_mode_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
     first_mode_hz = float(
         undamped_frequencies_rad_s(
             Beam(
-                values["beam.length_m"],
-                values["beam.density_kg_per_m"],
-                values["beam.bending_stiffness_n_m2"],
+                profile_values["beam.length_m"],
+                profile_values["beam.density_kg_per_m"],
+                profile_values["beam.bending_stiffness_n_m2"],
             ),
             1,
         )[0]
@@ -197,85 +209,106 @@ def first_mode_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _drag_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _drag_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for settings of a simulated rig that are incompatible with its air drag."""
-    if not values.get("simulation.air_drag_m"):
+    if not profile_values.get("simulation.air_drag_m"):
         return
-    for name in INCOMPATIBLE_WITH_FORCES:
-        if values.get(f"simulation.{name}"):
+    for key_name in INCOMPATIBLE_WITH_FORCES:
+        if profile_values.get(f"simulation.{key_name}"):
             yield (
-                f"simulation.{name} and simulation.air_drag_m cannot be simulated together; leave "
+                f"simulation.{key_name} and simulation.air_drag_m cannot be simulated "
+                "together; leave "
                 "one of them out, or make it 0."
             )
 
 
-def _hum_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _hum_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield a message if the simulated sensor's hum has too high a frequency for its rate."""
-    rate_hz, hum_hz = values["rig.rate_hz"], values.get("simulation.hum_hz", 0.0)
-    per_tick = max(1, round(values.get("ati_serial.stream_hz", rate_hz) / rate_hz))
-    if values.get("simulation.hum_nm") and hum_hz >= 0.5 * per_tick * rate_hz:
+    rate_hz, hum_hz = profile_values["rig.rate_hz"], profile_values.get("simulation.hum_hz", 0.0)
+    readings_per_tick = max(1, round(profile_values.get("ati_serial.stream_hz", rate_hz) / rate_hz))
+    if profile_values.get("simulation.hum_nm") and hum_hz >= 0.5 * readings_per_tick * rate_hz:
         yield (
-            f"simulation.hum_hz = {hum_hz:g} Hz is not below half of the {per_tick * rate_hz:g} "
+            f"simulation.hum_hz = {hum_hz:g} Hz is not below half of the "
+            f"{readings_per_tick * rate_hz:g} "
             "readings that the simulated sensor takes each second; choose less than "
-            f"{0.5 * per_tick * rate_hz:g} Hz, 50 or 60 for the mains."
+            f"{0.5 * readings_per_tick * rate_hz:g} Hz, 50 or 60 for the mains."
         )
 
 
-def _shear_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield a message if shear force and torque are measured along the same axis."""
-    torque, shear = values["sensor.projection"], values["sensor.shear_projection"]
-    projection_product = sum(a * b for a, b in zip(torque, shear, strict=True)) ** 2
-    squared_lengths = sum(a * a for a in torque) * sum(b * b for b in shear)
+def _shear_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield a message if a profile has the same sensor axis for shear force and torque."""
+    torque_projection, shear_projection = (
+        profile_values["sensor.projection"],
+        profile_values["sensor.shear_projection"],
+    )
+    projection_product = (
+        sum(a * b for a, b in zip(torque_projection, shear_projection, strict=True)) ** 2
+    )
+    squared_lengths = sum(a * a for a in torque_projection) * sum(b * b for b in shear_projection)
     if squared_lengths > 0 and projection_product > (1 - _PARALLEL_TOLERANCE) * squared_lengths:
         yield (
-            f"sensor.shear_projection = {_text(shear)} is a multiple of sensor.projection: shear "
+            f"sensor.shear_projection = {_text(shear_projection)} is a multiple of "
+            "sensor.projection: shear "
             "and torque could not be told apart; give the row that makes the force across the beam "
             "of the wrench."
         )
 
 
-def _obstacle_problems(values: Mapping[str, Any]) -> Iterator[str]:
+def _obstacle_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for invalid or incompatible obstacles of a simulated rig."""
     beam = Beam(
-        values["beam.length_m"],
-        values["beam.density_kg_per_m"],
-        values["beam.bending_stiffness_n_m2"],
+        profile_values["beam.length_m"],
+        profile_values["beam.density_kg_per_m"],
+        profile_values["beam.bending_stiffness_n_m2"],
     )
-    effects = {name: values.get(f"simulation.{name}") for name in INCOMPATIBLE_WITH_OBSTACLES}
-    for text in values.get("simulation.obstacles") or ():
+    effect_values = {
+        effect_name: profile_values.get(f"simulation.{effect_name}")
+        for effect_name in INCOMPATIBLE_WITH_OBSTACLES
+    }
+    for obstacle_text in profile_values.get("simulation.obstacles") or ():
         try:
-            check_obstacles([parse_obstacle(text)], beam, effects)
+            check_obstacles([parse_obstacle(obstacle_text)], beam, effect_values)
         except ObstacleError as error:
             yield f"simulation.obstacles: {error}"
 
 
-def _unreachable_limits(values: Mapping[str, Any]) -> Iterator[str]:
+def _unreachable_limits(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for limits so high that this rig cannot exceed them."""
-    angle_rad, inertia_kg_m2 = values["limits.angle_rad"], values["motor.inertia_kg_m2"]
-    own_rad_s2 = values["motor.peak_torque_nm"] / inertia_kg_m2
-    bounds = f"limits.angle_rad = {angle_rad:g} rad to either side"
-    error, speed = values["limits.tracking_error_rad"], values["limits.velocity_rad_s"]
-    if error >= 2 * angle_rad:
+    angle_rad, inertia_kg_m2 = (
+        profile_values["limits.angle_rad"],
+        profile_values["motor.inertia_kg_m2"],
+    )
+    own_rad_s2 = profile_values["motor.peak_torque_nm"] / inertia_kg_m2
+    bounds_text = f"limits.angle_rad = {angle_rad:g} rad to either side"
+    error_limit_rad, speed_limit_rad_s = (
+        profile_values["limits.tracking_error_rad"],
+        profile_values["limits.velocity_rad_s"],
+    )
+    if error_limit_rad >= 2 * angle_rad:
         yield (
-            f"limits.tracking_error_rad = {error:g} rad can never be exceeded: reference and angle "
-            f"are within {bounds}; choose less than {2 * angle_rad:g} rad, some three times the "
+            f"limits.tracking_error_rad = {error_limit_rad:g} rad can never be exceeded: "
+            "reference and angle "
+            f"are within {bounds_text}; choose less than {2 * angle_rad:g} rad, some three "
+            "times the "
             "error of your excitation."
         )
     max_speed_rad_s = sqrt(2 * own_rad_s2 * 2 * angle_rad)
-    if speed >= max_speed_rad_s:
+    if speed_limit_rad_s >= max_speed_rad_s:
         yield (
-            f"limits.velocity_rad_s = {speed:g} rad/s can never be exceeded: the peak torque "
-            f"accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between {bounds}; choose "
+            f"limits.velocity_rad_s = {speed_limit_rad_s:g} rad/s can never be exceeded: the "
+            "peak torque "
+            f"accelerates the motor alone to {max_speed_rad_s:.4g} rad/s between "
+            f"{bounds_text}; choose "
             "less, some three times the speed of your excitation."
         )
-    jump_limit = values["limits.acceleration_rad_s2"]
+    jump_limit = profile_values["limits.acceleration_rad_s2"]
     if jump_limit > _MAX_ACCELERATION_FACTOR * own_rad_s2:
         yield (
             f"limits.acceleration_rad_s2 = {jump_limit:g} rad/s² finds no jump of the encoder: it "
             f"is more than {_MAX_ACCELERATION_FACTOR:g} times the {own_rad_s2:.4g} rad/s² that the "
             "peak torque gives the motor alone; choose some two to five times that."
         )
-    lag = values["limits.recorder_lag_s"]
+    lag = profile_values["limits.recorder_lag_s"]
     if lag >= RECORDER_BUFFER_S:
         yield (
             f"limits.recorder_lag_s = {lag:g} s can never be exceeded: shared memory holds "
@@ -283,17 +316,19 @@ def _unreachable_limits(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def missing_key_messages(absent: list[str], values: Mapping[str, Any]) -> Iterator[str]:
+def missing_key_messages(
+    missing_keys: list[str], profile_values: Mapping[str, Any]
+) -> Iterator[str]:
     """Yield a message for each missing key or section.
 
-    `absent` has the missing keys, `values` the values of the file.
+    `missing_keys` has the missing keys, `profile_values` the values of the file.
     """
-    reported = set()
-    for key in absent:
+    reported_sections = set()
+    for key in missing_keys:
         section = key.rpartition(".")[0]
-        if section and not any(k.rpartition(".")[0] == section for k in values):
-            if section not in reported:
-                reported.add(section)
+        if section and not any(k.rpartition(".")[0] == section for k in profile_values):
+            if section not in reported_sections:
+                reported_sections.add(section)
                 yield f"section [{section}] is missing."
         elif key in TEXT_KEYS:
             yield f'{key} is missing; add {key} = "…" at the top.'
@@ -301,32 +336,40 @@ def missing_key_messages(absent: list[str], values: Mapping[str, Any]) -> Iterat
             yield f'{key} is missing; add it as {{ value = …, source = "…" }}{_unit(key, " in")}.'
 
 
-def unknown_key_message(key: str, values: Mapping[str, Any]) -> str:
+def unknown_key_message(key: str, profile_values: Mapping[str, Any]) -> str:
     """Return the message for an unknown key, with the key that was probably meant."""
     if key in SECTIONS:
-        return f"{key} = {_text(values[key])} must be a section; write [{key}] and its keys below."
+        return (
+            f"{key} = {_text(profile_values[key])} must be a section; write [{key}] and its keys "
+            "below."
+        )
     section = key.rpartition(".")[0]
     section_keys = [k for k in key_types() if k.rpartition(".")[0] == section]
     if not section_keys:
-        similar = difflib.get_close_matches(section or key, SECTIONS, 1)
-        hint = (
-            f"did you mean [{similar[0]}]?" if similar else f"sections are {', '.join(SECTIONS)}."
+        similar_names = difflib.get_close_matches(section or key, SECTIONS, 1)
+        hint_text = (
+            f"did you mean [{similar_names[0]}]?"
+            if similar_names
+            else f"sections are {', '.join(SECTIONS)}."
         )
-        return f"{key} is not a key of a profile; {hint}"
-    for candidate in section_keys:
-        suffix = suffix_of(candidate)
-        key_without_unit = candidate.removesuffix(suffix)
-        if suffix and key.startswith(key_without_unit + "_"):
+        return f"{key} is not a key of a profile; {hint_text}"
+    for candidate_key in section_keys:
+        unit_suffix = suffix_of(candidate_key)
+        key_without_unit = candidate_key.removesuffix(unit_suffix)
+        if unit_suffix and key.startswith(key_without_unit + "_"):
             return (
-                f"{key} = {_text(values[key])} has the wrong unit "
-                f"('{key.removeprefix(key_without_unit + '_')}'); write {candidate}, the value in "
-                f"{UNITS[suffix]}."
+                f"{key} = {_text(profile_values[key])} has the wrong unit "
+                f"('{key.removeprefix(key_without_unit + '_')}'); write {candidate_key}, the "
+                "value in "
+                f"{UNITS[unit_suffix]}."
             )
-    similar = difflib.get_close_matches(key, section_keys, 1)
-    if similar:
-        return f"{key} is unknown; did you mean {similar[0]}{_unit(similar[0], ', in')}?"
-    names = ", ".join(k.rpartition(".")[2] for k in section_keys)
-    return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names}."
+    similar_names = difflib.get_close_matches(key, section_keys, 1)
+    if similar_names:
+        return (
+            f"{key} is unknown; did you mean {similar_names[0]}{_unit(similar_names[0], ', in')}?"
+        )
+    names_text = ", ".join(k.rpartition(".")[2] for k in section_keys)
+    return f"{key} is unknown; {f'[{section}]' if section else 'the top'} has {names_text}."
 
 
 _REQUIRED_TYPES = {  # Required value, by the type of pydantic's error
@@ -348,31 +391,31 @@ _BOUND_WORDS = {  # Name of the bound in pydantic's error, and its wording, by t
 }
 
 
-def wrong_value_message(detail: ErrorDetails) -> str:
+def wrong_value_message(error_detail: ErrorDetails) -> str:
     """Return the message for a value of the wrong type or outside its range."""
-    key, *position = detail["loc"]
-    if detail["type"] == "missing":  # one of the six
-        position = []
-    item_key = f"{key}[{position[0]}]" if position else str(key)
-    statement = f"{item_key} = {_text(detail['input'])}{_unit(str(key))}"
-    if detail["type"] == "literal_error":
-        remedy = f"must be {detail['ctx']['expected']}".replace("'", '"')
-    elif detail["type"] in _BOUND_WORDS:
-        name, bound_words = _BOUND_WORDS[detail["type"]]
-        remedy = f"must be {bound_words} {detail['ctx'][name]:g}"
+    key, *item_position = error_detail["loc"]
+    if error_detail["type"] == "missing":  # one of the six
+        item_position = []
+    item_key = f"{key}[{item_position[0]}]" if item_position else str(key)
+    statement = f"{item_key} = {_text(error_detail['input'])}{_unit(str(key))}"
+    if error_detail["type"] == "literal_error":
+        remedy_text = f"must be {error_detail['ctx']['expected']}".replace("'", '"')
+    elif error_detail["type"] in _BOUND_WORDS:
+        bound_name, bound_words = _BOUND_WORDS[error_detail["type"]]
+        remedy_text = f"must be {bound_words} {error_detail['ctx'][bound_name]:g}"
         if str(key).startswith("beam.damping."):
-            remedy += ": a negative coefficient or an order of 2 or more is an unstable beam"
-    elif detail["type"] == "tuple_type" and not is_number(key_types()[str(key)]):
-        remedy = "must be an array of texts in quotes"
+            remedy_text += ": a negative coefficient or an order of 2 or more is an unstable beam"
+    elif error_detail["type"] == "tuple_type" and not is_number(key_types()[str(key)]):
+        remedy_text = "must be an array of texts in quotes"
     else:
-        remedy = f"must be {_REQUIRED_TYPES.get(detail['type'], detail['msg'])}"
-    return f"{statement} {remedy}."
+        remedy_text = f"must be {_REQUIRED_TYPES.get(error_detail['type'], error_detail['msg'])}"
+    return f"{statement} {remedy_text}."
 
 
 def _unit(key: str, before: str = "") -> str:
-    """Return the unit of a key with `before` and a space in front of it, or ""."""
-    unit = _AXIS_UNITS.get(key) or unit_of(key)
-    return f"{before} {unit}" if unit else ""
+    """Return a profile key's unit after `before` and a space, or "" if it has no unit."""
+    unit_text = _AXIS_UNITS.get(key) or unit_of(key)
+    return f"{before} {unit_text}" if unit_text else ""
 
 
 def _text(value: object) -> str:
@@ -384,62 +427,69 @@ def _text(value: object) -> str:
     if isinstance(value, bool):
         return str(value).lower()
     if isinstance(value, tuple | list):
-        shown = [_text(item) for item in value[:_MAX_ITEMS]]
-        return f"[{', '.join(shown)}{', …' if len(value) > _MAX_ITEMS else ''}]"
+        shown_items = [_text(list_item) for list_item in value[:_MAX_ITEMS]]
+        return f"[{', '.join(shown_items)}{', …' if len(value) > _MAX_ITEMS else ''}]"
     return printable(
         f"{value:g}" if isinstance(value, float) else str(value), _MAX_VALUE_CHARACTERS
     )
 
 
-def _quoted_choice(words: tuple[str, ...]) -> str:
+def _quoted_choice(choices: tuple[str, ...]) -> str:
     """Return the words in quotes, joined by "or"."""
-    return " or ".join(f'"{word}"' for word in words)
+    return " or ".join(f'"{choice}"' for choice in choices)
 
 
 # Devices and their wiring
 
 
-def wiring_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def wiring_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for contradictions in the settings of the devices and their wiring."""
-    absent = list(_section_problems(values))
-    yield from absent
-    if absent:
+    section_messages = list(_section_problems(profile_values))
+    yield from section_messages
+    if section_messages:
         return
-    if "acquisition.mode" in values:
-        yield from _acquisition_contradictions(values)
-    if "cia402.node_id" in values:
-        yield from _drive_contradictions(values)
-    if "ati_serial.port" in values:
-        yield from _serial_contradictions(values)
-    yield from _delay_contradictions(values)
+    if "acquisition.mode" in profile_values:
+        yield from _acquisition_contradictions(profile_values)
+    if "cia402.node_id" in profile_values:
+        yield from _drive_contradictions(profile_values)
+    if "ati_serial.port" in profile_values:
+        yield from _serial_contradictions(profile_values)
+    yield from _delay_contradictions(profile_values)
 
 
-def _section_problems(values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for missing and for unused sections of the selected devices."""
-    drive, sensor = values["devices.drive"], values["devices.sensor"]
-    required = {*DEVICE_SECTIONS.get(drive, ()), *DEVICE_SECTIONS.get(sensor, ())}
-    used_sections = {
-        section
-        for section in {name for names in DEVICE_SECTIONS.values() for name in names}
-        if any(key in values for key, _ in section_fields(section))
+def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
+    """Yield messages for profile sections that the selected devices lack or do not use."""
+    drive_name, sensor_name = profile_values["devices.drive"], profile_values["devices.sensor"]
+    required_sections = {
+        *DEVICE_SECTIONS.get(drive_name, ()),
+        *DEVICE_SECTIONS.get(sensor_name, ()),
     }
-    for section in sorted(required - used_sections):
+    used_sections = {
+        section_name
+        for section_name in {
+            device_name
+            for section_names in DEVICE_SECTIONS.values()
+            for device_name in section_names
+        }
+        if any(key in profile_values for key, _ in section_fields(section_name))
+    }
+    for section_name in sorted(required_sections - used_sections):
         yield (
-            f'section [{section}] is missing, which devices.drive = "{drive}" with '
-            f'devices.sensor = "{sensor}" needs.'
+            f'section [{section_name}] is missing, which devices.drive = "{drive_name}" with '
+            f'devices.sensor = "{sensor_name}" needs.'
         )
     # Any profile may have the noise and offset of a simulated rig.
-    for section in sorted(used_sections - required - {"simulation"}):
+    for section_name in sorted(used_sections - required_sections - {"simulation"}):
         yield (
-            f'section [{section}] belongs to none of devices.drive = "{drive}" and '
-            f'devices.sensor = "{sensor}"; remove it.'
+            f'section [{section_name}] belongs to none of devices.drive = "{drive_name}" and '
+            f'devices.sensor = "{sensor_name}"; remove it.'
         )
 
 
-def _acquisition_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield a message if the deadline of the replies is longer than a period."""
-    period_us = 1e6 / values["rig.rate_hz"]
-    deadline_us = values["acquisition.deadline_us"]
+    period_us = 1e6 / profile_values["rig.rate_hz"]
+    deadline_us = profile_values["acquisition.deadline_us"]
     if deadline_us >= period_us:
         yield (
             f"acquisition.deadline_us = {deadline_us:g} µs is not below the period of "
@@ -447,93 +497,106 @@ def _acquisition_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
-def _drive_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for contradictions in the settings of a CiA 402 drive."""
-    if values["cia402.direction"] == 0:
+    if profile_values["cia402.direction"] == 0:
         yield "cia402.direction = 0 must be 1, or -1 where the drive turns the other way round."
-    if values["cia402.host_node_id"] == values["cia402.node_id"]:
+    if profile_values["cia402.host_node_id"] == profile_values["cia402.node_id"]:
         yield (
-            f"cia402.host_node_id = {values['cia402.host_node_id']} is the drive's own "
+            f"cia402.host_node_id = {profile_values['cia402.host_node_id']} is the drive's own "
             "cia402.node_id; choose another."
         )
-    speed, limit = values["cia402.max_speed_rad_s"], values["limits.velocity_rad_s"]
-    if 0 < speed < limit:
+    max_speed_rad_s, speed_limit_rad_s = (
+        profile_values["cia402.max_speed_rad_s"],
+        profile_values["limits.velocity_rad_s"],
+    )
+    if 0 < max_speed_rad_s < speed_limit_rad_s:
         yield (
-            f"cia402.max_speed_rad_s = {speed:g} rad/s is below limits.velocity_rad_s = {limit:g} "
+            f"cia402.max_speed_rad_s = {max_speed_rad_s:g} rad/s is below "
+            f"limits.velocity_rad_s = {speed_limit_rad_s:g} "
             "rad/s; the drive would hold back torques that a session may ask for. Choose a quarter "
             "more than the limit, or 0 to leave what the drive has."
         )
-    ratio = values["motor.peak_torque_nm"] / values["motor.rated_torque_nm"]
-    if ratio > _PER_MILLE_LIMIT:
+    peak_ratio = profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
+    if peak_ratio > _PER_MILLE_LIMIT:
         yield (
-            f"motor.peak_torque_nm is {ratio:g} times motor.rated_torque_nm; the drive's target "
+            f"motor.peak_torque_nm is {peak_ratio:g} times motor.rated_torque_nm; the "
+            "drive's target "
             f"torque reaches {_PER_MILLE_LIMIT:g} times."
         )
     for key_prefix in ("", "drive_"):
-        period, timeout = (
+        period_text, timeout_text = (
             f"cia402.{key_prefix}heartbeat_period_s",
             f"cia402.{key_prefix}heartbeat_timeout_s",
         )
-        for key in (period, timeout):
-            if abs(values[key] * 1000 - round(values[key] * 1000)) > 1e-6 or values[key] < 1e-3:
-                yield f"{key} = {values[key]:g} s must be a whole number of milliseconds."
-        if values[timeout] < 2 * values[period]:
+        for key in (period_text, timeout_text):
+            if (
+                abs(profile_values[key] * 1000 - round(profile_values[key] * 1000)) > 1e-6
+                or profile_values[key] < 1e-3
+            ):
+                yield f"{key} = {profile_values[key]:g} s must be a whole number of milliseconds."
+        if profile_values[timeout_text] < 2 * profile_values[period_text]:
             yield (
-                f"{timeout} = {values[timeout]:g} s is below twice {period} = "
-                f"{values[period]:g} s; a single late heartbeat would end a session."
+                f"{timeout_text} = {profile_values[timeout_text]:g} s is below twice "
+                f"{period_text} = "
+                f"{profile_values[period_text]:g} s; a single late heartbeat would end a session."
             )
 
-    for number, text in enumerate(values["cia402.set_objects"]):
+    for entry_number, entry_text in enumerate(profile_values["cia402.set_objects"]):
         try:
-            parse_assignment(text)
+            parse_assignment(entry_text)
         except ValueError as error:
-            yield f'cia402.set_objects[{number}] = "{text}" {error}.'
-    for number, name in enumerate(values["cia402.accept_without"]):
-        if name not in ACCEPTABLE:
+            yield f'cia402.set_objects[{entry_number}] = "{entry_text}" {error}.'
+    for entry_number, key_name in enumerate(profile_values["cia402.accept_without"]):
+        if key_name not in ACCEPTABLE:
             yield (
-                f'cia402.accept_without[{number}] = "{name}" is nothing that a profile can accept '
+                f'cia402.accept_without[{entry_number}] = "{key_name}" is nothing that a '
+                "profile can accept "
                 f"the absence of; choose {', '.join(ACCEPTABLE)}."
             )
 
 
-def _serial_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for contradictions in the settings of a sensor on a serial line."""
-    if values["acquisition.mode"] != "same_tick":
+    if profile_values["acquisition.mode"] != "same_tick":
         yield (
             'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
             'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
         )
-    baud, stream_hz = values["ati_serial.baud"], values["ati_serial.stream_hz"]
+    baud, stream_hz = profile_values["ati_serial.baud"], profile_values["ati_serial.stream_hz"]
     max_records_hz = baud / RECORD_BITS
     if stream_hz > max_records_hz:
         yield (
             f"ati_serial.stream_hz = {stream_hz:g} Hz does not fit ati_serial.baud = {baud}, which "
             f"carries {max_records_hz:.0f} records a second; choose 1250000."
         )
-    if stream_hz < values["rig.rate_hz"]:
+    if stream_hz < profile_values["rig.rate_hz"]:
         yield (
             f"ati_serial.stream_hz = {stream_hz:g} Hz is below rig.rate_hz = "
-            f"{values['rig.rate_hz']:g} Hz; there would be ticks without a record."
+            f"{profile_values['rig.rate_hz']:g} Hz; there would be ticks without a record."
         )
 
 
-def _delay_contradictions(values: Mapping[str, Any]) -> Iterator[str]:
+def _delay_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for delays that are shorter than their protocol allows."""
-    period_s = 1 / values["rig.rate_hz"]
-    reply_s = period_s if values.get("acquisition.mode") == "previous_tick" else 0.0
+    period_s = 1 / profile_values["rig.rate_hz"]
+    reply_s = period_s if profile_values.get("acquisition.mode") == "previous_tick" else 0.0
     wrench_s, wrench_cause = reply_s, "the reply of the previous tick"
-    if "ati_serial.port" in values:
-        serial = AtiSerial(**{field: values[key] for key, field in section_fields("ati_serial")})
-        wrench_s = serial.filter_delay_s(values["rig.rate_hz"])
+    if "ati_serial.port" in profile_values:
+        serial_settings = AtiSerial(
+            **{field_name: profile_values[key] for key, field_name in section_fields("ati_serial")}
+        )
+        wrench_s = serial_settings.filter_delay_s(profile_values["rig.rate_hz"])
         wrench_cause = "the filter of the sensor's records"
-    delivery_s = period_s if values.get("cia402.torque_delivery") == "at_sync" else 0.0
-    causes = (
+    delivery_s = period_s if profile_values.get("cia402.torque_delivery") == "at_sync" else 0.0
+    delay_causes = (
         ("encoder.delay_s", reply_s, "the reply of the previous tick"),
         ("sensor.delay_s", wrench_s, wrench_cause),
         ("actuation.delay_s", delivery_s, "a torque that takes effect at the next SYNC"),
     )
-    for key, least_s, cause in causes:
-        if values[key] < least_s - _ROUNDING_S:
+    for key, least_s, delay_cause in delay_causes:
+        if profile_values[key] < least_s - _ROUNDING_S:
             yield (
-                f"{key} = {values[key]:g} s is less than {cause} alone: at least {least_s:.6g} s."
+                f"{key} = {profile_values[key]:g} s is less than {delay_cause} alone: at least "
+                f"{least_s:.6g} s."
             )

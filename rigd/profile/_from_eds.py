@@ -106,29 +106,31 @@ class Draft:
         self._path = path
         self._findings = suitability.findings
         self._accepted: list[str] = []
-        self._settings = {setting.key: setting for setting in self._eds_settings()}
+        self._settings = {
+            reset_setting.key: reset_setting for reset_setting in self._eds_settings()
+        }
         # The base profile has another motor, gear and encoder: none of their values is used.
-        for question in self.questions():
-            if question.key in MAY_BE_UNKNOWN and question.key not in self._settings:
-                self._settings[question.key] = Setting(question.key, math.nan, UNKNOWN)
+        for open_question in self.questions():
+            if open_question.key in MAY_BE_UNKNOWN and open_question.key not in self._settings:
+                self._settings[open_question.key] = Setting(open_question.key, math.nan, UNKNOWN)
 
     def _draft_value(self, key: str) -> SettingValue:
         """Return the value of a key in the draft."""
         if key in self._settings:
             return self._settings[key].value
-        section, _, name = key.rpartition(".")
-        section_settings: object = getattr(self._base.rig, section)
-        value: SettingValue = getattr(section_settings, name)
-        return value
+        section_name, _, field_name = key.rpartition(".")
+        section_settings: object = getattr(self._base.rig, section_name)
+        setting_value: SettingValue = getattr(section_settings, field_name)
+        return setting_value
 
-    def answer(self, key: str, text: str) -> None:
+    def answer(self, key: str, answer_text: str) -> None:
         """Set the value of a key of the draft from the operator's answer.
 
         Parameters
         ----------
         key
             Dotted key of the profile.
-        text
+        answer_text
             Answer of the operator. After ``unknown`` the value remains to be filled in, if the
             profile allows this.
 
@@ -137,16 +139,16 @@ class Draft:
         ValueError
             If the value is invalid; the message states the valid values.
         """
-        if text == UNKNOWN and key in MAY_BE_UNKNOWN:
+        if answer_text == UNKNOWN and key in MAY_BE_UNKNOWN:
             self._settings[key] = Setting(key, math.nan, UNKNOWN)
             return
-        annotation: Any = key_types()[key]
+        value_type: Any = key_types()[key]
         try:
-            value = TypeAdapter(annotation).validate_strings(text)
+            answered_value = TypeAdapter(value_type).validate_strings(answer_text)
         except ValidationError as error:
             raise ValueError(error.errors(include_url=False)[0]["msg"]) from None
-        if value != self._draft_value(key):
-            self._settings[key] = Setting(key, value, "datasheet")
+        if answered_value != self._draft_value(key):
+            self._settings[key] = Setting(key, answered_value, "datasheet")
 
     def value_text(self, key: str) -> str:
         """Return the draft's value of a key as text, or ``unknown``.
@@ -159,7 +161,7 @@ class Draft:
         return UNKNOWN if self._is_unknown(key) else str(self._draft_value(key))
 
     def _is_unknown(self, key: str) -> bool:
-        """Return whether the draft states a key as unknown."""
+        """Return whether the draft of the profile states a key's value as unknown."""
         return key in self._settings and self._settings[key].source == UNKNOWN
 
     def unaccepted_findings(self) -> list[SuitabilityFinding]:
@@ -170,10 +172,16 @@ class Draft:
         ProfileError
             If the values of the draft contradict one another.
         """
-        accepted = Setting(_ACCEPT_KEY, tuple(self._accepted))
-        text = with_settings(self._base.text, [*self._settings.values(), accepted])
-        findings = check_suitability(self._eds, profile_from_text(text, self._path).rig).findings
-        return [each for each in findings if each.accept and each.grade is Grade.REFUSED]
+        acceptance_setting = Setting(_ACCEPT_KEY, tuple(self._accepted))
+        draft_text = with_settings(self._base.text, [*self._settings.values(), acceptance_setting])
+        drive_findings = check_suitability(
+            self._eds, profile_from_text(draft_text, self._path).rig
+        ).findings
+        return [
+            finding
+            for finding in drive_findings
+            if finding.accept and finding.grade is Grade.REFUSED
+        ]
 
     def accept(self, name: str) -> None:
         """Accept a missing feature of the drive in the draft, as decided by the operator.
@@ -188,14 +196,14 @@ class Draft:
     @property
     def remarks(self) -> list[str]:
         """Sentences for the operator on what remains uncertain about this drive."""
-        findings = check_suitability(
+        drive_findings = check_suitability(
             self._eds, profile_from_text(self._text_without_head(), self._path).rig
         ).findings
-        remarks = [f.sentence for f in findings if f.sentence]
+        remarks = [f.sentence for f in drive_findings if f.sentence]
         return remarks + [
             f"The file does not tell what {f.what} holds, which has to be {f.wanted}: "
             "rigd check asks the drive."
-            for f in findings
+            for f in drive_findings
             if f.grade is Grade.ASK and f.wanted
         ]
 
@@ -204,8 +212,12 @@ class Draft:
         additional_questions = (
             (_OWN_WATCHDOG_QUESTION,) if WATCHDOG in self._missing_feature_names() else ()
         )
-        absent = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
-        return [each for each in (*QUESTIONS, *additional_questions) if each.key not in absent]
+        unneeded_keys = set() if self._eds.get(RATED_TORQUE) else {"cia402.rated_torque_unit_nm"}
+        return [
+            question
+            for question in (*QUESTIONS, *additional_questions)
+            if question.key not in unneeded_keys
+        ]
 
     def unanswered_questions(self) -> list[Question]:
         """Return the questions whose key is unknown or still has the value of the base profile."""
@@ -214,7 +226,7 @@ class Draft:
             for key, setting in self._settings.items()
             if setting.reason != _OTHER_DRIVE_COMMENT and setting.source != UNKNOWN
         }
-        return [each for each in self.questions() if each.key not in answered_keys]
+        return [question for question in self.questions() if question.key not in answered_keys]
 
     def text(self) -> str:
         """Return the text of the finished profile.
@@ -224,9 +236,9 @@ class Draft:
         ProfileError
             If the values of the draft contradict one another.
         """
-        text = self._text_without_head()
-        profile_from_text(text, self._path)
-        return with_head(text, self._head_comment())
+        profile_text = self._text_without_head()
+        profile_from_text(profile_text, self._path)
+        return with_head(profile_text, self._head_comment())
 
     def _text_without_head(self) -> str:
         """Return the text of the profile with its settings, but without the new head."""
@@ -239,38 +251,47 @@ class Draft:
             )
             for question in self.unanswered_questions()
         ]
-        settings = [*self._settings.values(), *marked_settings, *self._acceptance()]
-        return with_settings(self._base.text, settings)
+        all_settings = [*self._settings.values(), *marked_settings, *self._acceptance()]
+        return with_settings(self._base.text, all_settings)
 
     def _acceptance(self) -> Iterator[Setting]:
         """Yield the setting that accepts missing features of the drive, if one is needed.
 
         If the operator has accepted none yet, the setting is written as a comment.
         """
-        undecided = [finding.accept for finding in self.unaccepted_findings()]
+        undecided_names = [finding.accept for finding in self.unaccepted_findings()]
         limit_objects = (
-            self._manufacturer_limits() if TORQUE_LIMIT in (*undecided, *self._accepted) else ""
+            self._manufacturer_limits()
+            if TORQUE_LIMIT in (*undecided_names, *self._accepted)
+            else ""
         )
-        hint = (
+        hint_text = (
             f" For a torque limit of its own see {limit_objects}, set by cia402.set_objects."
             if limit_objects
             else ""
         )
         if self._accepted:
-            why = "The drive lacks, by its file, what these names stand for (docs/devices.md)."
-            why += (
-                f" Not accepted, so that rigd refuses it: {', '.join(undecided)}."
-                if undecided
+            acceptance_comment = (
+                "The drive lacks, by its file, what these names stand for (docs/devices.md)."
+            )
+            acceptance_comment += (
+                f" Not accepted, so that rigd refuses it: {', '.join(undecided_names)}."
+                if undecided_names
                 else ""
             )
-            yield Setting(_ACCEPT_KEY, tuple(self._accepted), reason=why + hint)
-        elif undecided:
-            why = (
+            yield Setting(_ACCEPT_KEY, tuple(self._accepted), reason=acceptance_comment + hint_text)
+        elif undecided_names:
+            acceptance_comment = (
                 "TO FILL IN: the drive lacks, by its file, what these names stand for "
                 "(docs/devices.md), and rigd refuses it. Take the # away, and from the list what "
                 "must not be missing."
             )
-            yield Setting(_ACCEPT_KEY, tuple(undecided), reason=why + hint, commented=True)
+            yield Setting(
+                _ACCEPT_KEY,
+                tuple(undecided_names),
+                reason=acceptance_comment + hint_text,
+                commented=True,
+            )
         elif self._base.rig.cia402 is not None and self._base.rig.cia402.accept_without:
             yield Setting(_ACCEPT_KEY, (), reason="The drive has, by its file, all that is needed.")
 
@@ -281,39 +302,45 @@ class Draft:
     def _eds_settings(self) -> Iterator[Setting]:
         """Yield the settings that follow from the EDS file and from missing features."""
         eds, path = self._eds, self._path
-        product = " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
+        product_name = (
+            " ".join(filter(None, (eds.vendor_name, eds.product_name))) or "CiA 402 drive"
+        )
         yield Setting("name", path.stem)
-        yield Setting("description", f"{product}, from {eds.path.name}")
+        yield Setting("description", f"{product_name}, from {eds.path.name}")
         relative_path = os.path.relpath(eds.path.resolve(), path.resolve().parent)
         yield Setting(
             "cia402.eds", relative_path, reason="The file of the drive, from this folder on."
         )
-        for key, number in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
-            if number:
-                yield Setting(f"cia402.{key}", number, "datasheet", hexadecimal=True)
+        for key, eds_node_id in (("vendor_id", eds.vendor_id), ("product_code", eds.product_code)):
+            if eds_node_id:
+                yield Setting(f"cia402.{key}", eds_node_id, "datasheet", hexadecimal=True)
         if eds.commissioned_node_id:
-            why = "The node id for which the file configures the drive."
-            yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", why)
+            setting_comment = "The node id for which the file configures the drive."
+            yield Setting("cia402.node_id", eds.commissioned_node_id, "datasheet", setting_comment)
         can = self._base.rig.can
         if can is not None and eds.bit_rates_bit_s and can.bitrate_bit_s not in eds.bit_rates_bit_s:
-            why = f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
-            yield Setting("can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", why)
+            setting_comment = (
+                f"The drive has no {can.bitrate_bit_s / 1000:g} kbit/s; this is its highest."
+            )
+            yield Setting(
+                "can.bitrate_bit_s", max(eds.bit_rates_bit_s), "datasheet", setting_comment
+            )
         yield from self._reset_settings()
         yield from self._missing_object_settings()
 
     def _reset_settings(self) -> Iterator[Setting]:
-        """Yield settings that reset what is specific to the drive of the base profile."""
-        drive = self._base.rig.cia402
-        assert drive is not None
-        if drive.set_objects:
+        """Yield settings that replace values which hold only for the base profile's drive."""
+        drive_settings = self._base.rig.cia402
+        assert drive_settings is not None
+        if drive_settings.set_objects:
             yield Setting("cia402.set_objects", (), reason=_OTHER_DRIVE_COMMENT)
-        if drive.own_watchdog_s:
+        if drive_settings.own_watchdog_s:
             yield Setting("cia402.own_watchdog_s", 0.0, "assumed", _OTHER_DRIVE_COMMENT)
 
     def _missing_object_settings(self) -> Iterator[Setting]:
         """Yield a setting of 0 for each optional object that the drive lacks."""
         missing_names = self._missing_feature_names()
-        for is_missing, key, why in (
+        for object_missing, key, why in (
             (
                 not self._eds.get(MAX_SPEED_RPM),
                 "max_speed_rad_s",
@@ -326,7 +353,7 @@ class Draft:
             ),
             (TORQUE_FEEDBACK in missing_names, "torque_tolerance_percent", "6077 (actual torque)"),
         ):
-            if is_missing:
+            if object_missing:
                 yield Setting(f"cia402.{key}", 0.0, "datasheet", f"The drive has no object {why}.")
 
     def _manufacturer_limits(self) -> str:
@@ -359,7 +386,7 @@ class Draft:
             "  assumed    of the profile started from: check those marked TO FILL IN first",
             "Units are in the keys; angles and torques are at the output shaft, behind the gear.",
             *(
-                ["", "Of this drive:", *(f"* {doubt}" for doubt in self.remarks)]
+                ["", "Of this drive:", *(f"* {file_doubt}" for file_doubt in self.remarks)]
                 if self.remarks
                 else []
             ),

@@ -67,8 +67,8 @@ def load_profile(name_or_path: str | Path) -> Profile:
     >>> rig.rate_hz, rig.beam.length_m
     (1000.0, 0.98)
     """
-    path = _find_profile(name_or_path)
-    return profile_from_text(read_text(path), path)
+    profile_path = _find_profile(name_or_path)
+    return profile_from_text(read_text(profile_path), profile_path)
 
 
 def read_text(path: Path) -> str:
@@ -85,35 +85,45 @@ def read_text(path: Path) -> str:
         raise ProfileError(f"{path}: {error}.") from error
 
 
-def profile_from_text(text: str, path: Path) -> Profile:
-    """Validate the text of a profile and return the profile; `path` is its file, existing or not.
+def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
+    """Validate a profile's text and return the profile; the file `profile_path` need not exist.
 
     Raises
     ------
     ProfileError
         If the text has mistakes.
     """
-    document = parse_document(text, path)
+    document = parse_document(profile_text, profile_path)
     problems: list[str] = []
-    values, sources = flatten_document(document, problems)
-    absent = {
-        name for name in OPTIONAL_SECTIONS if not any(k.startswith(name + ".") for k in values)
+    profile_values, sources = flatten_document(document, problems)
+    absent_sections = {
+        section_name
+        for section_name in OPTIONAL_SECTIONS
+        if not any(k.startswith(section_name + ".") for k in profile_values)
     }
-    unknown = frozenset(key for key, source in sources.items() if source == UNKNOWN)
-    values = validate_values(values, problems, frozenset(absent), unknown)
+    unknown_keys = frozenset(
+        key for key, number_source in sources.items() if number_source == UNKNOWN
+    )
+    profile_values = validate_values(
+        profile_values, problems, frozenset(absent_sections), unknown_keys
+    )
     if not problems:
-        problems.extend(_find_eds(path, values))
-        problems.extend(diagnostics.contradictions(values))
-        problems.extend(diagnostics.wiring_contradictions(values))
+        problems.extend(_find_eds(profile_path, profile_values))
+        problems.extend(diagnostics.contradictions(profile_values))
+        problems.extend(diagnostics.wiring_contradictions(profile_values))
     if problems:
-        raise problems_error(path, problems)
+        raise problems_error(profile_path, problems)
 
-    sections = {name: _build_section(name, values) for name in SECTIONS if name not in absent}
+    sections = {
+        section_name: _build_section(section_name, profile_values)
+        for section_name in SECTIONS
+        if section_name not in absent_sections
+    }
     return Profile(
-        name=values["name"],
-        description=values["description"],
-        path=path,
-        text=text,
+        name=profile_values["name"],
+        description=profile_values["description"],
+        path=profile_path,
+        text=profile_text,
         rig=RigParameters(
             rate_hz=sections["rig"].rate_hz,
             beam=sections["beam"].uniform,
@@ -124,7 +134,7 @@ def profile_from_text(text: str, path: Path) -> Profile:
             actuation=sections["actuation"],
             devices=sections["devices"],
             simulation=sections.get("simulation"),
-            name=values["name"],
+            name=profile_values["name"],
             can=sections.get("can"),
             acquisition=sections.get("acquisition"),
             cia402=sections.get("cia402"),
@@ -160,7 +170,7 @@ def parse_document(text: str, path: Path) -> dict[str, Any]:
 def problems_error(path: Path, problems: Iterable[str]) -> ProfileError:
     """Return the error to raise for a file, with a line for each problem."""
     # An array that is too short has an equal problem for each missing number.
-    return ProfileError("\n".join(f"{path}: {line}" for line in dict.fromkeys(problems)))
+    return ProfileError("\n".join(f"{path}: {problem}" for problem in dict.fromkeys(problems)))
 
 
 def _find_profile(name_or_path: str | Path) -> Path:
@@ -188,17 +198,21 @@ def known_profiles() -> list[str]:
 
 def _known_profiles_text() -> str:
     """Return the names of all known profiles as a clause for messages."""
-    names = known_profiles()
-    return "known profiles are " + ", ".join(names) if names else "no profiles are known here"
+    profile_names = known_profiles()
+    return (
+        "known profiles are " + ", ".join(profile_names)
+        if profile_names
+        else "no profiles are known here"
+    )
 
 
-def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
-    """Make the drive's EDS path in `values` absolute; yield a message if there is no file."""
-    eds_name = values.get("cia402.eds")
+def _find_eds(profile_path: Path, values_by_key: dict[str, Any]) -> Iterator[str]:
+    """Make the drive's EDS path in the values absolute; yield a message if there is no file."""
+    eds_name = values_by_key.get("cia402.eds")
     if not eds_name:
         return
-    eds = path.resolve().parent / eds_name
-    values["cia402.eds"] = str(eds)
+    eds = profile_path.resolve().parent / eds_name
+    values_by_key["cia402.eds"] = str(eds)
     if not eds.is_file():
         yield (
             f'cia402.eds = "{eds_name}": there is no file {eds}; give its path, relative to the '
@@ -209,35 +223,36 @@ def _find_eds(path: Path, values: dict[str, Any]) -> Iterator[str]:
 def flatten_document(
     document: Mapping[str, Any], problems: list[str]
 ) -> tuple[dict[str, Any], dict[str, str]]:
-    """Return the document's values and the numbers' sources, each by dotted keys.
+    """Return a profile's values, and the origins of its numbers, each by dotted keys.
 
-    A message for each missing or invalid source is appended to `problems`.
+    An origin is what the key ``source`` of a number states. A message for each missing or invalid
+    one is appended to `problems`.
     """
-    values: dict[str, Any] = {}
+    values_by_key: dict[str, Any] = {}
     sources: dict[str, str] = {}
     for key, entry in _dotted_entries(document, ""):
         if not isinstance(entry, dict):
-            values[key] = entry
+            values_by_key[key] = entry
             if _is_number(key):
                 problems.append(diagnostics.bare_number_message(key, entry))
             continue
-        source = entry.get("source")
-        if source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
-            sources[key] = source
-            values[key] = math.nan
+        number_source = entry.get("source")
+        if number_source == UNKNOWN and key in MAY_BE_UNKNOWN and "value" not in entry:
+            sources[key] = number_source
+            values_by_key[key] = math.nan
             continue
-        values[key] = entry.get("value")
-        if source == UNKNOWN:
+        values_by_key[key] = entry.get("value")
+        if number_source == UNKNOWN:
             problems.append(diagnostics.invalid_unknown_message(key, entry))
-        elif source in SOURCES:
-            sources[key] = source
+        elif number_source in SOURCES:
+            sources[key] = number_source
         elif _is_number(key):
-            problems.append(diagnostics.missing_source_message(key, source))
+            problems.append(diagnostics.missing_source_message(key, number_source))
         problems.extend(
-            f"{key} has the unknown part '{other}'; only value and source go there."
-            for other in sorted(entry.keys() - {"value", "source"})
+            f"{key} has the unknown part '{other_keys}'; only value and source go there."
+            for other_keys in sorted(entry.keys() - {"value", "source"})
         )
-    return values, sources
+    return values_by_key, sources
 
 
 def _is_number(key: str) -> bool:
@@ -251,73 +266,81 @@ def _dotted_entries(table: Mapping[str, Any], prefix: str) -> Iterator[tuple[str
     A table that is not a section and has ``value`` or ``source`` is the entry of a number.
     """
     for key, entry in table.items():
-        dotted = prefix + key
+        dotted_key = prefix + key
         if isinstance(entry, dict) and (
-            dotted in SECTIONS or (entry and not entry.keys() & {"value", "source"})
+            dotted_key in SECTIONS or (entry and not entry.keys() & {"value", "source"})
         ):
-            yield from _dotted_entries(entry, dotted + ".")
+            yield from _dotted_entries(entry, dotted_key + ".")
         else:
-            yield dotted, entry
+            yield dotted_key, entry
 
 
 def validate_values(
-    values: Mapping[str, Any],
+    values_by_key: Mapping[str, Any],
     problems: list[str],
-    absent: frozenset[str],
-    unknown: frozenset[str] = frozenset(),
+    absent_sections: frozenset[str],
+    unknown_keys: frozenset[str] = frozenset(),
 ) -> dict[str, Any]:
     """Check types and ranges of all values, and return them with defaults for missing keys.
 
     Parameters
     ----------
-    values
+    values_by_key
         Values of the file by dotted keys.
     problems
         List to which a message for each problem is appended.
-    absent
+    absent_sections
         Names of sections that the file omits; the top level has the empty name.
-    unknown
+    unknown_keys
         Keys whose value is unknown; their NaN is not checked.
     """
     # TOML has only arrays, and strict validation requires tuples.
-    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values.items()}
+    tuple_values = {k: tuple(v) if isinstance(v, list) else v for k, v in values_by_key.items()}
     try:
-        known_values = {key: value for key, value in tuple_values.items() if key not in unknown}
-        model = _validation_model(absent, unknown).model_validate(known_values)
+        known_values = {
+            key: key_value for key, key_value in tuple_values.items() if key not in unknown_keys
+        }
+        validation_model = _validation_model(absent_sections, unknown_keys).model_validate(
+            known_values
+        )
     except ValidationError as error:
-        details = error.errors(include_url=False)
+        error_details = error.errors(include_url=False)
         missing_keys = [
-            str(d["loc"][0]) for d in details if d["type"] == "missing" and not d["loc"][1:]
+            str(d["loc"][0]) for d in error_details if d["type"] == "missing" and not d["loc"][1:]
         ]
         problems.extend(diagnostics.missing_key_messages(missing_keys, tuple_values))
-        for detail in details:
-            if detail["type"] == "extra_forbidden":
+        for error_detail in error_details:
+            if error_detail["type"] == "extra_forbidden":
                 problems.append(
-                    diagnostics.unknown_key_message(str(detail["loc"][0]), tuple_values)
+                    diagnostics.unknown_key_message(str(error_detail["loc"][0]), tuple_values)
                 )
-            elif str(detail["loc"][0]) not in missing_keys:
-                problems.append(diagnostics.wrong_value_message(detail))
+            elif str(error_detail["loc"][0]) not in missing_keys:
+                problems.append(diagnostics.wrong_value_message(error_detail))
         return tuple_values
-    usable: dict[str, Any] = model.model_dump(by_alias=True)
-    problems.extend(diagnostics.implausible_numbers(usable))
-    return usable | dict.fromkeys(unknown, math.nan)
+    usable_values: dict[str, Any] = validation_model.model_dump(by_alias=True)
+    problems.extend(diagnostics.implausible_numbers(usable_values))
+    return usable_values | dict.fromkeys(unknown_keys, math.nan)
 
 
 @cache
-def _validation_model(absent: frozenset[str], unknown: frozenset[str]) -> type[BaseModel]:
+def _validation_model(
+    absent_sections: frozenset[str], unknown_keys: frozenset[str]
+) -> type[BaseModel]:
     """Return the pydantic model that validates all keys of a profile at once.
 
     A model for each section would be slow to build.
     """
-    definitions: dict[str, Any] = {
-        f"key_{index}": (annotation, Field(default=key_defaults().get(key, ...), alias=key))
-        for index, (key, annotation) in enumerate(key_types().items())
-        if key.rpartition(".")[0] not in absent and key not in unknown
+    field_definitions: dict[str, Any] = {
+        f"key_{key_index}": (value_type, Field(default=key_defaults().get(key, ...), alias=key))
+        for key_index, (key, value_type) in enumerate(key_types().items())
+        if key.rpartition(".")[0] not in absent_sections and key not in unknown_keys
     }
-    config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
-    return create_model("Profile", __config__=config, **definitions)
+    model_config = ConfigDict(strict=True, extra="forbid", allow_inf_nan=False)
+    return create_model("Profile", __config__=model_config, **field_definitions)
 
 
-def _build_section(sections: str, values: Mapping[str, Any]) -> Any:  # noqa: ANN401
+def _build_section(section_name: str, values_by_key: Mapping[str, Any]) -> Any:  # noqa: ANN401
     """Return the dataclass of a section with its validated values."""
-    return SECTIONS[sections](**{field: values[key] for key, field in section_fields(sections)})
+    return SECTIONS[section_name](
+        **{field_name: values_by_key[key] for key, field_name in section_fields(section_name)}
+    )

@@ -52,8 +52,8 @@ def profile_files() -> dict[str, list[ProfileFile]]:
     If several files have the same name, the first one is used and hides the others.
     """
     files_by_name: dict[str, list[ProfileFile]] = {}
-    for origin, folder in _search_folders():
-        for path in folder.glob("*.toml"):
+    for origin, search_folder in _search_folders():
+        for path in search_folder.glob("*.toml"):
             files_by_name.setdefault(path.stem, []).append(ProfileFile(path.stem, path, origin))
     return dict(sorted(files_by_name.items()))
 
@@ -66,12 +66,12 @@ def specimen_files() -> dict[str, Path]:
     """
     profile_folder = user_folder()
     paths_by_name: dict[str, Path] = {}
-    for folder in (
+    for specimen_folder in (
         SPECIMEN_FOLDER,
         *([profile_folder.with_name("specimens")] if profile_folder else []),
     ):
-        for path in folder.glob("*.toml"):
-            paths_by_name.setdefault(path.stem, path)
+        for specimen_path in specimen_folder.glob("*.toml"):
+            paths_by_name.setdefault(specimen_path.stem, specimen_path)
     return dict(sorted(paths_by_name.items()))
 
 
@@ -91,13 +91,13 @@ def user_folder() -> Path | None:
 
 def _search_folders() -> Iterator[tuple[Origin, Path]]:
     """Yield the folders that are searched for profiles, in the search order."""
-    shipped = _WHEEL_FOLDER if _WHEEL_FOLDER.is_dir() else _CHECKOUT_FOLDER
+    shipped_folder = _WHEEL_FOLDER if _WHEEL_FOLDER.is_dir() else _CHECKOUT_FOLDER
     try:
-        is_checkout_folder = WORKING_FOLDER.samefile(shipped)
+        is_checkout_folder = WORKING_FOLDER.samefile(shipped_folder)
     except OSError:  # usually the folder does not exist
         is_checkout_folder = False
     if not is_checkout_folder:
         yield Origin.HERE, WORKING_FOLDER
-    if user := user_folder():
-        yield Origin.USER, user
-    yield Origin.SHIPPED, shipped
+    if own_folder := user_folder():
+        yield Origin.USER, own_folder
+    yield Origin.SHIPPED, shipped_folder

@@ -100,9 +100,10 @@ class ScaleUncertainty:
     def stated(self) -> dict[str, float]:
         """Uncertainties in per cent that are not zero, by field name, without the uniformity."""
         return {
-            each.name: value
-            for each in fields(self)
-            if each.name != "uniformity_percent" and (value := getattr(self, each.name)) > 0
+            scale_field.name: percent
+            for scale_field in fields(self)
+            if scale_field.name != "uniformity_percent"
+            and (percent := getattr(self, scale_field.name)) > 0
         }
 
 
@@ -187,11 +188,13 @@ def key_types() -> dict[str, Any]:
 
     A profile must have all keys except those of :func:`key_defaults`.
     """
-    types: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
-    for section, cls in SECTIONS.items():
-        hints = get_type_hints(cls, include_extras=True)
-        types |= {key: hints[field] for key, field in section_fields(section)}
-    return types
+    type_by_key: dict[str, Any] = dict.fromkeys(TEXT_KEYS, Annotated[str, MinLen(1)])
+    for section_name, cls in SECTIONS.items():
+        type_hints = get_type_hints(cls, include_extras=True)
+        type_by_key |= {
+            key: type_hints[field_name] for key, field_name in section_fields(section_name)
+        }
+    return type_by_key
 
 
 @cache
@@ -202,27 +205,27 @@ def key_defaults() -> dict[str, Any]:
     unknown and not zero.
     """
     return {
-        f"{section}.{each.name}": each.default
-        for section, cls in SECTIONS.items()
-        for each in fields(cls)
-        if each.metadata.get("optional") and each.default is not MISSING
+        f"{section_name}.{dataclass_field.name}": dataclass_field.default
+        for section_name, cls in SECTIONS.items()
+        for dataclass_field in fields(cls)
+        if dataclass_field.metadata.get("optional") and dataclass_field.default is not MISSING
     }
 
 
-def is_number(annotation: Any) -> bool:  # noqa: ANN401
+def is_number(value_type: Any) -> bool:  # noqa: ANN401
     """Return whether values of a type are numbers, alone or as a tuple, which need a source."""
-    if get_origin(annotation) is Annotated:
-        annotation = get_args(annotation)[0]
-    if get_origin(annotation) is tuple:
-        return str not in get_args(annotation)
-    return annotation not in (str, bool) and get_origin(annotation) is not Literal
+    if get_origin(value_type) is Annotated:
+        value_type = get_args(value_type)[0]
+    if get_origin(value_type) is tuple:
+        return str not in get_args(value_type)
+    return value_type not in (str, bool) and get_origin(value_type) is not Literal
 
 
 def section_fields(section: str) -> list[tuple[str, str]]:
     """Return each dotted key of a section with the name of its dataclass field."""
     # A trailing underscore distinguishes the name of a field from a Python keyword.
-    names = [field.name for field in fields(SECTIONS[section])]
-    return [(f"{section}.{name.rstrip('_')}", name) for name in names]
+    field_names = [dataclass_field.name for dataclass_field in fields(SECTIONS[section])]
+    return [(f"{section}.{field_name.rstrip('_')}", field_name) for field_name in field_names]
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,9 +304,10 @@ class Profile:
     @property
     def standstill_torque_nm(self) -> float:
         """Net torque in N·m on the shaft that exceeds its largest friction."""
-        motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
+        rig_motor, stated_nm = self.rig.motor, self.limits.standstill_torque_nm
         return stated_nm or max(
-            _BREAKAWAY_TO_COULOMB * motor.coulomb_nm, _MIN_BREAKAWAY_FRACTION * motor.peak_torque_nm
+            _BREAKAWAY_TO_COULOMB * rig_motor.coulomb_nm,
+            _MIN_BREAKAWAY_FRACTION * rig_motor.peak_torque_nm,
         )
 
     @property
@@ -320,9 +324,11 @@ class Profile:
             If values of the profile are unknown; the message names each one and where to find it.
         """
         rig = self.rig
-        if unknown := describe_unknown_values(rig):
+        if unknown_keys := describe_unknown_values(rig):
             raise UnknownValueError(
-                "\n".join(f"{self.path}: {line}" for line in unknown.splitlines())
+                "\n".join(
+                    f"{self.path}: {message_line}" for message_line in unknown_keys.splitlines()
+                )
             )
         return LoopModel(
             rate_hz=rig.rate_hz,

@@ -40,7 +40,7 @@ _MAX_BYTES: Final = 16_384
 """Largest size of a specimen file in bytes, which each session sends through a pipe."""
 
 
-def load_specimen(path: Path) -> Specimen:
+def load_specimen(specimen_path: Path) -> Specimen:
     """Read and validate the file of a specimen.
 
     The file has the section ``[beam]`` of a profile. It may have ``[beam.damping]``, the keys of
@@ -48,7 +48,7 @@ def load_specimen(path: Path) -> Specimen:
 
     Parameters
     ----------
-    path
+    specimen_path
         Path of the specimen file.
 
     Returns
@@ -62,43 +62,68 @@ def load_specimen(path: Path) -> Specimen:
         If the file cannot be read or has mistakes. Every problem is reported with its key, value,
         unit and remedy.
     """
-    text = read_text(path)
-    if len(text.encode()) > _MAX_BYTES:
-        raise ProfileError(f"{path}: is longer than {_MAX_BYTES} bytes; shorten its notes.")
+    file_text = read_text(specimen_path)
+    if len(file_text.encode()) > _MAX_BYTES:
+        raise ProfileError(
+            f"{specimen_path}: is longer than {_MAX_BYTES} bytes; shorten its notes."
+        )
     problems: list[str] = []
-    values, _ = flatten_document(parse_document(text, path), problems)
-    note = values.pop(_NOTE_KEY, "")
-    if not isinstance(note, str):
-        problems.append(f"{_NOTE_KEY} = {note!r} must be text in quotes.")
+    values_by_key, _ = flatten_document(parse_document(file_text, specimen_path), problems)
+    specimen_note = values_by_key.pop(_NOTE_KEY, "")
+    if not isinstance(specimen_note, str):
+        problems.append(f"{_NOTE_KEY} = {specimen_note!r} must be text in quotes.")
     valid_prefixes = (f"{_BEAM_SECTION}.", f"{_UNCERTAINTY_SECTION}.")
     for key in [
-        key for key in values if not key.startswith(valid_prefixes) or key == _RIG_UNCERTAINTY_KEY
+        key
+        for key in values_by_key
+        if not key.startswith(valid_prefixes) or key == _RIG_UNCERTAINTY_KEY
     ]:
-        del values[key]
+        del values_by_key[key]
         problems.append(
             f"{key} does not belong to a specimen, which has [beam], [beam.damping], of "
             f"[uncertainty] all but {_RIG_UNCERTAINTY_KEY.partition('.')[2]}, and note; remove it."
         )
-    sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
-    sections |= {_DAMPING_SECTION for key in values if key.startswith(f"{_DAMPING_SECTION}.")}
-    values = validate_values(values, problems, frozenset({"", *SECTIONS} - sections))
+    known_sections = {_BEAM_SECTION, _UNCERTAINTY_SECTION}
+    known_sections |= {
+        _DAMPING_SECTION for key in values_by_key if key.startswith(f"{_DAMPING_SECTION}.")
+    }
+    values_by_key = validate_values(
+        values_by_key, problems, frozenset({"", *SECTIONS} - known_sections)
+    )
     if not problems:
-        problems.extend(diagnostics.first_mode_contradictions(values))
+        problems.extend(diagnostics.first_mode_contradictions(values_by_key))
     if problems:
-        raise problems_error(path, problems)
-    beam = BeamSection(**{field: values[key] for key, field in section_fields(_BEAM_SECTION)})
+        raise problems_error(specimen_path, problems)
+    beam = BeamSection(
+        **{field_name: values_by_key[key] for key, field_name in section_fields(_BEAM_SECTION)}
+    )
     damping = None
-    if _DAMPING_SECTION in sections:
-        damping = Damping(**{field: values[key] for key, field in section_fields(_DAMPING_SECTION)})
+    if _DAMPING_SECTION in known_sections:
+        damping = Damping(
+            **{
+                field_name: values_by_key[key]
+                for key, field_name in section_fields(_DAMPING_SECTION)
+            }
+        )
     uncertainty = ScaleUncertainty(
-        **{field: values[key] for key, field in section_fields(_UNCERTAINTY_SECTION)}
+        **{
+            field_name: values_by_key[key]
+            for key, field_name in section_fields(_UNCERTAINTY_SECTION)
+        }
     )
     return Specimen(
-        path.stem, path, text, beam.uniform, damping, uncertainty, note, beam.tip_mass_kg
+        specimen_path.stem,
+        specimen_path,
+        file_text,
+        beam.uniform,
+        damping,
+        uncertainty,
+        specimen_note,
+        beam.tip_mass_kg,
     )
 
 
-def with_specimen(profile: Profile, name: str) -> Profile:
+def with_specimen(profile: Profile, specimen_name: str) -> Profile:
     """Return the profile of a rig on which a specimen is mounted.
 
     The beam of the specimen's file replaces that of the profile.
@@ -107,7 +132,7 @@ def with_specimen(profile: Profile, name: str) -> Profile:
     ----------
     profile
         Profile of the rig.
-    name
+    specimen_name
         Name of the specimen in a session. If there is no file of that name, it is only a label and
         the profile is returned unchanged.
 
@@ -121,10 +146,10 @@ def with_specimen(profile: Profile, name: str) -> Profile:
     ProfileError
         If the specimen's file cannot be used.
     """
-    path = specimen_files().get(name.strip())
-    if path is None:
+    specimen_path = specimen_files().get(specimen_name.strip())
+    if specimen_path is None:
         return profile
-    specimen = load_specimen(path)
+    specimen = load_specimen(specimen_path)
     rig = replace(profile.rig, beam=specimen.beam, damping=specimen.damping or profile.rig.damping)
     scale_percent = profile.uncertainty.torque_scale_percent
     return replace(
@@ -139,21 +164,23 @@ def with_specimen(profile: Profile, name: str) -> Profile:
 
 def _describe_specimen(profile: Profile, specimen: Specimen) -> str:
     """Return a sentence on the specimen's differences from the profile, for the operator."""
-    prefix = f"Specimen {specimen.name} ({specimen.path}): "
-    differences = [
-        f"{name.removesuffix(suffix_of(name)).replace('_', ' ')} "
-        f"{specimen_value:g} {unit_of(name)} (profile: {its:g})"
-        for name in (each.name for each in fields(Beam))
-        if (specimen_value := getattr(specimen.beam, name))
-        != (its := getattr(profile.rig.beam, name))
+    sentence_start = f"Specimen {specimen.name} ({specimen.path}): "
+    difference_texts = [
+        f"{field_name.removesuffix(suffix_of(field_name)).replace('_', ' ')} "
+        f"{specimen_value:g} {unit_of(field_name)} (profile: {its:g})"
+        for field_name in (beam_field.name for beam_field in fields(Beam))
+        if (specimen_value := getattr(specimen.beam, field_name))
+        != (its := getattr(profile.rig.beam, field_name))
     ]
     if specimen.tip_mass_kg is not None:
-        differences.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
+        difference_texts.append(f"tip mass {1e3 * specimen.tip_mass_kg:g} g")
     if specimen.damping not in (None, profile.rig.damping):
-        differences.append("nominal damping of its own")
-    if not differences:
-        return f"{prefix}beam as in the profile."
-    sentence = f"{prefix}{', '.join(differences)}; for prediction, nominal model and file."
+        difference_texts.append("nominal damping of its own")
+    if not difference_texts:
+        return f"{sentence_start}beam as in the profile."
+    sentence = (
+        f"{sentence_start}{', '.join(difference_texts)}; for prediction, nominal model and file."
+    )
     if actuation_target(profile.rig) is not ActuationTarget.HARDWARE:
         sentence += " The simulated rig keeps the beam of the profile."
     return sentence

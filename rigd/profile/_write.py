@@ -53,18 +53,21 @@ def with_settings(text: str, settings: Iterable[Setting]) -> str:
     KeyError
         If the profile does not have the section of a key.
     """
-    lines = text.splitlines()
-    for setting in settings:
-        indices = _line_indices(lines)
-        line = _setting_line(setting)
-        new_lines = [*_comment_lines(setting.reason), f"# {line}" if setting.commented else line]
-        if setting.key in indices:
-            index = indices[setting.key]
-            lines[index : index + 1] = new_lines
+    text_lines = text.splitlines()
+    for new_setting in settings:
+        line_indices = _line_indices(text_lines)
+        line_index = _setting_line(new_setting)
+        new_lines = [
+            *_comment_lines(new_setting.reason),
+            f"# {line_index}" if new_setting.commented else line_index,
+        ]
+        if new_setting.key in line_indices:
+            line_position = line_indices[new_setting.key]
+            text_lines[line_position : line_position + 1] = new_lines
         else:
-            index = indices[setting.key.rpartition(".")[0]] + 1
-            lines[index:index] = new_lines
-    return "\n".join(lines) + "\n"
+            line_position = line_indices[new_setting.key.rpartition(".")[0]] + 1
+            text_lines[line_position:line_position] = new_lines
+    return "\n".join(text_lines) + "\n"
 
 
 def with_head(text: str, head: Sequence[str]) -> str:
@@ -72,11 +75,21 @@ def with_head(text: str, head: Sequence[str]) -> str:
 
     `head` has the lines of the new comments.
     """
-    lines = text.splitlines()
-    first = next(i for i, line in enumerate(lines) if line and not line.startswith("#"))
+    text_lines = text.splitlines()
+    first_key_line = next(
+        i for i, text_line in enumerate(text_lines) if text_line and not text_line.startswith("#")
+    )
     return (
         "\n".join(
-            [*(each for line in head for each in _comment_lines(line) or ["#"]), "", *lines[first:]]
+            [
+                *(
+                    head_line
+                    for text_line in head
+                    for head_line in _comment_lines(text_line) or ["#"]
+                ),
+                "",
+                *text_lines[first_key_line:],
+            ]
         )
         + "\n"
     )
@@ -114,15 +127,15 @@ def write_new(path: Path, text: str) -> None:
         If the file exists or cannot be written.
     """
     try:
-        with path.open("x", encoding="utf-8") as file:
-            file.write(text)
+        with path.open("x", encoding="utf-8") as profile_file:
+            profile_file.write(text)
     except FileExistsError as error:
         raise _exists_error(path) from error
     except OSError as error:
         raise ProfileError(f"{path}: cannot be written ({error.strerror}).") from error
 
 
-def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
+def copy_profile(profile: Profile, path: Path, new_name: str | None = None) -> None:
     """Write a copy of a profile to a new file; create its folder if necessary.
 
     Parameters
@@ -131,7 +144,7 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
         Profile to copy, with all comments. The path of the drive's EDS file becomes absolute.
     path
         Path of the copy.
-    name
+    new_name
         Name of the rig in the copy, or None if it is unchanged.
 
     Raises
@@ -139,67 +152,67 @@ def copy_profile(profile: Profile, path: Path, name: str | None = None) -> None:
     ProfileError
         If the file exists or cannot be written, or the name is invalid for a profile.
     """
-    settings = [] if name is None else [Setting("name", name)]
-    drive = profile.rig.cia402
-    if drive is not None and drive.eds:
-        settings.append(Setting("cia402.eds", drive.eds))
-    text = profile.text
-    if settings:
+    new_settings = [] if new_name is None else [Setting("name", new_name)]
+    drive_settings = profile.rig.cia402
+    if drive_settings is not None and drive_settings.eds:
+        new_settings.append(Setting("cia402.eds", drive_settings.eds))
+    profile_text = profile.text
+    if new_settings:
         try:
-            text = with_settings(text, settings)
+            profile_text = with_settings(profile_text, new_settings)
         except KeyError:
             raise ProfileError(
                 f"{profile.path}: is not laid out as the shipped profiles are, one key a line "
                 "under its [section], so that no changed copy can be made; copy the file, edit it."
             ) from None
-        profile_from_text(text, path)
+        profile_from_text(profile_text, path)
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise ProfileError(f"{path.parent}: cannot be made ({error.strerror}).") from error
     check_new(path)
-    write_new(path, text)
+    write_new(path, profile_text)
 
 
 def _exists_error(path: Path) -> ProfileError:
-    """Return the error to raise if a file exists already."""
+    """Return the error to raise if a new profile's file exists already."""
     return ProfileError(f"{path}: exists and is not overwritten; name another file.")
 
 
-def _line_indices(lines: Sequence[str]) -> dict[str, int]:
+def _line_indices(text_lines: Sequence[str]) -> dict[str, int]:
     """Return the index of the line of each section and each key of a profile.
 
     If a key occurs only in a comment, it is the index of the comment.
     """
-    indices: dict[str, int] = {}
+    index_by_key: dict[str, int] = {}
     value_text: dict[str, int] = {}
     section = ""
-    for index, line in enumerate(lines):
-        if section_title := re.match(r"\[([^\]]+)\]", line):
-            indices[section_title[1]] = index
+    for line_index, text_line in enumerate(text_lines):
+        if section_title := re.match(r"\[([^\]]+)\]", text_line):
+            index_by_key[section_title[1]] = line_index
             section = section_title[1] + "."
-        elif key := re.match(r"(\w+)\s*=", line):
-            indices[section + key[1]] = index
-        elif (key := re.match(r"# (\w+) = ", line)) and section + key[1] in key_types():
-            value_text[section + key[1]] = index
-    return value_text | indices
+        elif key := re.match(r"(\w+)\s*=", text_line):
+            index_by_key[section + key[1]] = line_index
+        elif (key := re.match(r"# (\w+) = ", text_line)) and section + key[1] in key_types():
+            value_text[section + key[1]] = line_index
+    return value_text | index_by_key
 
 
-def _comment_lines(text: str) -> list[str]:
-    """Return a text wrapped into lines of a comment."""
-    return textwrap.wrap(text, _COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
+def _comment_lines(comment: str) -> list[str]:
+    """Return a text as lines of a profile's comment, wrapped and each with "# "."""
+    return textwrap.wrap(comment, _COMMENT_WIDTH, initial_indent="# ", subsequent_indent="# ")
 
 
 def _setting_line(setting: Setting) -> str:
     """Return the line of a profile for a setting."""
-    name = setting.key.rpartition(".")[2]
-    value = setting.value
+    key_name = setting.key.rpartition(".")[2]
+    setting_value = setting.value
     # Texts and booleans have the same syntax in JSON and TOML.
-    value_text = json.dumps(value, ensure_ascii=False)
+    value_text = json.dumps(setting_value, ensure_ascii=False)
     if not is_number(key_types()[setting.key]):
-        return f"{name} = {value_text}"
+        return f"{key_name} = {value_text}"
     if setting.source == UNKNOWN:
-        return f'{name} = {{ source = "{UNKNOWN}" }}'
-    if setting.hexadecimal and isinstance(value, int):
-        value_text = f"0x{value:08X}"
-    return f'{name} = {{ value = {value_text}, source = "{setting.source}" }}'
+        return f'{key_name} = {{ source = "{UNKNOWN}" }}'
+    if setting.hexadecimal and isinstance(setting_value, int):
+        value_text = f"0x{setting_value:08X}"
+    return f'{key_name} = {{ value = {value_text}, source = "{setting.source}" }}'

@@ -64,43 +64,43 @@ class BeamPrediction:
         stiffness_nm = 4.0 * beam.bending_stiffness_n_m2 / beam.length_m
         m = len(oscillating_poles)
         # Input [modes, offset, angle before, angle, torque], output [modes, offset, angle, error].
-        size = 2 * m + 2
-        a = np.zeros((size + 1, size + 2))
-        error = np.zeros(size + 2)
-        gain = np.zeros(size + 1)
+        state_size = 2 * m + 2
+        a = np.zeros((state_size + 1, state_size + 2))
+        error_row = np.zeros(state_size + 2)
+        observer_gain = np.zeros(state_size + 1)
         a[2 * m, 2 * m] = 1.0
         a[2 * m + 1, 2 * m + 2] = 1.0
-        error[-1], error[2 * m] = 1.0, -1.0
-        gain[2 * m] = _OFFSET_BANDWIDTH_RAD_S * period_s
-        for number, pole in enumerate(oscillating_poles):
+        error_row[-1], error_row[2 * m] = 1.0, -1.0
+        observer_gain[2 * m] = _OFFSET_BANDWIDTH_RAD_S * period_s
+        for mode_index, mode_pole in enumerate(oscillating_poles):
             # φ = 2 Re(r z) with z' = p z + θ, and θ is linear between two ticks.
-            mode_rows = slice(2 * number, 2 * number + 2)
-            step_factor = cexp(pole * period_s)
-            present_gain = (step_factor - 1.0 - pole * period_s) / (pole**2 * period_s)
-            previous_gain = (step_factor - 1.0) / pole - present_gain
+            mode_rows = slice(2 * mode_index, 2 * mode_index + 2)
+            step_factor = cexp(mode_pole * period_s)
+            present_gain = (step_factor - 1.0 - mode_pole * period_s) / (mode_pole**2 * period_s)
+            previous_gain = (step_factor - 1.0) / mode_pole - present_gain
             a[mode_rows, mode_rows] = (
                 (step_factor.real, -step_factor.imag),
                 (step_factor.imag, step_factor.real),
             )
             a[mode_rows, 2 * m + 1] = previous_gain.real, previous_gain.imag
             a[mode_rows, 2 * m + 2] = present_gain.real, present_gain.imag
-            factor = stiffness_nm * abs(pole) ** 2 / (2j * pole.imag)
-            error += 2.0 * np.array([factor.real, -factor.imag]) @ a[mode_rows]
-            error[2 * m + 2] -= stiffness_nm
-            gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / factor
-            gain[mode_rows] = gain_of_mode.real, gain_of_mode.imag
-        matrix = a + np.outer(gain, error)
-        matrix[-1] = error
-        self._state_size = size
-        self._gain = gain[:size]
-        self._matrix_product = np.asfortranarray(matrix).dot
-        self._vectors = tuple(np.zeros((2, size + 2)))
+            gain_factor = stiffness_nm * abs(mode_pole) ** 2 / (2j * mode_pole.imag)
+            error_row += 2.0 * np.array([gain_factor.real, -gain_factor.imag]) @ a[mode_rows]
+            error_row[2 * m + 2] -= stiffness_nm
+            gain_of_mode = -_OBSERVER_BANDWIDTH_RAD_S * period_s / gain_factor
+            observer_gain[mode_rows] = gain_of_mode.real, gain_of_mode.imag
+        update_matrix = a + np.outer(observer_gain, error_row)
+        update_matrix[-1] = error_row
+        self._state_size = state_size
+        self._gain = observer_gain[:state_size]
+        self._matrix_product = np.asfortranarray(update_matrix).dot
+        self._vectors = tuple(np.zeros((2, state_size + 2)))
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
         """Start again with the beam at rest at an angle."""
-        for vector in self._vectors:
-            vector[:] = 0.0
+        for state_vector in self._vectors:
+            state_vector[:] = 0.0
         self._start_rad = angle_rad
 
     def step(self, angle_rad: float, torque_nm: float) -> float:
@@ -111,13 +111,13 @@ class BeamPrediction:
         angle_rad, torque_nm
             Measured angle and coupling torque.
         """
-        size = self._state_size
-        input_, output = self._vectors
-        input_[size] = angle_rad - self._start_rad
-        input_[size + 1] = torque_nm
-        self._matrix_product(input_, output[:-1])
-        self._vectors = output, input_
-        return float(output[size])
+        state_size = self._state_size
+        input_, output_state = self._vectors
+        input_[state_size] = angle_rad - self._start_rad
+        input_[state_size + 1] = torque_nm
+        self._matrix_product(input_, output_state[:-1])
+        self._vectors = output_state, input_
+        return float(output_state[state_size])
 
     def skip(self, angle_rad: float) -> None:
         """Advance the prediction by a tick without a measured torque."""

@@ -93,7 +93,7 @@ class EncoderWatch:
         Net torque that exceeds any friction of the shaft.
     delay_ticks
         Ticks from a torque command to the torque.
-    scales
+    scale_watch
         Check of the scales of encoder and motor, or None to omit it.
 
     Attributes
@@ -141,27 +141,27 @@ class EncoderWatch:
         inertia_kg_m2: float,
         breakaway_nm: float,
         delay_ticks: int,
-        scales: ScaleWatch | None = None,
+        scale_watch: ScaleWatch | None = None,
     ) -> None:
         self._prediction = prediction
-        self._scale_watch = scales
+        self._scale_watch = scale_watch
         self._rate_hz = rate_hz
         self._resolution_rad = resolution_rad
         self._inertia_kg_m2 = inertia_kg_m2
         self._breakaway_nm = breakaway_nm
-        lengths = [
+        window_ticks = [
             max(_STANDSTILL_TICKS_AT_STOP + 1, round(w * rate_hz)) for w in _AVERAGING_WINDOWS_S
         ]
         # Within an encoder step the shaft may reverse, with an acceleration of at most `8 step/T²`.
         turn_nm = inertia_kg_m2 * 8.0 * resolution_rad * rate_hz**2
-        self._windows = [(ticks, turn_nm / ticks**2) for ticks in lengths]
-        self._min_test_ticks = max(lengths[0], round(_STANDSTILL_S * rate_hz))
+        self._windows = [(tick_count, turn_nm / tick_count**2) for tick_count in window_ticks]
+        self._min_test_ticks = max(window_ticks[0], round(_STANDSTILL_S * rate_hz))
         # The mean of a sine over a time T is at most 2/(ω T) of its amplitude.
         self._half_period_ticks = (
             inf if prediction is None else 2.0 / prediction.first_rad_s * rate_hz
         )
         self._decay = 1.0 / (_RMS_TIME_CONSTANT_S * rate_hz)
-        history_ticks = lengths[-1] + 2
+        history_ticks = window_ticks[-1] + 2
         # Cumulative sums: the difference of two gives the mean over a window.
         self._torque_history: deque[tuple[float, float]] = deque(maxlen=history_ticks)
         self._error_sums: deque[float] = deque(maxlen=history_ticks)
@@ -227,9 +227,9 @@ class EncoderWatch:
             Evidence of a failed encoder, or None. With a violation `test_nm` must be ignored.
         """
         prediction = self._prediction
-        pending = self._delayed_commands_nm
-        pending.append(sent_nm)
-        motor_nm = pending[0]
+        pending_commands_nm = self._delayed_commands_nm
+        pending_commands_nm.append(sent_nm)
+        motor_nm = pending_commands_nm[0]
         if not fresh:
             self.skip(1, angle_rad)
             return None
@@ -278,7 +278,7 @@ class EncoderWatch:
         return None
 
     def skip(self, ticks: int, angle_rad: float) -> None:
-        """Advance over ticks that were missed or have only old readings.
+        """Advance the watch over ticks that were missed or have only old readings.
 
         The torque was constant in these ticks.
 
@@ -304,12 +304,12 @@ class EncoderWatch:
 
         The shortest window is checked in every tick, the others in turn.
         """
-        windows = self._windows
-        ticks, max_turning_nm = windows[0]
+        standstill_windows = self._windows
+        ticks, max_turning_nm = standstill_windows[0]
         if standstill_ticks < ticks:
             return None
         violation = self._check_net_torque(ticks, max_turning_nm)
-        ticks, max_turning_nm = windows[1 + self._count % (len(windows) - 1)]
+        ticks, max_turning_nm = standstill_windows[1 + self._count % (len(standstill_windows) - 1)]
         if violation is not None or standstill_ticks < ticks:
             return violation
         violation = self._check_net_torque(ticks, max_turning_nm)
@@ -365,8 +365,8 @@ class EncoderWatch:
 
     def _compare_coupling_torque(self, ticks: int) -> None:
         """Start a test of the encoder if the beam's torque differs from its prediction."""
-        errors, noise_nm = self._error_sums, self._noise_nm
-        error_nm = (errors[-1] - errors[-1 - ticks]) / ticks
+        error_sums, noise_nm = self._error_sums, self._noise_nm
+        error_nm = (error_sums[-1] - error_sums[-1 - ticks]) / ticks
         vibration_nm = sqrt(max(0.0, self._coupling_nm2 - noise_nm * noise_nm))
         significant_nm = max(
             _MIN_SIGNIFICANT_FRACTION * self._breakaway_nm,
@@ -398,17 +398,20 @@ class EncoderWatch:
             or min(abs(moved_rad), abs(previous_movement_rad)) < least_rad
         ):
             return None
-        repeats = self._repeat_ticks
-        repeats.append(self._count)
-        if len(repeats) < _MAX_REPEATS or self._count - repeats[0] >= _REPEAT_WINDOW_TICKS:
+        repeat_ticks = self._repeat_ticks
+        repeat_ticks.append(self._count)
+        if (
+            len(repeat_ticks) < _MAX_REPEATS
+            or self._count - repeat_ticks[0] >= _REPEAT_WINDOW_TICKS
+        ):
             return None
-        return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeats), _MAX_REPEATS - 1)
+        return INTERLOCKS_BY_NAME["repeated angle"].violated(len(repeat_ticks), _MAX_REPEATS - 1)
 
-    def _compare_scales(self, scales: ScaleWatch) -> Violation | None:
+    def _compare_scales(self, scale_watch: ScaleWatch) -> Violation | None:
         """Pass acceleration and net torque over the last `WINDOW_TICKS` to the scale watch."""
-        angles, torques = self._angles, self._torque_history
+        angles, torque_history = self._angles, self._torque_history
         n = WINDOW_TICKS
-        if len(angles) < n + SPEED_TICKS + 1 or len(torques) < n + SPEED_TICKS + 3:
+        if len(angles) < n + SPEED_TICKS + 1 or len(torque_history) < n + SPEED_TICKS + 3:
             return None
         recent_movement_rad = angles[-1] - angles[-1 - SPEED_TICKS]
         previous_movement_rad = angles[-1 - n] - angles[-1 - n - SPEED_TICKS]
@@ -421,9 +424,9 @@ class EncoderWatch:
         # Weighted like the difference of two mean speeds, the torques match the acceleration.
         net_nm = motor_nm = 0.0
         for j in range(1, SPEED_TICKS + 1):
-            for window_end in (torques[-1 - j], torques[-2 - j]):
+            for window_end in (torque_history[-1 - j], torque_history[-2 - j]):
                 net_nm, motor_nm = net_nm + window_end[0], motor_nm + window_end[1]
-            for window_start in (torques[-1 - j - n], torques[-2 - j - n]):
+            for window_start in (torque_history[-1 - j - n], torque_history[-2 - j - n]):
                 net_nm, motor_nm = net_nm - window_start[0], motor_nm - window_start[1]
         net_nm, motor_nm = net_nm / (2 * SPEED_TICKS * n), motor_nm / (2 * SPEED_TICKS * n)
         acceleration_rad_s2 = (
@@ -432,7 +435,7 @@ class EncoderWatch:
         speed_rad_s = (
             (recent_movement_rad + previous_movement_rad) * self._rate_hz / (2 * SPEED_TICKS)
         )
-        return scales.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
+        return scale_watch.add(acceleration_rad_s2, speed_rad_s, motor_nm - net_nm, net_nm)
 
     def _torque_sums(self, ticks: int) -> tuple[float, float]:
         """Return the sums of net torque and motor torque over the last `ticks` ticks in N·m.

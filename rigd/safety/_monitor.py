@@ -176,11 +176,13 @@ class LimitWatch:
         self._slow_value_near = False
         self.warning = False
 
-    def skip(self, missed: int) -> None:
-        """Register missed ticks, over which the next check computes the speed."""
-        self._elapsed_ticks += missed
-        if missed:
-            self._recently_missed = missed + (self._recently_missed if self.after_missed else 0)
+    def skip(self, missed_ticks: int) -> None:
+        """Register missed ticks; the next check computes the shaft's speed over them."""
+        self._elapsed_ticks += missed_ticks
+        if missed_ticks:
+            self._recently_missed = missed_ticks + (
+                self._recently_missed if self.after_missed else 0
+            )
             self._last_missed_check = self._slow_checks
 
     @property
@@ -189,13 +191,13 @@ class LimitWatch:
 
         It counts ticks missed within the last 64 to 128 ticks.
         """
-        missed = self._recently_missed
-        if not missed or self._slow_checks - self._last_missed_check > 1:
+        missed_count = self._recently_missed
+        if not missed_count or self._slow_checks - self._last_missed_check > 1:
             return ""
-        ticks = "1 missed tick" if missed == 1 else f"{missed} missed ticks"
-        if missed < _MIN_STALL_S * self._rate_hz:
-            return f"It came after {ticks}."
-        return f"It came after {ticks}. {OVERLOADED_ADVICE}"
+        ticks_text = "1 missed tick" if missed_count == 1 else f"{missed_count} missed ticks"
+        if missed_count < _MIN_STALL_S * self._rate_hz:
+            return f"It came after {ticks_text}."
+        return f"It came after {ticks_text}. {OVERLOADED_ADVICE}"
 
     def check(
         self,
@@ -222,7 +224,10 @@ class LimitWatch:
             Violation furthest beyond its limit, or None. `warning` is set if a value is near its
             limit.
         """
-        moved, previous_moved_rad = angle_rad - self._previous_angle_rad, self._previous_moved_rad
+        moved_rad, previous_moved_rad = (
+            angle_rad - self._previous_angle_rad,
+            self._previous_moved_rad,
+        )
         a, e, v, j = (
             self._angle_warning,
             self._error_warning,
@@ -235,8 +240,8 @@ class LimitWatch:
             self._elapsed_ticks == 1
             and -a < angle_rad < a
             and -e < reference_rad - angle_rad < e
-            and -v < moved < v
-            and -j < moved - previous_moved_rad < j
+            and -v < moved_rad < v
+            and -j < moved_rad - previous_moved_rad < j
             and -w0 < fx < w0
             and -w1 < fy < w1
             and -w2 < fz < w2
@@ -247,7 +252,7 @@ class LimitWatch:
         ):
             self._previous_angle_rad = angle_rad
             self._second_last_moved_rad = previous_moved_rad
-            self._previous_moved_rad = moved
+            self._previous_moved_rad = moved_rad
             self._previous_elapsed_ticks = 1
             self._ticks_without_jump_check = 0
             self.warning = self._slow_value_near
@@ -273,13 +278,13 @@ class LimitWatch:
         checked_values += (
             (
                 "wrench range",
-                f"sensor's {axis}",
+                f"sensor's {axis_name}",
                 "N" if i < _FORCE_AXES else "N·m",
-                value,
-                limit,
+                axis_value,
+                axis_limit,
                 warning_level,
             )
-            for i, (axis, value, limit, warning_level) in enumerate(
+            for i, (axis_name, axis_value, axis_limit, warning_level) in enumerate(
                 zip(_AXES, wrench, self._wrench_limits, self._wrench_warnings, strict=True)
             )
         )
@@ -295,39 +300,42 @@ class LimitWatch:
 
         `angle_rad` is the new angle, with which the next one is compared.
         """
-        elapsed, before_rad = self._elapsed_ticks, self._previous_moved_rad
+        elapsed_ticks, previous_moved_rad = self._elapsed_ticks, self._previous_moved_rad
         moved_rad = angle_rad - self._previous_angle_rad
-        speed_rad_s = moved_rad * self._rate_hz / elapsed
+        speed_rad_s = moved_rad * self._rate_hz / elapsed_ticks
         # One latch of the encoder may be late by most of a period and the next one not: the time
         # between them is longer or shorter by that much.
         max_jump_rad = (
-            self._per_tick2_rad * elapsed * (elapsed + self._previous_elapsed_ticks) / 2
+            self._per_tick2_rad * elapsed_ticks * (elapsed_ticks + self._previous_elapsed_ticks) / 2
             + self._jump_rad
-            + abs(before_rad)
+            + abs(previous_moved_rad)
             + abs(self._second_last_moved_rad)
         )
-        jump_rad = moved_rad - elapsed * before_rad
-        if elapsed > 1:
+        jump_rad = moved_rad - elapsed_ticks * previous_moved_rad
+        if elapsed_ticks > 1:
             self._ticks_without_jump_check = _NO_JUMP_CHECK_TICKS
         elif self._ticks_without_jump_check:
             self._ticks_without_jump_check -= 1
         self._previous_angle_rad = angle_rad
-        self._second_last_moved_rad, self._previous_moved_rad = before_rad, moved_rad / elapsed
-        self._previous_elapsed_ticks, self._elapsed_ticks = elapsed, 1
+        self._second_last_moved_rad, self._previous_moved_rad = (
+            previous_moved_rad,
+            moved_rad / elapsed_ticks,
+        )
+        self._previous_elapsed_ticks, self._elapsed_ticks = elapsed_ticks, 1
         limit_rad_s = self._limits.velocity_rad_s
-        near_rad_s = _warning_fraction("velocity") * limit_rad_s
+        warning_rad_s = _warning_fraction("velocity") * limit_rad_s
         checked_values: list[_CheckedValue] = [
-            ("velocity", "", "", speed_rad_s, limit_rad_s, near_rad_s)
+            ("velocity", "", "", speed_rad_s, limit_rad_s, warning_rad_s)
         ]
         if not self._ticks_without_jump_check:
-            near_rad = _warning_fraction("encoder jump") * max_jump_rad
-            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, near_rad))
+            warning_rad = _warning_fraction("encoder jump") * max_jump_rad
+            checked_values.append(("encoder jump", "", "", jump_rad, max_jump_rad, warning_rad))
         return checked_values
 
     def check_stale(
         self, angle_stale: bool, wrench_stale: bool, saturated: bool = False
     ) -> Violation | None:
-        """Check how long readings are missing, or at the end of the sensor's range.
+        """Return a violation if readings are old, or at the sensor's limit, for too many ticks.
 
         It is called in every tick with such a reading, and in the next one. A controller that uses
         an old angle turns the motor without limit, and neither speed nor tracking error would show
@@ -357,35 +365,39 @@ class LimitWatch:
         )
 
     def check_torque(self, requested_nm: float) -> Violation | None:
-        """Check the torque that the controller requests, before it is limited and commanded."""
+        """Return a violation if the controller requests a torque above its limit, else None."""
         limit_nm = self._limits.torque_command_nm
         return self._assess_values(
             (("torque command", "", "", requested_nm, limit_nm, self._peak_nm),)
         )
 
-    def check_missed(self, missed: int, missed_so_far: int, scheduled: int) -> Violation | None:
-        """Check the number and the percentage of missed ticks.
+    def check_missed(
+        self, missed_in_row: int, missed_in_session: int, scheduled_ticks: int
+    ) -> Violation | None:
+        """Return a violation if too many ticks were missed in a row or in the session, else None.
 
         The next speed is computed over the missed ticks, too.
 
         Parameters
         ----------
-        missed
+        missed_in_row
             Number of consecutive ticks missed just now.
-        missed_so_far, scheduled
+        missed_in_session, scheduled_ticks
             Numbers of missed and of scheduled ticks since the record's first.
         """
-        self.skip(missed)
+        self.skip(missed_in_row)
         limits = self._limits
         return self._assess_fraction(
-            _checked_value("missed ticks", missed, limits.missed_ticks_in_a_row),
+            _checked_value("missed ticks", missed_in_row, limits.missed_ticks_in_a_row),
             _checked_value(
-                "missed share", self._percentage(missed_so_far, scheduled), limits.missed_percent
+                "missed share",
+                self._percentage(missed_in_session, scheduled_ticks),
+                limits.missed_percent,
             ),
         )
 
     def check_stale_fraction(
-        self, stale_angles: int, stale_wrenches: int, scheduled: int
+        self, stale_angles: int, stale_wrenches: int, scheduled_ticks: int
     ) -> Violation | None:
         """Check the percentages of ticks without a new angle and without a new wrench.
 
@@ -395,26 +407,30 @@ class LimitWatch:
 
         Parameters
         ----------
-        stale_angles, stale_wrenches, scheduled
+        stale_angles, stale_wrenches, scheduled_ticks
             Numbers of ticks with an old angle, of ticks with an old wrench, and of scheduled ticks,
             since the record's first.
         """
-        limit = self._limits.stale_percent
+        percent_limit = self._limits.stale_percent
         return self._assess_fraction(
-            _checked_value("stale angle share", self._percentage(stale_angles, scheduled), limit),
             _checked_value(
-                "stale wrench share", self._percentage(stale_wrenches, scheduled), limit
+                "stale angle share", self._percentage(stale_angles, scheduled_ticks), percent_limit
+            ),
+            _checked_value(
+                "stale wrench share",
+                self._percentage(stale_wrenches, scheduled_ticks),
+                percent_limit,
             ),
         )
 
-    def _percentage(self, ticks: int, scheduled: int) -> float:
-        """Return the percentage of ticks in the scheduled ones, of at least ten seconds."""
-        return 100.0 * ticks / max(scheduled, self._fraction_window)
+    def _percentage(self, counted_ticks: int, scheduled_ticks: int) -> float:
+        """Return ticks as a percentage of the scheduled ones, or of those in 10 s if more."""
+        return 100.0 * counted_ticks / max(scheduled_ticks, self._fraction_window)
 
     def _assess_fraction(self, *checked_values: _CheckedValue) -> Violation | None:
-        """Return the worst violation by a percentage.
+        """Return the violation by the percentage furthest beyond its limit, or None.
 
-        The next sample is flagged if a percentage is near its limit.
+        The next recorded sample gets a warning flag if a percentage is near its limit.
         """
         previous_warning, self.warning = self.warning, False
         violation = self._assess_values(checked_values)
@@ -449,7 +465,9 @@ class LimitWatch:
         if self._last_warnings:
             oldest_check = self._slow_checks - self._rearm_checks
             self._last_warnings = {
-                name: last for name, last in self._last_warnings.items() if last >= oldest_check
+                channel_name: last_check
+                for channel_name, last_check in self._last_warnings.items()
+                if last_check >= oldest_check
             }
         elapsed_s = (
             0.0 if self._last_slow_check_ns is None else (due_ns - self._last_slow_check_ns) * 1e-9
@@ -481,71 +499,81 @@ class LimitWatch:
 
         A channel that stays near its limit, or returns to it repeatedly, is reported once.
         """
-        notices, self._notices = self._notices, []
-        return notices
+        new_notices, self._notices = self._notices, []
+        return new_notices
 
     def _assess_values(self, checked_values: Sequence[_CheckedValue]) -> Violation | None:
         """Return the violation furthest beyond its limit, and register warnings.
 
         A value that is not a number counts as infinitely far beyond its limit.
         """
-        worst, worst_ratio = None, 1.0
+        worst_value, worst_ratio = None, 1.0
         near_limit = []
-        for checked in checked_values:
-            name, _, _, value, limit, warning = checked
-            if INTERLOCKS_BY_NAME[name].below:
-                ratio, is_near = limit / value if value > 0.0 else inf, value <= warning
+        for checked_value in checked_values:
+            interlock_name, _, _, measured_value, limit_value, warning_level = checked_value
+            if INTERLOCKS_BY_NAME[interlock_name].below:
+                limit_ratio, is_near_limit = (
+                    limit_value / measured_value if measured_value > 0.0 else inf,
+                    measured_value <= warning_level,
+                )
             else:
-                size = abs(value) if isfinite(value) else inf
-                ratio, is_near = size / limit, size >= warning
-            if ratio > worst_ratio:
-                worst, worst_ratio = checked, ratio
-            elif is_near:
-                near_limit.append(checked)
-        if worst is not None:
+                magnitude = abs(measured_value) if isfinite(measured_value) else inf
+                limit_ratio, is_near_limit = magnitude / limit_value, magnitude >= warning_level
+            if limit_ratio > worst_ratio:
+                worst_value, worst_ratio = checked_value, limit_ratio
+            elif is_near_limit:
+                near_limit.append(checked_value)
+        if worst_value is not None:
             self.warning = True
-            return self._violation_with_cause(worst)
-        for checked in near_limit:
+            return self._violation_with_cause(worst_value)
+        for checked_value in near_limit:
             self.warning = True
-            channel = checked[1] or checked[0]
+            channel = checked_value[1] or checked_value[0]
             if channel not in self._last_warnings:
-                self._notices.append(str(_make_violation(checked, warns=True)))
+                self._notices.append(str(_make_violation(checked_value, warns=True)))
             self._last_warnings[channel] = self._slow_checks
         return None
 
-    def _violation_with_cause(self, checked: _CheckedValue) -> Violation:
+    def _violation_with_cause(self, checked_value: _CheckedValue) -> Violation:
         """Return the violation of a limit, with advice that mentions ticks missed just before."""
-        violation, missed = _make_violation(checked, warns=False), self.after_missed
-        if not missed or not INTERLOCKS_BY_NAME[checked[0]].follows_missed_ticks:
+        violation, missed_text = _make_violation(checked_value, warns=False), self.after_missed
+        if not missed_text or not INTERLOCKS_BY_NAME[checked_value[0]].follows_missed_ticks:
             return violation
-        if OVERLOADED_ADVICE not in missed:
-            missed = f"{missed} {violation.remedy}"
-        return replace(violation, remedy=missed)
+        if OVERLOADED_ADVICE not in missed_text:
+            missed_text = f"{missed_text} {violation.remedy}"
+        return replace(violation, remedy=missed_text)
 
 
-def _warning_fraction(name: str) -> float:
+def _warning_fraction(interlock_name: str) -> float:
     """Return the warning level of an interlock as a fraction of its limit."""
-    fraction = INTERLOCKS_BY_NAME[name].warning
-    assert isinstance(fraction, float)
-    return fraction
+    warning_fraction = INTERLOCKS_BY_NAME[interlock_name].warning
+    assert isinstance(warning_fraction, float)
+    return warning_fraction
 
 
-def _checked_value(name: str, value: float, limit: float) -> _CheckedValue:
+def _checked_value(interlock_name: str, measured_value: float, limit_value: float) -> _CheckedValue:
     """Return a value to check, with the channel, unit and warning level of its interlock."""
-    return name, "", "", value, limit, _warning_fraction(name) * limit
+    return (
+        interlock_name,
+        "",
+        "",
+        measured_value,
+        limit_value,
+        _warning_fraction(interlock_name) * limit_value,
+    )
 
 
-def _make_violation(checked: _CheckedValue, *, warns: bool) -> Violation:
-    """Return a reading's violation of its limit, or with `warns` of its warning level."""
-    name, channel, unit, value, limit, warning = checked
-    row = INTERLOCKS_BY_NAME[name]
+def _make_violation(checked_value: _CheckedValue, *, warns: bool) -> Violation:
+    """Return the violation of a reading's limit, or of its warning level if `warns` is true."""
+    interlock_name, channel_text, unit, measured_value, limit_value, warning_level = checked_value
+    interlock = INTERLOCKS_BY_NAME[interlock_name]
     return Violation(
-        channel or row.channel,
-        value,
-        limit,
-        unit or row.unit,
-        "" if warns else row.remedy,
-        row.limit,
-        below=row.below,
-        warning=warning if warns else None,
+        channel_text or interlock.channel,
+        measured_value,
+        limit_value,
+        unit or interlock.unit,
+        "" if warns else interlock.remedy,
+        interlock.limit,
+        below=interlock.below,
+        warning=warning_level if warns else None,
     )

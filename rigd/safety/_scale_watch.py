@@ -43,7 +43,7 @@ _CHECK_WINDOWS = 8
 
 
 class ScaleWatch:
-    """Estimates the ratio of net torque to inertia times acceleration, and checks its limit.
+    """Estimates the ratio of net torque to inertia times acceleration, and checks it.
 
     The estimate uses windows of `WINDOW_TICKS` ticks.
 
@@ -51,19 +51,19 @@ class ScaleWatch:
     ----------
     inertia_kg_m2
         Inertia of the motor.
-    limit
+    ratio_limit
         Ratio, or inverse ratio, above which there is a fault; infinite to check nothing.
     """
 
     __slots__ = ("_inertia_kg_m2", "_limit", "_moments", "_windows")
 
-    def __init__(self, inertia_kg_m2: float, limit: float) -> None:
+    def __init__(self, inertia_kg_m2: float, ratio_limit: float) -> None:
         self._inertia_kg_m2 = inertia_kg_m2
-        self._limit = limit
+        self._limit = ratio_limit
         self.reset()
 
     def reset(self) -> None:
-        """Forget all windows."""
+        """Forget the means of all windows of ticks added so far."""
         # Sums of the products of [J θ'', Γ, sign(θ'), θ', u - Γ].
         self._moments = np.zeros((5, 5))
         self._windows = 0
@@ -86,51 +86,53 @@ class ScaleWatch:
             Violation if the ratio is beyond its limit.
         """
         inertia_nm = self._inertia_kg_m2 * acceleration_rad_s2
-        row = np.array((inertia_nm, coupling_nm, copysign(1.0, speed_rad_s), speed_rad_s, net_nm))
+        window_row = np.array(
+            (inertia_nm, coupling_nm, copysign(1.0, speed_rad_s), speed_rad_s, net_nm)
+        )
         self._moments *= _FORGETTING_FACTOR
-        self._moments += row[:, None] * row
+        self._moments += window_row[:, None] * window_row
         self._windows += 1
         if self._windows < _MIN_WINDOWS or self._windows % _CHECK_WINDOWS:
             return None
         return self._check_ratio()
 
     def estimate(self) -> tuple[float, float]:
-        """Return the estimated ratio and its standard deviation.
+        """Return the ratio of net torque to inertia times acceleration, and its standard deviation.
 
         The standard deviation is infinite if the windows do not determine the ratio.
         """
-        moments = self._moments
-        weight = float(moments[2, 2])
-        if moments[0, 0] < weight * _MIN_INERTIA_TORQUE_RMS_NM**2:
+        moment_matrix = self._moments
+        window_weight = float(moment_matrix[2, 2])
+        if moment_matrix[0, 0] < window_weight * _MIN_INERTIA_TORQUE_RMS_NM**2:
             return 1.0, inf
         variance_nm2 = _MIN_TORQUE_STD_NM**2
-        ratio = deviation = inf
+        ratio = ratio_std = inf
         for _ in range(2):
-            information = moments[:4, :4] / variance_nm2
+            information = moment_matrix[:4, :4] / variance_nm2
             information[1, 1] += 1.0 / _TORQUE_ERROR_STD**2
             information[3, 3] += _FRICTION_PRIOR_PRECISION
             covariance = np.linalg.inv(information)
-            solution = covariance @ (moments[:4, 4] / variance_nm2)
-            squares = (
-                moments[4, 4]
-                - 2 * solution @ moments[:4, 4]
-                + solution @ moments[:4, :4] @ solution
+            solution = covariance @ (moment_matrix[:4, 4] / variance_nm2)
+            residual_squares = (
+                moment_matrix[4, 4]
+                - 2 * solution @ moment_matrix[:4, 4]
+                + solution @ moment_matrix[:4, :4] @ solution
             )
-            ratio, deviation = float(solution[0]), sqrt(max(0.0, float(covariance[0, 0])))
-            variance_nm2 = max(_MIN_TORQUE_STD_NM**2, float(squares) / weight)
-        return ratio, deviation
+            ratio, ratio_std = float(solution[0]), sqrt(max(0.0, float(covariance[0, 0])))
+            variance_nm2 = max(_MIN_TORQUE_STD_NM**2, float(residual_squares) / window_weight)
+        return ratio, ratio_std
 
     def _check_ratio(self) -> Violation | None:
-        """Return a violation if the ratio is significantly beyond its limit."""
-        ratio, deviation = self.estimate()
-        row = INTERLOCKS_BY_NAME["scales"]
+        """Return a violation if the torque ratio is significantly beyond its limit, else None."""
+        ratio, ratio_std = self.estimate()
+        interlock = INTERLOCKS_BY_NAME["scales"]
         lower_bound, upper_bound = (
-            ratio - _SIGNIFICANT_STDS * deviation,
-            ratio + _SIGNIFICANT_STDS * deviation,
+            ratio - _SIGNIFICANT_STDS * ratio_std,
+            ratio + _SIGNIFICANT_STDS * ratio_std,
         )
-        limit = self._limit
-        if lower_bound > limit:
-            return row.violated(ratio, limit)
-        if upper_bound < 1.0 / limit:
-            return row.violated(ratio, 1.0 / limit, below=True)
+        ratio_limit = self._limit
+        if lower_bound > ratio_limit:
+            return interlock.violated(ratio, ratio_limit)
+        if upper_bound < 1.0 / ratio_limit:
+            return interlock.violated(ratio, 1.0 / ratio_limit, is_below=True)
         return None

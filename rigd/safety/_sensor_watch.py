@@ -101,58 +101,59 @@ class SensorWatch:
         n = max(1, self._learned_readings)
         if n < _MIN_LEARNED_READINGS:
             return None
-        fractions = [count / n for count in self._repeat_counts]
+        repeat_fractions = [repeat_count / n for repeat_count in self._repeat_counts]
         min_run = max(_MIN_FROZEN_READINGS, ceil(_MIN_FROZEN_S * self._rate_hz)) - 1
-        unlimited = 2**62
+        unlimited_run = 2**62
         self._limits = []
-        for fraction, noisy in zip(fractions, self._has_noise, strict=True):
-            if not noisy or fraction > _NO_NOISE_FRACTION:
-                self._limits.append(unlimited)
+        for repeat_fraction, has_noise in zip(repeat_fractions, self._has_noise, strict=True):
+            if not has_noise or repeat_fraction > _NO_NOISE_FRACTION:
+                self._limits.append(unlimited_run)
             else:
-                repeat_probability = max(fraction, 1.0 / n)
+                repeat_probability = max(repeat_fraction, 1.0 / n)
                 self._limits.append(
                     max(min_run, ceil(log(_MIN_RUN_PROBABILITY) / log(repeat_probability)))
                 )
         self._fraction_limits = [
-            fraction
+            repeat_fraction
             + max(
                 _MIN_EXCESS_FRACTION,
-                _SIGNIFICANT_STDS * sqrt(fraction * (1.0 - fraction) / _COUNT_TICKS),
+                _SIGNIFICANT_STDS * sqrt(repeat_fraction * (1.0 - repeat_fraction) / _COUNT_TICKS),
             )
-            if noisy
+            if has_noise
             else 1.0
-            for fraction, noisy in zip(fractions, self._has_noise, strict=True)
+            for repeat_fraction, has_noise in zip(repeat_fractions, self._has_noise, strict=True)
         ]
-        self._repeat_counts = [0] * len(fractions)
+        self._repeat_counts = [0] * len(repeat_fractions)
         self._counted_ticks = 0
-        if self._has_noise[-1] and fractions[-1] > _NO_NOISE_FRACTION:
+        if self._has_noise[-1] and repeat_fractions[-1] > _NO_NOISE_FRACTION:
             return INTERLOCKS_BY_NAME["frozen sensor"].violated(self._runs[-1], min_run)
-        for channel, fraction, noisy in zip(
-            self._channels[:-1], fractions, self._has_noise, strict=False
+        for channel_name, repeat_fraction, has_noise in zip(
+            self._channels[:-1], repeat_fractions, self._has_noise, strict=False
         ):
-            if noisy and fraction > _NO_NOISE_FRACTION:
+            if has_noise and repeat_fraction > _NO_NOISE_FRACTION:
                 self._notices.append(
-                    f"The sensor's {channel} shows no noise at rest: a broken gauge or cable is "
+                    f"The sensor's {channel_name} shows no noise at rest: a broken gauge or "
+                    "cable is "
                     "not detected there. Check the sensor."
                 )
         return None
 
     def step(self, reading: tuple[float, ...]) -> Violation | None:
         """Return a violation if a new reading continues an improbable run of identical readings."""
-        previous, self._previous_reading = self._previous_reading, reading
-        if not previous:
+        previous_reading, self._previous_reading = self._previous_reading, reading
+        if not previous_reading:
             return None
         self._learned_readings += 1
-        if self._any_run or any(map(eq, reading, previous)):
+        if self._any_run or any(map(eq, reading, previous_reading)):
             runs, repeat_counts = self._runs, self._repeat_counts
-            repeated = [*map(eq, reading, previous), reading == previous]
-            for channel_index, repeats in enumerate(repeated):
-                if repeats:
+            is_repeated = [*map(eq, reading, previous_reading), reading == previous_reading]
+            for channel_index, channel_repeats in enumerate(is_repeated):
+                if channel_repeats:
                     runs[channel_index] += 1
                     repeat_counts[channel_index] += 1
                 else:
                     runs[channel_index] = 0
-            self._any_run = any(repeated)
+            self._any_run = any(is_repeated)
         elif self._limits is None or self._counted_ticks + 1 < _COUNT_TICKS:
             self._counted_ticks += 1
             return None
@@ -160,10 +161,10 @@ class SensorWatch:
 
     def _check_repeats(self) -> Violation | None:
         """Compare the runs and the fraction of repeated readings with their limits."""
-        runs, limits = self._runs, self._limits
-        assert limits is not None
-        if runs[-1] > limits[-1]:
-            return INTERLOCKS_BY_NAME["frozen sensor"].violated(runs[-1], limits[-1])
+        runs, run_limits = self._runs, self._limits
+        assert run_limits is not None
+        if runs[-1] > run_limits[-1]:
+            return INTERLOCKS_BY_NAME["frozen sensor"].violated(runs[-1], run_limits[-1])
         self._counted_ticks += 1
         if self._counted_ticks >= _COUNT_TICKS:
             repeat_counts, self._repeat_counts, self._counted_ticks = (
@@ -171,38 +172,43 @@ class SensorWatch:
                 [0] * len(runs),
                 0,
             )
-            for channel_index, count in enumerate(repeat_counts):
-                fraction, limit = count / _COUNT_TICKS, self._fraction_limits[channel_index]
+            for channel_index, repeat_count in enumerate(repeat_counts):
+                repeat_fraction, run_limit = (
+                    repeat_count / _COUNT_TICKS,
+                    self._fraction_limits[channel_index],
+                )
                 if (
-                    limit < fraction
-                    and limit < _MAX_FRACTION_LIMIT
-                    and runs[channel_index] <= limits[channel_index]
+                    run_limit < repeat_fraction
+                    and run_limit < _MAX_FRACTION_LIMIT
+                    and runs[channel_index] <= run_limits[channel_index]
                 ):
-                    all_channels = 2 * repeat_counts[-1] > count
+                    all_channels = 2 * repeat_counts[-1] > repeat_count
                     repeated_part = (
                         "whole wrench" if all_channels else self._channels[channel_index]
                     )
                     return INTERLOCKS_BY_NAME["repeated wrench"].violated(
-                        100.0 * fraction, 100.0 * limit, repeated_part
+                        100.0 * repeat_fraction, 100.0 * run_limit, repeated_part
                     )
-        if max(runs) <= min(limits):
+        if max(runs) <= min(run_limits):
             return None
-        for channel, run, limit in zip(self._channels[:-1], runs, limits, strict=False):
-            if run <= limit:
+        for channel_name, run, run_limit in zip(
+            self._channels[:-1], runs, run_limits, strict=False
+        ):
+            if run <= run_limit:
                 continue
-            if run > _FAULT_TO_WARNING_FACTOR * limit:
+            if run > _FAULT_TO_WARNING_FACTOR * run_limit:
                 return INTERLOCKS_BY_NAME["frozen channel"].violated(
-                    run, _FAULT_TO_WARNING_FACTOR * limit, channel
+                    run, _FAULT_TO_WARNING_FACTOR * run_limit, channel_name
                 )
-            if channel not in self._warned_channels:
-                self._warned_channels.add(channel)
+            if channel_name not in self._warned_channels:
+                self._warned_channels.add(channel_name)
                 self._notices.append(
-                    f"The sensor's {channel} has not changed for {run} ticks. "
+                    f"The sensor's {channel_name} has not changed for {run} ticks. "
                     f"{INTERLOCKS_BY_NAME['frozen channel'].remedy}"
                 )
         return None
 
     def take_notices(self) -> list[str]:
         """Return and clear the warnings on channels since the last call."""
-        notices, self._notices = self._notices, []
-        return notices
+        new_notices, self._notices = self._notices, []
+        return new_notices

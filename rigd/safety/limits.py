@@ -123,19 +123,22 @@ class Violation:
         """Return the message for the operator, one or two sentences."""
         if not isfinite(self.value):
             return f"The {self.channel} is not a number: no usable reading came from its device."
-        remedy = f" {self.remedy}" if self.remedy else ""
-        channel = f"{self.channel[0].upper()}{self.channel[1:]}"
-        value, limit = (f"{number:.4g} {self.unit}".rstrip() for number in (self.value, self.limit))
+        remedy_text = f" {self.remedy}" if self.remedy else ""
+        channel_text = f"{self.channel[0].upper()}{self.channel[1:]}"
+        value_text, limit_text = (
+            f"{number:.4g} {self.unit}".rstrip() for number in (self.value, self.limit)
+        )
         if self.warning is not None:
-            side = "below" if self.below else "above"
+            warning_side = "below" if self.below else "above"
             key_text = f", {self.key}" if self.key else ""
             return (
-                f"{channel} {value} {side} warning level {self.warning:.4g} {self.unit} "
-                f"(limit {self.limit:.4g}{key_text}).{remedy}"
+                f"{channel_text} {value_text} {warning_side} warning level "
+                f"{self.warning:.4g} {self.unit} "
+                f"(limit {self.limit:.4g}{key_text}).{remedy_text}"
             )
         how = "below" if self.below else "exceeds"
         key_text = f" ({self.key})" if self.key else ""
-        return f"{channel} {value} {how} limit {limit}{key_text}.{remedy}"
+        return f"{channel_text} {value_text} {how} limit {limit_text}{key_text}.{remedy_text}"
 
 
 # Table of interlocks
@@ -196,21 +199,34 @@ class Interlock:
     follows_missed_ticks: bool = False
 
     def violated(
-        self, value: float, limit: float, part: str = "", *, below: bool = False
+        self,
+        measured_value: float,
+        limit_value: float,
+        channel_name: str = "",
+        *,
+        is_below: bool = False,
     ) -> Violation:
         """Return the violation of this interlock by a measured value.
 
         Parameters
         ----------
-        value, limit
+        measured_value, limit_value
             Measured value, and the limit that it exceeds.
-        part
+        channel_name
             Text that replaces ``{channel}`` in the name of the quantity.
-        below
+        is_below
             Whether the value is below the limit.
         """
-        channel = self.channel.format(channel=part) if part else self.channel
-        return Violation(channel, value, limit, self.unit, self.remedy, self.limit, below=below)
+        channel_text = self.channel.format(channel=channel_name) if channel_name else self.channel
+        return Violation(
+            channel_text,
+            measured_value,
+            limit_value,
+            self.unit,
+            self.remedy,
+            self.limit,
+            below=is_below,
+        )
 
 
 OVERLOADED_ADVICE: Final = "The computer is overloaded: close other programs."

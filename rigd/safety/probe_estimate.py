@@ -98,113 +98,126 @@ def estimate_probe(rig: ProbedRig, move: ProbingMove) -> ProbeEstimate:
     ProbeEstimate
         Ratios of the measured values to those of the profile, and friction.
     """
-    angle = np.array(move.angles_rad)
-    window = _smoothing_window(rig.rate_hz)
-    if angle.size < window.size + _MIN_SAMPLES:
-        return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle)), speed_rad_s=0.0)
+    angle_rad = np.array(move.angles_rad)
+    smoothing_window = _smoothing_window(rig.rate_hz)
+    if angle_rad.size < smoothing_window.size + _MIN_SAMPLES:
+        return ProbeEstimate(*(None,) * 8, travel_rad=float(np.ptp(angle_rad)), speed_rad_s=0.0)
 
     def smooth(signal: Real) -> Real:
-        return np.convolve(signal, window, "valid")
+        return np.convolve(signal, smoothing_window, "valid")
 
-    speed = np.gradient(smooth(angle)) * rig.rate_hz
-    acceleration = np.gradient(speed) * rig.rate_hz
-    max_speed = float(np.max(np.abs(speed)))
-    ratio, ratio_std, beam_nm = _coupling_ratio(
-        rig, angle, smooth(np.array(move.coupling_nm)), window
+    speed_rad_s = np.gradient(smooth(angle_rad)) * rig.rate_hz
+    acceleration = np.gradient(speed_rad_s) * rig.rate_hz
+    max_speed = float(np.max(np.abs(speed_rad_s)))
+    coupling_ratio, ratio_std, beam_nm = _coupling_ratio(
+        rig, angle_rad, smooth(np.array(move.coupling_nm)), smoothing_window
     )
     delay_ticks = max(0, round(rig.command_delay_s * rig.rate_hz))
-    command = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle.size]
-    is_moving: NDArray[np.bool_] = np.abs(speed) > _MIN_SPEED_FRACTION * max_speed
+    command_nm = np.concatenate([np.zeros(delay_ticks), move.torques_nm])[: angle_rad.size]
+    is_moving: NDArray[np.bool_] = np.abs(speed_rad_s) > _MIN_SPEED_FRACTION * max_speed
     motor_fit = _fit_motor_equation(
-        smooth(command), acceleration, speed, beam_nm, is_moving, window.size
+        smooth(command_nm), acceleration, speed_rad_s, beam_nm, is_moving, smoothing_window.size
     )
-    scale, scale_std, inertia, inertia_std, coulomb, viscous = motor_fit
-    if ratio and ratio_std and scale and scale_std and inertia and inertia_std:
+    torque_scale, scale_std, inertia, inertia_std, coulomb_nm, viscous_nm_s_per_rad = motor_fit
+    if coupling_ratio and ratio_std and torque_scale and scale_std and inertia and inertia_std:
         # Both uncertainties enter the fitted torque of the beam.
-        relative_std = ratio_std / ratio
-        scale_std = hypot(scale_std, relative_std * scale)
+        relative_std = ratio_std / coupling_ratio
+        scale_std = hypot(scale_std, relative_std * torque_scale)
         inertia_std = hypot(inertia_std, relative_std * inertia)
     return ProbeEstimate(
-        ratio,
+        coupling_ratio,
         ratio_std,
-        scale,
+        torque_scale,
         scale_std,
         None if inertia is None else inertia / rig.inertia_kg_m2,
         None if inertia_std is None else inertia_std / rig.inertia_kg_m2,
-        coulomb,
-        viscous,
-        float(np.ptp(angle)),
+        coulomb_nm,
+        viscous_nm_s_per_rad,
+        float(np.ptp(angle_rad)),
         max_speed,
     )
 
 
 def _smoothing_window(rate_hz: float) -> Real:
     """Return the Gaussian smoothing window, of unit sum, odd length and at least three ticks."""
-    spread = max(1.0, _WINDOW_STD_S * rate_hz)
-    half = int(3.0 * spread)
-    weights: Real = np.exp(-0.5 * (np.arange(-half, half + 1) / spread) ** 2)
-    weights /= weights.sum()
-    return weights
+    spread_ticks = max(1.0, _WINDOW_STD_S * rate_hz)
+    half_width = int(3.0 * spread_ticks)
+    window_weights: Real = np.exp(
+        -0.5 * (np.arange(-half_width, half_width + 1) / spread_ticks) ** 2
+    )
+    window_weights /= window_weights.sum()
+    return window_weights
 
 
 def _coupling_ratio(
-    rig: ProbedRig, angle: Real, measured: Real, window: Real
+    rig: ProbedRig, angle_rad: Real, measured_nm: Real, smoothing_window: Real
 ) -> tuple[float | None, float | None, Real]:
-    """Fit the measured coupling torque by that of the beam at the measured angle.
+    """Fit the measured coupling torque by the torque of the profile's beam at the measured angle.
 
-    Returns the ratio, its standard deviation, and the fitted coupling torque without noise.
+    Returns the ratio of measured to expected torque, its standard deviation, and the fitted
+    coupling torque in N·m without noise.
     """
     best_fit: tuple[float, float, float, Real] | None = None
-    for beam_nm in _beam_torques(rig, angle):
-        expected = np.convolve(beam_nm, window, "valid")
-        squares = float(expected @ expected)
-        if squares == 0.0:
+    for beam_nm in _beam_torques(rig, angle_rad):
+        expected_nm = np.convolve(beam_nm, smoothing_window, "valid")
+        torque_squares = float(expected_nm @ expected_nm)
+        if torque_squares == 0.0:
             continue
-        ratio = float(expected @ measured) / squares
-        residual = float(np.sum((measured - ratio * expected) ** 2))
-        if best_fit is None or residual < best_fit[0]:
+        coupling_ratio = float(expected_nm @ measured_nm) / torque_squares
+        residual_nm = float(np.sum((measured_nm - coupling_ratio * expected_nm) ** 2))
+        if best_fit is None or residual_nm < best_fit[0]:
             # Smoothed samples within a window are not independent.
-            variance = residual / expected.size * _samples_per_independent_one(window) / squares
-            best_fit = residual, ratio, sqrt(variance), ratio * expected
-    return (None, None, np.zeros_like(measured)) if best_fit is None else best_fit[1:]
+            ratio_variance = (
+                residual_nm
+                / expected_nm.size
+                * _samples_per_independent_one(smoothing_window)
+                / torque_squares
+            )
+            best_fit = (
+                residual_nm,
+                coupling_ratio,
+                sqrt(ratio_variance),
+                coupling_ratio * expected_nm,
+            )
+    return (None, None, np.zeros_like(measured_nm)) if best_fit is None else best_fit[1:]
 
 
-def _samples_per_independent_one(window: Real) -> float:
-    """Return the number of smoothed samples that count as one independent sample of white noise."""
-    return 1.0 / float(window @ window)
+def _samples_per_independent_one(smoothing_window: Real) -> float:
+    """Return how many smoothed samples carry the information of one independent sample."""
+    return 1.0 / float(smoothing_window @ smoothing_window)
 
 
-def _beam_torques(rig: ProbedRig, angle: Real) -> Real:
+def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
     """Return the exact beam's torque in N·m at the measured angle, shape (factors, n).
 
     There is a row for each candidate factor of the beam's frequencies.
     """
-    n = angle.size
-    padded = 1 << (2 * n - 1).bit_length()
+    n = angle_rad.size
+    padded_length = 1 << (2 * n - 1).bit_length()
     # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY_EXPONENT * rig.rate_hz / padded
-    frequency_hz = np.fft.rfftfreq(padded, 1.0 / rig.rate_hz)
+    sigma = _DECAY_EXPONENT * rig.rate_hz / padded_length
+    frequency_hz = np.fft.rfftfreq(padded_length, 1.0 / rig.rate_hz)
     within_window_band = frequency_hz <= _WINDOW_CUTOFF_HZ
     s = sigma + 2j * pi * frequency_hz[within_window_band]
-    growth = np.exp(sigma * np.arange(padded) / rig.rate_hz)
-    extended_angle = np.full(padded, angle[-1])
-    extended_angle[:n] = angle
+    growth = np.exp(sigma * np.arange(padded_length) / rig.rate_hz)
+    extended_angle = np.full(padded_length, angle_rad[-1])
+    extended_angle[:n] = angle_rad
     angle_spectrum = np.fft.rfft(extended_angle / growth)[within_window_band]
-    result = np.empty((len(_FREQUENCY_FACTORS), n))
+    torques_nm = np.empty((len(_FREQUENCY_FACTORS), n))
     spectrum = np.zeros(frequency_hz.size, dtype=np.complex128)
-    for row, factor in zip(result, _FREQUENCY_FACTORS, strict=True):
-        stiffness = rig.beam.bending_stiffness_n_m2 * factor**2
-        beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
-        response = transfer(s, beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
-        spectrum[within_window_band] = response * angle_spectrum
-        row[:] = (np.fft.irfft(spectrum, padded) * growth)[:n]
-    return result
+    for row, frequency_factor in zip(torques_nm, _FREQUENCY_FACTORS, strict=True):
+        stiffness = rig.beam.bending_stiffness_n_m2 * frequency_factor**2
+        scaled_beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
+        torque_per_angle = transfer(s, scaled_beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
+        spectrum[within_window_band] = torque_per_angle * angle_spectrum
+        row[:] = (np.fft.irfft(spectrum, padded_length) * growth)[:n]
+    return torques_nm
 
 
 def _fit_motor_equation(
-    command: Real,
+    command_nm: Real,
     acceleration: Real,
-    speed: Real,
+    speed_rad_s: Real,
     beam_nm: Real,
     is_moving: NDArray[np.bool_],
     window_ticks: float,
@@ -214,31 +227,35 @@ def _fit_motor_equation(
     Returns the torque scale and its standard deviation, the inertia and its standard deviation,
     Coulomb and viscous friction. All are None if they cannot be estimated.
     """
-    columns = np.stack([beam_nm, acceleration, np.sign(speed), speed], axis=1)[is_moving]
-    size = np.linalg.norm(columns, axis=0)
-    if len(columns) < 2 * _MIN_SAMPLES or not size.all():
+    equation_columns = np.stack([beam_nm, acceleration, np.sign(speed_rad_s), speed_rad_s], axis=1)[
+        is_moving
+    ]
+    column_norms = np.linalg.norm(equation_columns, axis=0)
+    if len(equation_columns) < 2 * _MIN_SAMPLES or not column_norms.all():
         return (None,) * 6
-    columns = columns / size
-    normal = columns.T @ columns
-    if np.linalg.cond(normal) > _MAX_CONDITION_NUMBER:
+    equation_columns = equation_columns / column_norms
+    normal_matrix = equation_columns.T @ equation_columns
+    if np.linalg.cond(normal_matrix) > _MAX_CONDITION_NUMBER:
         return (None,) * 6
-    inverse = np.linalg.inv(normal)
-    solution = inverse @ (columns.T @ command[is_moving])
-    residual = command[is_moving] - columns @ solution
-    variance = float(residual @ residual) / len(residual) * window_ticks * np.diag(inverse)
-    per_scale, inertia, coulomb, viscous = (solution / size).tolist()
-    per_scale_std, inertia_std = (np.sqrt(variance) / size)[:2].tolist()
+    inverse_matrix = np.linalg.inv(normal_matrix)
+    solution = inverse_matrix @ (equation_columns.T @ command_nm[is_moving])
+    residual_nm = command_nm[is_moving] - equation_columns @ solution
+    variances = (
+        float(residual_nm @ residual_nm) / len(residual_nm) * window_ticks * np.diag(inverse_matrix)
+    )
+    per_scale, inertia, coulomb_nm, viscous_nm_s_per_rad = (solution / column_norms).tolist()
+    per_scale_std, inertia_std = (np.sqrt(variances) / column_norms)[:2].tolist()
     if per_scale <= 0.0:
         return (None,) * 6
-    scale = 1.0 / per_scale
-    relative_std = per_scale_std * scale
+    torque_scale = 1.0 / per_scale
+    relative_std = per_scale_std * torque_scale
     return (
-        scale,
-        relative_std * scale,
-        inertia * scale,
-        scale * sqrt(inertia_std**2 + (inertia * relative_std) ** 2),
-        coulomb * scale,
-        viscous * scale,
+        torque_scale,
+        relative_std * torque_scale,
+        inertia * torque_scale,
+        torque_scale * sqrt(inertia_std**2 + (inertia * relative_std) ** 2),
+        coulomb_nm * torque_scale,
+        viscous_nm_s_per_rad * torque_scale,
     )
 
 
@@ -267,26 +284,26 @@ def contradiction(
     str
         Message with advice, or an empty string if there is no contradiction.
     """
-    message = _motion_contradiction(rig, end)
-    if not message and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
-        message = _coupling_contradiction(estimate, motor=motor)
-    if not message and motor:
-        message = _motor_contradiction(estimate)
-    if not message and end is ProbeEnd.AWAY and motor:
-        message = (
+    description = _motion_contradiction(rig, end)
+    if not description and (end is ProbeEnd.PULLED or not _is_accepted(estimate.coupling_ratio)):
+        description = _coupling_contradiction(estimate, with_motor=motor)
+    if not description and motor:
+        description = _motor_contradiction(estimate)
+    if not description and end is ProbeEnd.AWAY and motor:
+        description = (
             f"The shaft left the bounds of the probing move after {estimate.travel_rad:.2g} rad at "
             f"up to {estimate.speed_rad_s:.2g} rad/s: check motor.inertia_kg_m2, "
             "motor.rated_torque_nm and encoder.resolution_rad."
         )
-    return f"Probing move: {message} {_ADVICE}" if message else ""
+    return f"Probing move: {description} {_ADVICE}" if description else ""
 
 
 def doubts(estimate: ProbeEstimate) -> list[str]:
-    """Return a warning for each ratio of a probing move that is accepted but unusual."""
+    """Return a warning for each estimated ratio that is accepted but outside `WARNING_BAND`."""
     lowest_ratio, highest_ratio = WARNING_BAND
     return [
-        f"Probing move: {quantity} is {ratio:.2f} times what the profile states ({keys})."
-        for quantity, ratio, keys in (
+        f"Probing move: {quantity} is {ratio:.2f} times what the profile states ({profile_keys})."
+        for quantity, ratio, profile_keys in (
             (
                 "the beam's torque at the measured angle",
                 estimate.coupling_ratio,
@@ -310,7 +327,7 @@ def _is_accepted(ratio: float | None) -> bool:
 
 
 def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
-    """Describe a shaft that moves in the wrong direction or shows no motion, or return ""."""
+    """Describe a shaft or encoder that did not move or moved the wrong way; "" otherwise."""
     if end is ProbeEnd.REVERSED:
         return (
             "the encoder counts against the torque: one of both has the wrong sign. Check "
@@ -331,76 +348,83 @@ def _motion_contradiction(rig: ProbedRig, end: ProbeEnd | None) -> str:
     return ""
 
 
-def _coupling_contradiction(estimate: ProbeEstimate, *, motor: bool) -> str:
+def _coupling_contradiction(estimate: ProbeEstimate, *, with_motor: bool) -> str:
     """Describe a coupling torque that contradicts the profile's beam, or return ""."""
-    ratio, std = estimate.coupling_ratio, estimate.coupling_std
-    if ratio is None or std is None:
+    coupling_ratio, std = estimate.coupling_ratio, estimate.coupling_std
+    if coupling_ratio is None or std is None:
         return (
             f"the coupling torque is not the beam's at the measured angle ({_COUPLING_RATIO_KEYS})."
         )
-    if abs(ratio) < _NO_TORQUE_RATIO:
-        if not motor:
+    if abs(coupling_ratio) < _NO_TORQUE_RATIO:
+        if not with_motor:
             return ""  # no antenna: the shaft moves no farther than the encoder shows
         return (
-            f"the coupling torque is {ratio:.2f} times that of the profile's beam at the measured "
+            f"the coupling torque is {coupling_ratio:.2f} times that of the profile's beam "
+            "at the measured "
             "angle. Check that the antenna is mounted and the sensor works, and "
             "encoder.resolution_rad."
         )
-    if not motor and 0.0 < ratio < 1.0:
+    if not with_motor and 0.0 < coupling_ratio < 1.0:
         return ""  # the shaft moves less than the encoder shows: its bounds hold
-    size = f"{ratio:.2g} ± {std:.1g}"
-    if ratio < 0.0:
+    ratio_text = f"{coupling_ratio:.2g} ± {std:.1g}"
+    if coupling_ratio < 0.0:
         return (
-            f"the coupling torque is {size} times that of the profile's beam at the measured "
+            f"the coupling torque is {ratio_text} times that of the profile's beam at the measured "
             "angle: it has the wrong sign (sensor.projection, mounting of the sensor)."
         )
     return (
-        f"the coupling torque is {size} times that of the profile's beam at the measured angle: "
-        f"{_likely_cause(estimate, ratio)}."
+        f"the coupling torque is {ratio_text} times that of the profile's beam at the "
+        "measured angle: "
+        f"{_likely_cause(estimate, coupling_ratio)}."
     )
 
 
 def _likely_cause(estimate: ProbeEstimate, ratio: float) -> str:
     """Describe the probable cause of a wrong ratio of the coupling torques."""
-    scale, inertia = estimate.torque_ratio, estimate.inertia_ratio
-    if scale is None or inertia is None:
+    torque_ratio, inertia_ratio = estimate.torque_ratio, estimate.inertia_ratio
+    if torque_ratio is None or inertia_ratio is None:
         return f"one of {_COUPLING_RATIO_KEYS} is wrong by that ratio"
-    if _is_same_ratio(scale, 1.0) and _is_same_ratio(inertia, ratio):
+    if _is_same_ratio(torque_ratio, 1.0) and _is_same_ratio(inertia_ratio, ratio):
         return (
             "the motor's inertia shows the same ratio, so encoder.resolution_rad is probably too "
             f"{'small' if ratio > 1.0 else 'large'} by it"
         )
-    if _is_same_ratio(scale, ratio):
+    if _is_same_ratio(torque_ratio, ratio):
         return (
             "the motor's torque shows the same ratio, so the sensor's calibration or "
             "sensor.projection is probably wrong by it"
         )
-    if _is_same_ratio(scale, 1.0) and _is_same_ratio(inertia, 1.0):
+    if _is_same_ratio(torque_ratio, 1.0) and _is_same_ratio(inertia_ratio, 1.0):
         return "the motor agrees, so the data of the beam are probably wrong by it"
     return f"one of {_COUPLING_RATIO_KEYS} is wrong by that ratio"
 
 
 def _motor_contradiction(estimate: ProbeEstimate) -> str:
     """Describe a torque or inertia of the motor that contradicts the profile, or return ""."""
-    rows = (
+    checked_ratios = (
         ("the motor exerts", estimate.torque_ratio, estimate.torque_std,
          "the torque commanded (motor.rated_torque_nm, or the drive's rated torque)"),
         ("the motor has", estimate.inertia_ratio, estimate.inertia_std,
          "the inertia of the profile (motor.inertia_kg_m2)"),
     )  # fmt: skip
-    unknown = []
-    for clause, ratio, std, quantity in rows:
-        if ratio is None or std is None:
-            unknown.append(quantity)
-        elif not _is_accepted(ratio):
-            return f"{clause} {ratio:.2g} ± {std:.1g} times {quantity}."
-        elif std > _MAX_RELATIVE_STD * ratio:
-            unknown.append(quantity)
-    if unknown:
-        return f"it could not be determined how far the motor agrees with {' and '.join(unknown)}."
+    unknown_clauses = []
+    for clause, checked_ratio, std, quantity in checked_ratios:
+        if checked_ratio is None or std is None:
+            unknown_clauses.append(quantity)
+        elif not _is_accepted(checked_ratio):
+            return f"{clause} {checked_ratio:.2g} ± {std:.1g} times {quantity}."
+        elif std > _MAX_RELATIVE_STD * checked_ratio:
+            unknown_clauses.append(quantity)
+    if unknown_clauses:
+        return (
+            "it could not be determined how far the motor agrees with "
+            f"{' and '.join(unknown_clauses)}."
+        )
     return ""
 
 
-def _is_same_ratio(first: float, second: float) -> bool:
+def _is_same_ratio(first_ratio: float, second_ratio: float) -> bool:
     """Return whether two ratios are positive and differ by less than `_SAME_RATIO_FACTOR`."""
-    return first > 0.0 < second and abs(log(first / second)) < log(_SAME_RATIO_FACTOR)
+    return first_ratio > 0.0 < second_ratio and abs(log(first_ratio / second_ratio)) < log(
+        _SAME_RATIO_FACTOR
+    )

@@ -74,19 +74,24 @@ class BeamFollower:
     def __init__(self, rig: ProbedRig) -> None:
         beam = rig.beam
         inertias = participation(beam, _BEAM_MODES) * beam.density_kg_per_m
-        remainder = beam.inertia_kg_m2 - float(inertias.sum()) + rig.tool_inertia_kg_m2
+        remaining_inertia = beam.inertia_kg_m2 - float(inertias.sum()) + rig.tool_inertia_kg_m2
         beam_poles = poles(beam, rig.damping, _BEAM_MODES)[:, 0]
-        modes = [
-            (complex(pole), float(inertia))
-            for pole, inertia in zip(beam_poles, inertias, strict=True)
-            if pole.imag > 0.0
+        beam_modes = [
+            (complex(mode_pole), float(mode_inertia))
+            for mode_pole, mode_inertia in zip(beam_poles, inertias, strict=True)
+            if mode_pole.imag > 0.0
         ]
         self._oscillators: list[tuple[complex, complex, complex, float]] = []
-        for pole, inertia in [*modes, (_REMAINDER_RAD_S * (-0.7 + 0.714j), remainder)]:
-            squared_magnitude = abs(pole) ** 2
-            residue = (squared_magnitude - 2.0 * pole.real * pole) / (2j * pole.imag)
-            coefficients = _linear_input_step(pole, residue, 1.0 / rig.rate_hz)
-            self._oscillators.append((*coefficients, inertia * squared_magnitude))
+        for mode_pole, mode_inertia in [
+            *beam_modes,
+            (_REMAINDER_RAD_S * (-0.7 + 0.714j), remaining_inertia),
+        ]:
+            squared_magnitude = abs(mode_pole) ** 2
+            mode_residue = (squared_magnitude - 2.0 * mode_pole.real * mode_pole) / (
+                2j * mode_pole.imag
+            )
+            step_coefficients = _linear_input_step(mode_pole, mode_residue, 1.0 / rig.rate_hz)
+            self._oscillators.append((*step_coefficients, mode_inertia * squared_magnitude))
         self._states = [0j] * len(self._oscillators)
         self._angle_rad = 0.0
 
@@ -99,12 +104,16 @@ class BeamFollower:
             Angle relative to the initial position at rest.
         """
         previous_rad, self._angle_rad = self._angle_rad, angle_rad
-        states, torque_nm = self._states, 0.0
-        for number, (step_factor, first, last, stiffness) in enumerate(self._oscillators):
-            state = states[number] = (
-                step_factor * states[number] + first * previous_rad + last * angle_rad
+        mode_states, torque_nm = self._states, 0.0
+        for mode_index, (step_factor, previous_factor, present_factor, stiffness) in enumerate(
+            self._oscillators
+        ):
+            mode_state = mode_states[mode_index] = (
+                step_factor * mode_states[mode_index]
+                + previous_factor * previous_rad
+                + present_factor * angle_rad
             )
-            torque_nm += stiffness * (angle_rad - 2.0 * state.real)
+            torque_nm += stiffness * (angle_rad - 2.0 * mode_state.real)
         return torque_nm
 
 
@@ -116,9 +125,9 @@ def _linear_input_step(
     The new state is ``a z + b u_before + c u_now`` if u is a straight line over the period.
     """
     step_factor = exp(pole * period_s)
-    constant = (step_factor - 1.0) / pole
-    slope = (step_factor - 1.0 - pole * period_s) / (pole * pole * period_s)
-    return step_factor, residue * (constant - slope), residue * slope
+    constant_term = (step_factor - 1.0) / pole
+    slope_term = (step_factor - 1.0 - pole * period_s) / (pole * pole * period_s)
+    return step_factor, residue * (constant_term - slope_term), residue * slope_term
 
 
 # Plan
@@ -189,8 +198,8 @@ def plan_probe(rig: ProbedRig) -> ProbePlan:
     rig
         Values of the profile.
     """
-    first = abs(complex(poles(rig.beam, rig.damping, 1)[0, 0]))
-    period_s = 2.0 * pi / first
+    first_pole_rad_s = abs(complex(poles(rig.beam, rig.damping, 1)[0, 0]))
+    period_s = 2.0 * pi / first_pole_rad_s
     cruise_s = period_s * max(1, round(_MIN_CRUISE_S / period_s + 0.3))
     fast_speed_rad_s = min(
         2.0 * _FIRST_SPEED_RAD_S,
@@ -289,19 +298,19 @@ class ProbingMove:
         self._start_rad = start_rad
         self._period_s = 1.0 / rate_hz
         self._beam_follower = BeamFollower(rig)
-        inertia = rig.inertia_kg_m2 + rig.beam.inertia_kg_m2 + rig.tool_inertia_kg_m2
-        bandwidth = min(_BANDWIDTH_RAD_S, 0.05 * rate_hz)
-        self._gain = inertia * bandwidth
-        self._integral_gain = self._gain * min(_INTEGRAL_RATE_RAD_S, 0.25 * bandwidth)
+        inertia_kg_m2 = rig.inertia_kg_m2 + rig.beam.inertia_kg_m2 + rig.tool_inertia_kg_m2
+        bandwidth_rad_s = min(_BANDWIDTH_RAD_S, 0.05 * rate_hz)
+        self._gain = inertia_kg_m2 * bandwidth_rad_s
+        self._integral_gain = self._gain * min(_INTEGRAL_RATE_RAD_S, 0.25 * bandwidth_rad_s)
         self._speed_ticks = max(2, round(_SPEED_WINDOW_S * rate_hz))
         self._filter_gain = 1.0 / (1.0 + _COMPARISON_TIME_CONSTANT_S * rate_hz)
         self._min_difference_nm = max(_MIN_DIFFERENCE_NM, _MIN_DIFFERENCE_STDS * torque_noise_nm)
         self._min_movement_rad = max(_MIN_MOVEMENT_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD)
         first_side = -1.0 if start_rad > 0.0 else 1.0
         self._strokes = [
-            (side * first_side, speed)
-            for speed in (plan.speed_rad_s, plan.fast_rad_s)
-            for side in (1.0, -1.0)
+            (stroke_side * first_side, speed_rad_s)
+            for speed_rad_s in (plan.speed_rad_s, plan.fast_rad_s)
+            for stroke_side in (1.0, -1.0)
         ]
         self._stroke_index = 0
         self._stroke_start_rad = 0.0
@@ -344,10 +353,10 @@ class ProbingMove:
     def _record_missed_ticks(self, angle_rad: float, coupling_torque_nm: float) -> None:
         """Record missed ticks with linearly interpolated readings and the last torque."""
         previous_rad, before_nm = self.angles_rad[-1], self.coupling_nm[-1]
-        for tick in range(1, self.missed + 1):
-            fraction = tick / (self.missed + 1)
-            between_rad = previous_rad + fraction * (angle_rad - previous_rad)
-            between_nm = before_nm + fraction * (coupling_torque_nm - before_nm)
+        for tick_number in range(1, self.missed + 1):
+            time_fraction = tick_number / (self.missed + 1)
+            between_rad = previous_rad + time_fraction * (angle_rad - previous_rad)
+            between_nm = before_nm + time_fraction * (coupling_torque_nm - before_nm)
             self._compare_coupling_torque(between_rad, between_nm)
             self._record_tick(between_rad, self._torque_nm, between_nm)
         self.missed = 0
@@ -377,8 +386,8 @@ class ProbingMove:
 
     def _is_encoder_frozen(self, angle_rad: float) -> bool:
         """Return whether the encoder has shown the same angle for `_FROZEN_ENCODER_S`."""
-        recent = self.angles_rad[-max(3, self._to_ticks(_FROZEN_ENCODER_S)) :]
-        return all(each == angle_rad for each in recent)
+        recent_angles_rad = self.angles_rad[-max(3, self._to_ticks(_FROZEN_ENCODER_S)) :]
+        return all(angle == angle_rad for angle in recent_angles_rad)
 
     def _check_bounds(self, angle_rad: float) -> None:
         """End the move if angle, speed or duration exceeds its bound."""
@@ -401,10 +410,12 @@ class ProbingMove:
 
     def _stroke_torque(self, angle_rad: float) -> float:
         """Return the torque in N·m that this tick of the present stroke requires."""
-        side, speed = self._strokes[self._stroke_index]
+        stroke_side, stroke_rad_s = self._strokes[self._stroke_index]
         plan = self._plan
         if self._moving_since_tick is None:
-            return self._breakaway_torque(side, side * (angle_rad - self._stroke_start_rad))
+            return self._breakaway_torque(
+                stroke_side, stroke_side * (angle_rad - self._stroke_start_rad)
+            )
         elapsed_s = (self._tick_count - self._moving_since_tick) * self._period_s
         speed_fraction = _smooth_step(elapsed_s / _SPEED_RAMP_S) - _smooth_step(
             (elapsed_s - plan.cruise_s) / _SPEED_RAMP_S
@@ -413,17 +424,17 @@ class ProbingMove:
             self._stroke_torque_nm = abs(self._integral_nm)
         elif elapsed_s > plan.cruise_s + _SPEED_RAMP_S + _STROKE_PAUSE_S:
             return self._start_next_stroke(angle_rad)
-        return self._speed_controller_torque(side * speed * speed_fraction)
+        return self._speed_controller_torque(stroke_side * stroke_rad_s * speed_fraction)
 
-    def _breakaway_torque(self, side: float, moved_rad: float) -> float:
-        """Return the torque in N·m before the shaft moves, which rises from tick to tick."""
+    def _breakaway_torque(self, stroke_side: float, moved_rad: float) -> float:
+        """Return the torque in N·m until the shaft breaks away; it rises from tick to tick."""
         if moved_rad < -self._min_movement_rad and self._stroke_index == 0:
             self.end = ProbeEnd.REVERSED
             return 0.0
         if moved_rad > self._min_movement_rad:
             self._moving_since_tick = self._tick_count
             return self._integral_nm
-        self._integral_nm += side * self._plan.torque_rise_nm_per_s * self._period_s
+        self._integral_nm += stroke_side * self._plan.torque_rise_nm_per_s * self._period_s
         if abs(self._integral_nm) > self._plan.torque_limit_nm:
             self.end = ProbeEnd.BLOCKED
             return 0.0
@@ -436,10 +447,12 @@ class ProbingMove:
         beam's torque in the strokes so far.
         """
         self._stroke_index += 1
-        ratio = self._beam_coupling_products / self._beam_squares if self._beam_squares else inf
+        coupling_ratio = (
+            self._beam_coupling_products / self._beam_squares if self._beam_squares else inf
+        )
         if self._stroke_index == len(self._strokes):
             self.end = ProbeEnd.COMPLETE
-        elif not _COUPLING_RATIO_BAND[0] < ratio < _COUPLING_RATIO_BAND[1]:
+        elif not _COUPLING_RATIO_BAND[0] < coupling_ratio < _COUPLING_RATIO_BAND[1]:
             self.end = ProbeEnd.PULLED
         if self.end is not None:
             return 0.0

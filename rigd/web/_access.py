@@ -92,8 +92,8 @@ class WebAccess:
     async def check_and_respond(self, request: web.Request, handler: Handler) -> web.StreamResponse:
         """Return the response of a permitted request, or a refusal or an error as JSON."""
         try:
-            refusal = _refusal_of_other_pages(request)
-            response = await handler(request) if refusal is None else refusal
+            request_refusal = _refusal_of_other_pages(request)
+            response = await handler(request) if request_refusal is None else request_refusal
         except web.HTTPException as error:
             response = refusal_response(error.status, error.reason)
         except UserError as error:
@@ -105,18 +105,18 @@ class WebAccess:
     @staticmethod
     async def add_security_headers(_: web.Request, response: web.StreamResponse) -> None:
         """Add the security headers to a response that is about to be sent."""
-        for name, value in _SECURITY_HEADERS.items():
-            response.headers.setdefault(name, value)
+        for header_name, header_value in _SECURITY_HEADERS.items():
+            response.headers.setdefault(header_name, header_value)
 
     def may_act(self, request: web.Request) -> bool:
         """Return whether a request has the token that permits it to act."""
-        scheme, _, given_token = request.headers.get("Authorization", "").partition(" ")
-        return scheme == "Bearer" and hmac.compare_digest(
+        auth_scheme, _, given_token = request.headers.get("Authorization", "").partition(" ")
+        return auth_scheme == "Bearer" and hmac.compare_digest(
             given_token.encode(errors="surrogateescape"), self._token
         )
 
     def may_command(self, request: web.Request, command: str, parameters: object) -> bool:
-        """Return whether a request may send a command to the daemon.
+        """Return whether a request of a browser may send a command to the daemon.
 
         Parameters
         ----------
@@ -148,14 +148,14 @@ async def read_json_object(request: web.Request) -> dict[str, Any]:
         If the body is no JSON object, or does not arrive in time.
     """
     try:
-        value = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
+        body_value = json.loads(await asyncio.wait_for(request.read(), _BODY_TIMEOUT_S))
     except TimeoutError:
         raise web.HTTPRequestTimeout(reason="The request did not come to its end.") from None
     except (ValueError, RecursionError):
-        value = None
-    if not isinstance(value, dict):
+        body_value = None
+    if not isinstance(body_value, dict):
         raise web.HTTPBadRequest(reason="The request is not a JSON object.")
-    return value
+    return body_value
 
 
 def refusal_response(status: int, text: str) -> web.Response:
@@ -173,12 +173,12 @@ def refusal_response(status: int, text: str) -> web.Response:
 
 def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
     """Return the refusal of a request that this server's own page would not send, or None."""
-    host = request.headers.get("Host", "")
+    host_name = request.headers.get("Host", "")
     # The port may differ because of a tunnel, but the name must be local.
-    if _host_name_of(host) not in _PERMITTED_HOSTS:
+    if _host_name_of(host_name) not in _PERMITTED_HOSTS:
         return refusal_response(403, "Open this page as http://127.0.0.1:PORT/.")
-    origin = request.headers.get("Origin")
-    if origin is not None and origin != f"http://{host}":
+    origin_url = request.headers.get("Origin")
+    if origin_url is not None and origin_url != f"http://{host_name}":
         return refusal_response(403, "Requests from other pages are refused.")
     # A sandboxed report counts as another origin, and its browser requests the icon.
     fetch_site = request.headers.get("Sec-Fetch-Site", "same-origin")
@@ -195,15 +195,17 @@ def _refusal_of_other_pages(request: web.Request) -> web.Response | None:
     return None
 
 
-def _host_name_of(host: str) -> str:
+def _host_name_of(host_header: str) -> str:
     """Return the name in a Host header, or "" unless it has only a name and a port."""
     try:
-        parsed = urlsplit(f"//{host}")
-        port = parsed.port
+        parsed_url = urlsplit(f"//{host_header}")
+        port_number = parsed_url.port
     except ValueError:
         return ""
-    name_and_port = parsed.hostname if port is None else f"{parsed.hostname}:{port}"
-    return (parsed.hostname or "") if name_and_port == host else ""
+    name_and_port = (
+        parsed_url.hostname if port_number is None else f"{parsed_url.hostname}:{port_number}"
+    )
+    return (parsed_url.hostname or "") if name_and_port == host_header else ""
 
 
 # Connections
@@ -230,34 +232,34 @@ class Connections:
         """Close connections that have sent no request in time, now and periodically."""
         now_s, open_connections = time.monotonic(), set(self.serving.connections)
         self._first_request_deadlines = {
-            each: end_s
-            for each, end_s in self._first_request_deadlines.items()
-            if each in open_connections
+            handler: end_s
+            for handler, end_s in self._first_request_deadlines.items()
+            if handler in open_connections
         }
-        for protocol, end_s in self._first_request_deadlines.items():
-            if end_s < now_s and protocol.transport is not None:
-                protocol.transport.abort()
+        for request_handler, end_s in self._first_request_deadlines.items():
+            if end_s < now_s and request_handler.transport is not None:
+                request_handler.transport.abort()
         asyncio.get_running_loop().call_later(_POLL_PERIOD_S, self.close_silent)
 
     def accept_connection(self) -> asyncio.Protocol:
-        """Return the protocol of a new connection, and close old ones if there are too many.
+        """Return the handler of a new connection, and close old connections if there are too many.
 
         Connections of open pages are not closed.
         """
         open_connections = [
-            (each, each.transport)
-            for each in self.serving.connections
-            if each.transport is not None and not each.transport.is_closing()
+            (handler, handler.transport)
+            for handler in self.serving.connections
+            if handler.transport is not None and not handler.transport.is_closing()
         ]
         too_many = max(0, len(open_connections) - _MAX_CONNECTIONS + 1)
         # The newest client may want to stop the rig.
-        for transport in [each[1] for each in open_connections if each[0] not in self._pages][
-            :too_many
-        ]:
-            transport.abort()
-        protocol = self.serving()
-        self._first_request_deadlines[protocol] = time.monotonic() + _FIRST_REQUEST_TIMEOUT_S
-        return protocol
+        for old_transport in [
+            handler[1] for handler in open_connections if handler[0] not in self._pages
+        ][:too_many]:
+            old_transport.abort()
+        request_handler = self.serving()
+        self._first_request_deadlines[request_handler] = time.monotonic() + _FIRST_REQUEST_TIMEOUT_S
+        return request_handler
 
     @web.middleware
     async def register_request(self, request: web.Request, handler: Handler) -> web.StreamResponse:

@@ -114,7 +114,7 @@ class Jobs:
     def put(
         self, kind: str, arguments: Sequence[str], session: str = "", address: str = ""
     ) -> AnalysisJob:
-        """Queue a job of `analyze`, and return it.
+        """Queue a run of the program `analyze`, and return it as a job.
 
         Parameters
         ----------
@@ -153,7 +153,7 @@ class Jobs:
                 await asyncio.wait_for(job.done.wait(), _POLL_PERIOD_S)
 
     async def run(self) -> None:
-        """Run the queued jobs until cancelled."""
+        """Run the queued jobs one after the other until this task is cancelled."""
         while True:
             job = await self._queue.get()
             while self.paused:
@@ -171,7 +171,7 @@ class Jobs:
             del self._unfinished[job.number]
 
     def _publish_state(self, job: AnalysisJob) -> None:
-        """Send the state of a job to the pages, except of an export, whose request waits for it."""
+        """Send a job's state to the open pages, except that of an export to another format."""
         if job.kind != "export":
             self._publish(job.document())
 
@@ -191,32 +191,32 @@ class Jobs:
             process_group=0,
         )
         give_way(process.pid)
-        communication = asyncio.create_task(process.communicate())
-        suspended = False
+        output_task = asyncio.create_task(process.communicate())
+        is_suspended = False
         try:
-            while not communication.done():
+            while not output_task.done():
                 if job.dropped:
                     raise JobError("A session has begun.")
-                if self.paused is not suspended:
-                    suspended = self.paused
-                    _signal_group(process.pid, signal.SIGSTOP if suspended else signal.SIGCONT)
-                await asyncio.wait((communication,), timeout=_POLL_PERIOD_S)
-            _, stderr = communication.result()
+                if self.paused is not is_suspended:
+                    is_suspended = self.paused
+                    _signal_group(process.pid, signal.SIGSTOP if is_suspended else signal.SIGCONT)
+                await asyncio.wait((output_task,), timeout=_POLL_PERIOD_S)
+            _, stderr_bytes = output_task.result()
         finally:
             if process.returncode is None:
                 _signal_group(process.pid, signal.SIGKILL)
-                await asyncio.wait((communication,))
+                await asyncio.wait((output_task,))
         if process.returncode != 0:
             last_lines = (
-                stderr.decode(errors="replace")
+                stderr_bytes.decode(errors="replace")
                 .strip()[-_MAX_STDERR_BYTES:]
                 .splitlines()[-_MAX_STDERR_LINES:]
             )
-            why = " ".join(last_lines) or f"exit code {process.returncode}"
-            raise JobError(f"The {job.kind} was not made: {why}")
+            failure_reason = " ".join(last_lines) or f"exit code {process.returncode}"
+            raise JobError(f"The {job.kind} was not made: {failure_reason}")
 
 
-def _signal_group(group: int, number: int) -> None:
+def _signal_group(process_group: int, signal_number: int) -> None:
     """Send a signal to a process group, if it exists."""
     with suppress(ProcessLookupError):
-        os.killpg(group, number)
+        os.killpg(process_group, signal_number)

@@ -102,7 +102,7 @@ class Library:
         but
             Name of a session to exclude, because it is running.
         """
-        newest = await asyncio.to_thread(
+        newest_pair = await asyncio.to_thread(
             partial(
                 last_quick_look,
                 self._folder,
@@ -111,24 +111,30 @@ class Library:
                 is_usable=itemgetter("response"),
             )
         )
-        if newest is None:
+        if newest_pair is None:
             return None
-        path, quick_look = newest
-        description = {"type": "last", "path": str(path), "specimen": specimen}
-        return {**quick_look["response"], **description, "id": path.stem}
+        document_path, quick_look = newest_pair
+        description = {"type": "last", "path": str(document_path), "specimen": specimen}
+        return {**quick_look["response"], **description, "id": document_path.stem}
 
     # Rows
 
     async def _list_sessions(self, request: web.Request) -> web.Response:
-        """Send a part of the list of sessions."""
-        filters = {name: value for name in _FILTERS if (value := request.query.get(name))}
-        limit, offset = (
-            _whole_number(request.query.get(name, str(default)), name)
-            for name, default in (("limit", _DEFAULT_ROWS), ("offset", 0))
+        """Reply with a part of the filtered list of recorded sessions."""
+        filters = {
+            filter_name: filter_value
+            for filter_name in _FILTERS
+            if (filter_value := request.query.get(filter_name))
+        }
+        row_limit, first_row = (
+            _whole_number(request.query.get(filter_name, str(default_number)), filter_name)
+            for filter_name, default_number in (("limit", _DEFAULT_ROWS), ("offset", 0))
         )
-        rows = await self.rows(**filters)
-        shown = rows[offset : offset + min(limit, _MAX_ROWS)]
-        return web.json_response({"total": len(rows), "sessions": [row.as_dict() for row in shown]})
+        session_rows = await self.rows(**filters)
+        shown_rows = session_rows[first_row : first_row + min(row_limit, _MAX_ROWS)]
+        return web.json_response(
+            {"total": len(session_rows), "sessions": [row.as_dict() for row in shown_rows]}
+        )
 
     async def _send_quick_look(self, request: web.Request) -> web.Response:
         """Send the quick look of a session."""
@@ -141,32 +147,36 @@ class Library:
 
     async def _send_responses(self, request: web.Request) -> web.Response:
         """Send fitted models and measured responses of several sessions for comparison."""
-        ids = [name for name in request.query.get("ids", "").split(",") if name]
+        ids = [
+            session_name for session_name in request.query.get("ids", "").split(",") if session_name
+        ]
         if not 1 <= len(ids) <= _MAX_RESPONSES:
             return refusal_response(400, f"ids: name 1 to {_MAX_RESPONSES} sessions.")
-        responses, errors = [], []
-        for name in ids:
-            quick_look = self._read_quick_look(self._session_path(name).stem)
+        responses, error_texts = [], []
+        for session_name in ids:
+            quick_look = self._read_quick_look(self._session_path(session_name).stem)
             if quick_look is None or quick_look["response"] is None:
-                errors.append(f"{name}: there is no quick look of it, and so no response.")
+                error_texts.append(
+                    f"{session_name}: there is no quick look of it, and so no response."
+                )
             else:
-                identity = {
-                    "id": name,
+                session_identity = {
+                    "id": session_name,
                     "specimen": quick_look["specimen"],
                     "model": quick_look["model"],
                 }
-                responses.append({**identity, **quick_look["response"]})
-        return web.json_response({"responses": responses, "errors": errors})
+                responses.append({**session_identity, **quick_look["response"]})
+        return web.json_response({"responses": responses, "errors": error_texts})
 
     # Downloads
 
     async def _send_file(self, request: web.Request) -> web.StreamResponse:
         """Send a session file, converted if another format is requested."""
-        path = self._requested_session(request)
-        ending = request.match_info["ending"]
-        if ending == "mcap":
-            return web.FileResponse(path, headers=_download_headers(path.name))
-        if ending not in _EXPORT_SUFFIXES:
+        session_path = self._requested_session(request)
+        file_ending = request.match_info["ending"]
+        if file_ending == "mcap":
+            return web.FileResponse(session_path, headers=_download_headers(session_path.name))
+        if file_ending not in _EXPORT_SUFFIXES:
             return refusal_response(404, "There are .mcap, .mat and .uff.")
         if self._jobs.paused:
             return refusal_response(409, _SESSION_RUNS_MESSAGE)
@@ -176,11 +186,11 @@ class Library:
                 409, "Another file is being converted; try again when it is done."
             )
         async with self._exporting:
-            with tempfile.TemporaryDirectory(prefix="rigd-page-") as folder:
-                out = Path(folder) / f"{path.stem}{_EXPORT_SUFFIXES[ending]}"
-                arguments = ("export", "record", str(path), str(out))
+            with tempfile.TemporaryDirectory(prefix="rigd-page-") as temporary_folder:
+                out = Path(temporary_folder) / f"{session_path.stem}{_EXPORT_SUFFIXES[file_ending]}"
+                arguments = ("export", "record", str(session_path), str(out))
                 try:
-                    job = self._jobs.put("export", arguments, path.stem)
+                    job = self._jobs.put("export", arguments, session_path.stem)
                 except JobError as error:
                     return refusal_response(409, str(error))
                 await self._jobs.await_or_drop(job)
@@ -195,8 +205,10 @@ class Library:
 
     async def _send_report(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a session's report."""
-        path = self._requested_session(request)
-        session_row = next((row for row in await self.rows() if row.path.name == path.name), None)
+        session_path = self._requested_session(request)
+        session_row = next(
+            (row for row in await self.rows() if row.path.name == session_path.name), None
+        )
         if session_row is None or session_row.report is None:
             return refusal_response(404, "There is no report of it.")
         return self._report_file(
@@ -205,63 +217,67 @@ class Library:
 
     async def _send_campaign_report(self, request: web.Request) -> web.StreamResponse:
         """Send a file of a campaign's report."""
-        folder = self._path_in_folder(request.match_info["name"])
-        if not folder.name.startswith("campaign.report"):
+        report_folder = self._path_in_folder(request.match_info["name"])
+        if not report_folder.name.startswith("campaign.report"):
             return refusal_response(404, "There is no such campaign.")
-        return self._report_file(folder, request.match_info.get("file", REPORT_PAGE))
+        return self._report_file(report_folder, request.match_info.get("file", REPORT_PAGE))
 
-    def _report_file(self, folder: Path, name: str) -> web.StreamResponse:
+    def _report_file(self, report_folder: Path, file_name: str) -> web.StreamResponse:
         """Return the response with a file of a report, or a refusal.
 
         Only regular files in the report's folder are served.
         """
-        if not _REPORT_FILE_NAME.fullmatch(name):
+        if not _REPORT_FILE_NAME.fullmatch(file_name):
             return refusal_response(404, "There is no such file.")
-        path = (folder / name).resolve()
-        if path.parent.parent != self._folder.resolve() or not path.is_file():
+        file_path = (report_folder / file_name).resolve()
+        if file_path.parent.parent != self._folder.resolve() or not file_path.is_file():
             return refusal_response(404, "There is no such file.")
-        return web.FileResponse(path, headers={"Content-Security-Policy": REPORT_POLICY})
+        return web.FileResponse(file_path, headers={"Content-Security-Policy": REPORT_POLICY})
 
     async def _make_report(self, request: web.Request) -> web.Response:
-        """Queue the report of a session."""
+        """Queue the job that writes the analysis report of a recorded session."""
         if not self._access.may_act(request):
             return refusal_response(403, "Making a report needs the token of the printed address.")
-        path = self._requested_session(request)
-        address = f"/api/sessions/{path.stem}/report/"
-        return self._queue_job("report", [str(path)], path.stem, address)
+        session_path = self._requested_session(request)
+        report_address = f"/api/sessions/{session_path.stem}/report/"
+        return self._queue_job("report", [str(session_path)], session_path.stem, report_address)
 
     async def _make_campaign(self, request: web.Request) -> web.Response:
-        """Queue the report of several sessions together."""
+        """Queue the job that writes one analysis report on several sessions."""
         if not self._access.may_act(request):
             return refusal_response(403, "A campaign needs the token of the printed address.")
-        body = await read_json_object(request)
-        ids = body.get("ids")
+        request_object = await read_json_object(request)
+        ids = request_object.get("ids")
         if (
             not isinstance(ids, list)
             or not 2 <= len(ids) <= _MAX_CAMPAIGN_SESSIONS
-            or not all(isinstance(name, str) for name in ids)
+            or not all(isinstance(session_name, str) for session_name in ids)
         ):
             return refusal_response(400, f"ids: name 2 to {_MAX_CAMPAIGN_SESSIONS} sessions.")
-        paths = sorted({str(self._session_path(name)) for name in ids})  # in the order of recording
-        folder = self._unused_folder("campaign.report")
-        arguments = [*paths, "--jobs", "1", "--report", str(folder)]
-        return self._queue_job("campaign", arguments, "", _campaign_url_path(folder))
+        paths = sorted(
+            {str(self._session_path(session_name)) for session_name in ids}
+        )  # in the order of recording
+        report_folder = self._unused_folder("campaign.report")
+        arguments = [*paths, "--jobs", "1", "--report", str(report_folder)]
+        return self._queue_job("campaign", arguments, "", _campaign_url_path(report_folder))
 
-    def _queue_job(self, kind: str, arguments: list[str], name: str, address: str) -> web.Response:
+    def _queue_job(
+        self, job_kind: str, arguments: list[str], session_name: str, report_address: str
+    ) -> web.Response:
         """Queue a job, and return the response with its number or a refusal."""
         try:
-            job = self._jobs.put(kind, arguments, name, address)
+            job = self._jobs.put(job_kind, arguments, session_name, report_address)
         except JobError as error:
             return refusal_response(409, str(error))
         return web.json_response({"ok": True, "job": job.number}, status=202)
 
-    def _unused_folder(self, name: str) -> Path:
+    def _unused_folder(self, folder_name: str) -> Path:
         """Return the path of a new folder that no queued campaign will create either."""
-        number, path = 1, self._folder / name
-        while path.exists() or _campaign_url_path(path) in self._jobs.addresses:
-            number += 1
-            path = self._folder / f"{name}-{number}"
-        return path
+        folder_number, folder_path = 1, self._folder / folder_name
+        while folder_path.exists() or _campaign_url_path(folder_path) in self._jobs.addresses:
+            folder_number += 1
+            folder_path = self._folder / f"{folder_name}-{folder_number}"
+        return folder_path
 
     # Names
 
@@ -269,7 +285,7 @@ class Library:
         """Return the file of the session that a request names."""
         return self._session_path(request.match_info["id"])
 
-    def _session_path(self, name: str) -> Path:
+    def _session_path(self, session_name: str) -> Path:
         """Return the file of the session with a name.
 
         Raises
@@ -277,12 +293,12 @@ class Library:
         HTTPNotFound
             If the folder has no regular file of that name.
         """
-        path = self._path_in_folder(f"{name}.mcap")
-        if not path.is_file():
+        session_file = self._path_in_folder(f"{session_name}.mcap")
+        if not session_file.is_file():
             raise web.HTTPNotFound(reason="There is no such session.")
-        return path
+        return session_file
 
-    def _path_in_folder(self, name: str) -> Path:
+    def _path_in_folder(self, file_name: str) -> Path:
         """Return the path of a file or folder in the sessions' folder by its name.
 
         Raises
@@ -291,19 +307,21 @@ class Library:
             If the name is a path, a link out of the folder, or does not exist.
         """
         with suppress(OSError, ValueError):
-            path = self._folder / name
+            path = self._folder / file_name
             is_plain_name = (
-                Path(name).name == name and not name.startswith(".") and name.isprintable()
+                Path(file_name).name == file_name
+                and not file_name.startswith(".")
+                and file_name.isprintable()
             )
             path.lstat()  # raises if it does not exist or the name is too long
             if is_plain_name and path.resolve().parent == self._folder.resolve():
                 return path
         raise web.HTTPNotFound(reason="There is no such session.")
 
-    def _read_quick_look(self, name: str) -> Document | None:
+    def _read_quick_look(self, session_name: str) -> Document | None:
         """Return the quick look of a session, or None if there is none or it is unreadable."""
         with suppress(web.HTTPNotFound):
-            return read_quick_look(self._path_in_folder(f"{name}{QUICK_LOOK_SUFFIX}"))
+            return read_quick_look(self._path_in_folder(f"{session_name}{QUICK_LOOK_SUFFIX}"))
         return None
 
 
@@ -312,18 +330,18 @@ def _campaign_url_path(folder: Path) -> str:
     return f"/api/campaign/{folder.name}/"
 
 
-def _download_headers(name: str) -> dict[str, str]:
+def _download_headers(file_name: str) -> dict[str, str]:
     """Return the HTTP headers that make a browser save a file under a name."""
     # The name of a session may contain any character of file names.
-    is_plain_name = re.sub(r"[^A-Za-z0-9_.-]", "_", name)
+    plain_name = re.sub(r"[^A-Za-z0-9_.-]", "_", file_name)
     return {
-        "Content-Disposition": f'attachment; filename="{is_plain_name}"',
+        "Content-Disposition": f'attachment; filename="{plain_name}"',
         "Content-Type": "application/octet-stream",
     }
 
 
-def _whole_number(text: str, name: str) -> int:
-    """Return a query parameter as a whole number, or raise HTTPBadRequest."""
-    if not text.isdecimal() or len(text) > len(str(_MAX_ROWS)) + 3:
-        raise web.HTTPBadRequest(reason=f"{name} is not a whole number.")
-    return int(text)
+def _whole_number(parameter_text: str, parameter_name: str) -> int:
+    """Return a URL's query parameter as a whole number, or raise HTTPBadRequest."""
+    if not parameter_text.isdecimal() or len(parameter_text) > len(str(_MAX_ROWS)) + 3:
+        raise web.HTTPBadRequest(reason=f"{parameter_name} is not a whole number.")
+    return int(parameter_text)

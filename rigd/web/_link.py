@@ -85,11 +85,11 @@ class DaemonLink:
             await asyncio.sleep(_RECONNECT_PAUSE_S)
 
     def request_status(self) -> None:
-        """Make the next request of the daemon's status at once, since the status has changed."""
+        """Request the daemon's status now instead of at the next period, since it has changed."""
         self._status_requested.set()
 
     def register_stop(self) -> None:
-        """Register that a stop was requested, which cancels requests that are not sent yet."""
+        """Register that a stop was requested; requests that are not sent yet are cancelled."""
         self._stop_count += 1
 
     async def send_request(self, request: Document) -> Document:
@@ -123,11 +123,11 @@ class DaemonLink:
                 self._release_control()
             try:
                 if self._control_connection is None:
-                    reply = await self._send_on_new_connection(request)
+                    daemon_reply = await self._send_on_new_connection(request)
                 else:
-                    reply = await _send_and_receive(self._control_connection, request)
-                if request.get("command") == "start" and reply.get("ok"):
-                    self._controlled_series = reply["series"]
+                    daemon_reply = await _send_and_receive(self._control_connection, request)
+                if request.get("command") == "start" and daemon_reply.get("ok"):
+                    self._controlled_series = daemon_reply["series"]
             except DaemonError:
                 # Not sent again, because it may have been executed.
                 self._release_control()
@@ -135,38 +135,38 @@ class DaemonLink:
             finally:
                 if self._controlled_series <= self._last_ended_series:
                     self._release_control()
-            return reply
+            return daemon_reply
 
     async def _send_on_new_connection(self, request: Document) -> Document:
         """Send a request on a new connection, and return the reply.
 
         It is repeated while the daemon has too many clients.
         """
-        stops = self._stop_count
-        for attempt in range(_CROWDED_ATTEMPTS):
-            if attempt:
+        stop_count = self._stop_count
+        for attempt_number in range(_CROWDED_ATTEMPTS):
+            if attempt_number:
                 await asyncio.sleep(_CROWDED_PAUSE_S)
             try:
                 connection = await self._connect()
             except (OSError, TimeoutError):
                 raise DaemonError(_NO_DAEMON_MESSAGE) from None
             try:
-                if self._stop_count != stops and request.get("command") != "predict":
+                if self._stop_count != stop_count and request.get("command") != "predict":
                     raise BusyError("It was stopped before it began.")
-                reply = await _send_and_receive(connection, request)
-                if request.get("command") == "start" and reply.get("ok"):
+                daemon_reply = await _send_and_receive(connection, request)
+                if request.get("command") == "start" and daemon_reply.get("ok"):
                     self._control_connection = connection
             finally:
                 if self._control_connection is not connection:
                     connection[1].close()
-            if not reply.get("crowded"):
+            if not daemon_reply.get("crowded"):
                 break
-        return reply
+        return daemon_reply
 
     async def _connect(self) -> _Connection:
         """Open a connection to the daemon's socket."""
-        connecting = asyncio.open_unix_connection(self._path, limit=_MAX_LINE_BYTES)
-        return await asyncio.wait_for(connecting, _CONNECT_TIMEOUT_S)
+        opening_task = asyncio.open_unix_connection(self._path, limit=_MAX_LINE_BYTES)
+        return await asyncio.wait_for(opening_task, _CONNECT_TIMEOUT_S)
 
     async def _receive_messages(self) -> None:
         """Receive the messages of one connection until it ends."""
@@ -175,7 +175,7 @@ class DaemonLink:
             time.monotonic(),
             0,
         )  # a new daemon numbers its series from 0
-        tasks = [
+        connection_tasks = [
             asyncio.create_task(self._poll_status(writer)),
             asyncio.create_task(self._report_silence()),
         ]
@@ -184,16 +184,16 @@ class DaemonLink:
             while True:
                 self._process_message(await reader.readline())
         finally:
-            for task in tasks:
-                task.cancel()
+            for connection_task in connection_tasks:
+                connection_task.cancel()
             writer.close()
 
-    def _process_message(self, line: bytes) -> None:
+    def _process_message(self, json_line: bytes) -> None:
         """Decode a line of the daemon, and pass events and status replies to `on_message`."""
-        if not line:
+        if not json_line:
             raise DaemonError(_NO_DAEMON_MESSAGE)
         self._last_received_s, self._silent = time.monotonic(), False
-        message = json.loads(line)
+        message = json.loads(json_line)
         if message.get("reply") == "watch" and not message.get("ok"):
             raise DaemonError(str(message.get("error")))
         if message.get("event") == "signals":
@@ -225,9 +225,9 @@ class DaemonLink:
             with suppress(TimeoutError):
                 await asyncio.wait_for(self._status_requested.wait(), pause_s)
 
-    def _register_end(self, series: float) -> None:
+    def _register_end(self, series_number: float) -> None:
         """Register the end of a series, and release control unless a request is pending."""
-        self._last_ended_series = series
+        self._last_ended_series = series_number
         if not self._request_lock.locked():
             self._release_control()
 
@@ -243,8 +243,8 @@ async def _send_and_receive(connection: _Connection, request: Document) -> Docum
     reader, writer = connection
     try:
         writer.write(json.dumps(request).encode() + b"\n")
-        line = await asyncio.wait_for(reader.readline(), _REPLY_TIMEOUT_S)
-        return dict(json.loads(line))
+        json_line = await asyncio.wait_for(reader.readline(), _REPLY_TIMEOUT_S)
+        return dict(json.loads(json_line))
     except (OSError, ValueError, TimeoutError):
         raise DaemonError("The daemon gave no answer.") from None
 

@@ -43,12 +43,12 @@ class OpenPage:
         self._queue: deque[str] = deque()
         self._message_queued = asyncio.Event()
 
-    def put(self, text: str) -> None:
+    def put(self, message_text: str) -> None:
         """Queue a message to the page, or close its connection if the queue is full."""
         if len(self._queue) >= _MAX_QUEUED_MESSAGES:
             self.drop()
             return
-        self._queue.append(text)
+        self._queue.append(message_text)
         self._message_queued.set()
 
     def drop(self) -> None:
@@ -65,9 +65,9 @@ class OpenPage:
                 self._message_queued.clear()
                 while self._queue:
                     # In one message, because the cost of a message hardly depends on its size.
-                    text = "\n".join(self._queue)
+                    message_text = "\n".join(self._queue)
                     self._queue.clear()
-                    await self._socket.send_str(text)
+                    await self._socket.send_str(message_text)
 
     async def stop_on_request(
         self, stop_requested: asyncio.Event, stop: Callable[[], Awaitable[Document]]
@@ -101,20 +101,20 @@ class Pages:
     def send(self, document: Document | None) -> None:
         """Send a message to all open pages; None is ignored."""
         if document is not None and self._pages:
-            text = _to_json(document)
-            for page in list(self._pages):
-                page.put(text)
+            message_text = _to_json(document)
+            for open_page in list(self._pages):
+                open_page.put(message_text)
 
-    def log(self, level: str, text: str) -> None:
+    def log(self, level: str, log_text: str) -> None:
         """Send a log line to all open pages, and store it for pages that open later."""
-        event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": text}
-        self._events.append(event)
-        self.send(event)
+        log_event = {"type": "event", "utc_ns": time.time_ns(), "level": level, "text": log_text}
+        self._events.append(log_event)
+        self.send(log_event)
 
     async def serve(
         self,
         request: web.Request,
-        first: Iterable[Document],
+        first_messages: Iterable[Document],
         stop: Callable[[], Awaitable[Document]],
     ) -> web.StreamResponse:
         """Send live messages to a new page until it is closed.
@@ -123,7 +123,7 @@ class Pages:
         ----------
         request
             Request for a WebSocket.
-        first
+        first_messages
             First messages for the page.
         stop
             Function that stops the session. It is called for each message ``stop`` of the page, and
@@ -131,37 +131,37 @@ class Pages:
         """
         if len(self._pages) >= MAX_PAGES:
             raise web.HTTPServiceUnavailable(reason=f"There are {MAX_PAGES} open pages already.")
-        socket = web.WebSocketResponse(
+        web_socket = web.WebSocketResponse(
             heartbeat=_PING_PERIOD_S, compress=False, max_msg_size=_MAX_MESSAGE_BYTES
         )
-        await socket.prepare(request)
-        page = OpenPage(socket, request.transport)
-        for document in (*first, *self._events):
-            page.put(_to_json(document))
-        self._pages.add(page)
+        await web_socket.prepare(request)
+        open_page = OpenPage(web_socket, request.transport)
+        for document in (*first_messages, *self._events):
+            open_page.put(_to_json(document))
+        self._pages.add(open_page)
         stop_requested = asyncio.Event()
-        tasks = [
-            asyncio.create_task(page.write()),
-            asyncio.create_task(page.stop_on_request(stop_requested, stop)),
+        page_tasks = [
+            asyncio.create_task(open_page.write()),
+            asyncio.create_task(open_page.stop_on_request(stop_requested, stop)),
         ]
         try:
             # Unlike a request, this does not wait for downloads of the browser. Any other message
             # ends the connection.
             while (
-                message := await socket.receive()
-            ).type is WSMsgType.TEXT and message.data == "stop":
+                first_message := await web_socket.receive()
+            ).type is WSMsgType.TEXT and first_message.data == "stop":
                 stop_requested.set()
         finally:
-            self._pages.discard(page)
-            for task in tasks:
-                task.cancel()
-            page.drop()
-        return socket
+            self._pages.discard(open_page)
+            for page_task in page_tasks:
+                page_task.cancel()
+            open_page.drop()
+        return web_socket
 
     def drop_all(self) -> None:
         """Close the connections of all pages."""
-        for page in list(self._pages):
-            page.drop()
+        for open_page in list(self._pages):
+            open_page.drop()
 
 
 _to_json: Final = json.JSONEncoder(allow_nan=False, separators=(",", ":")).encode

@@ -118,21 +118,21 @@ class OperatorPageServer:
         )
 
     def end(self, reason: str) -> None:
-        """Report to the open pages that this server ends."""
+        """Send the open pages a message that this server ends, with the reason."""
         self._report_loss(reason)
 
     # Requests
 
     async def _static_file(self, request: web.Request) -> web.StreamResponse:
         """Send a static file of the page."""
-        name = request.match_info.get(
+        file_name = request.match_info.get(
             "name", "index.html" if request.path == "/" else "favicon.svg"
         )
-        path = Path(str(files("rigd.web") / "static" / name))
-        if not _STATIC_NAME.fullmatch(name) or not path.is_file():
+        file_path = Path(str(files("rigd.web") / "static" / file_name))
+        if not _STATIC_NAME.fullmatch(file_name) or not file_path.is_file():
             return refusal_response(404, "There is no such file.")
-        headers = {"Cross-Origin-Resource-Policy": "cross-origin"}
-        return web.FileResponse(path, headers=headers if request.path == ICON else None)
+        icon_headers = {"Cross-Origin-Resource-Policy": "cross-origin"}
+        return web.FileResponse(file_path, headers=icon_headers if request.path == ICON else None)
 
     async def _live_messages(self, request: web.Request) -> web.StreamResponse:
         """Send live messages to a page until it is closed."""
@@ -171,23 +171,25 @@ class OperatorPageServer:
             )
         try:
             if command == "stop":
-                reply = await self._stop()
+                daemon_reply = await self._stop()
             else:
-                reply = await self._link.send_request(request_object)
+                daemon_reply = await self._link.send_request(request_object)
         except (DaemonError, DaemonGoneError) as error:
             return refusal_response(503, str(error))
         except (BusyError, RefusedByDaemonError) as error:
             return refusal_response(409, str(error))
         finally:
             self._link.request_status()
-        status = 200 if reply.get("ok") else 400 if reply.get("wrong_use") else 409
-        return web.json_response(reply, status=status)
+        http_status = (
+            200 if daemon_reply.get("ok") else 400 if daemon_reply.get("wrong_use") else 409
+        )
+        return web.json_response(daemon_reply, status=http_status)
 
     async def _stop(self) -> Document:
         """Stop the daemon's session, if necessary by a signal, and return the reply."""
         self._link.register_stop()
-        loop = asyncio.get_running_loop()
-        return await loop.run_in_executor(self._stopping, stop_session, self._socket)
+        event_loop = asyncio.get_running_loop()
+        return await event_loop.run_in_executor(self._stopping, stop_session, self._socket)
 
     async def _stop_for_page(self) -> Document:
         """Stop the daemon's session, and return the reply or the reason of a failure."""
@@ -205,74 +207,78 @@ class OperatorPageServer:
         if self._lost_message is not None:
             self._lost_message = None
             self._link.request_status()
-        event = message.get("event")
-        if event is None:
+        event_name = message.get("event")
+        if event_name is None:
             self._process_status(message)
-        elif event == "signals":
+        elif event_name == "signals":
             self._process_signals(message)
-        elif event == "fit":
+        elif event_name == "fit":
             # The status contains the last fit, also for pages that open later.
             self._link.request_status()
-        elif event == "message":
+        elif event_name == "message":
             self.pages.log(message["level"], message["text"])
         else:
             del message["event"]
-            self.pages.send({"type": event, **message})
-            if event != "progress":
+            self.pages.send({"type": event_name, **message})
+            if event_name != "progress":
                 self._link.request_status()
-            if event == "session":
+            if event_name == "session":
                 self._start_search(self._find_specimens())
-            elif event == "quick_look":
+            elif event_name == "quick_look":
                 self.pages.log("info", "\n".join(QuickLook.of_event(message).lines))
 
     def _process_status(self, status: Document) -> None:
         """Send the daemon's status to the open pages, and prepare for a new session."""
         self._status = {"type": "status", **status}
         self._jobs.paused = status["state"] in _SESSION_STATES
-        series = status["series"]
-        session = series["path"] if series is not None and series["running"] else None
-        if session is not None and session != self._session:
-            self._prepare_session(session, series)
-        self._session = session
+        session_series = status["series"]
+        session_path = (
+            session_series["path"]
+            if session_series is not None and session_series["running"]
+            else None
+        )
+        if session_path is not None and session_path != self._session:
+            self._prepare_session(session_path, session_series)
+        self._session = session_path
         self.pages.send(self._status)
 
-    def _prepare_session(self, path: str, series: Document) -> None:
+    def _prepare_session(self, session_path: str, session_series: Document) -> None:
         """Prepare the frequency responses that the pages show during a new session."""
-        plan, rate_hz = series["plan"], self._job["rate_hz"]
-        self._nominal_response = self._nominal_message(plan)
-        first, end = sweep_ticks(plan["segments"])
+        session_plan, rate_hz = session_series["plan"], self._job["rate_hz"]
+        self._nominal_response = self._nominal_message(session_plan)
+        sweep_begin, sweep_end = sweep_ticks(session_plan["segments"])
         self._shown = self._last_response = None
         self._response = None
-        if series["excitation"] != "hold":
+        if session_series["excitation"] != "hold":
             self._response = SessionResponse(
                 Subject(
-                    Path(path).stem,
+                    Path(session_path).stem,
                     rate_hz,
-                    round(plan["record_s"] * rate_hz),
-                    (first, end),
-                    Beam(**plan["beam"]),
-                    Damping(**plan["damping"]),
+                    round(session_plan["record_s"] * rate_hz),
+                    (sweep_begin, sweep_end),
+                    Beam(**session_plan["beam"]),
+                    Damping(**session_plan["damping"]),
                     self._job["tool_inertia_kg_m2"],
                     self._job["angle_delay_s"],
                     self._job["torque_delay_s"],
                 )
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
-        specimen = str(series["notes"].get("specimen", ""))
-        self._start_search(self._find_last(specimen, Path(path).stem))
+        specimen_name = str(session_series["notes"].get("specimen", ""))
+        self._start_search(self._find_last(specimen_name, Path(session_path).stem))
 
-    def _nominal_message(self, specimen: Document) -> Document:
+    def _nominal_message(self, beam_document: Document) -> Document:
         """Return the message with the nominal frequency response of a job's or plan's beam."""
-        beam, damping = Beam(**specimen["beam"]), Damping(**specimen["damping"])
+        beam, damping = Beam(**beam_document["beam"]), Damping(**beam_document["damping"])
         return nominal_document(beam, damping, self._job["tool_inertia_kg_m2"])
 
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
         if event["count"]:
-            block = PageSignalBlock.of_event(event)
-            self.pages.send(self._envelopes.feed(block))
+            signal_block = PageSignalBlock.of_event(event)
+            self.pages.send(self._envelopes.feed(signal_block))
             if self._response is not None:
-                self._response.feed(block)
+                self._response.feed(signal_block)
         if event["gauges"] is not None:
             frequency_hz = event["frequency_hz"]
             self._gauges_message = {
@@ -294,15 +300,15 @@ class OperatorPageServer:
         while True:
             await asyncio.sleep(_RESPONSE_PERIOD_S)
             if self._response is not None and self.pages:
-                shown = self._response.document()
-                self._shown = shown or self._shown
-                self.pages.send(shown)
+                shown_response = self._response.document()
+                self._shown = shown_response or self._shown
+                self.pages.send(shown_response)
 
     def _start_search(self, search: Awaitable[None]) -> None:
         """Start a search in the recorded sessions without waiting for it."""
-        task = asyncio.ensure_future(search)
-        self._searches.add(task)
-        task.add_done_callback(self._searches.discard)
+        search_task = asyncio.ensure_future(search)
+        self._searches.add(search_task)
+        search_task.add_done_callback(self._searches.discard)
 
     async def _find_specimens(self) -> None:
         """Update the names of specimens that the page suggests."""
@@ -319,32 +325,40 @@ class OperatorPageServer:
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
     """Yield the name and the options of each excitation, for the page's form."""
-    for name, function in KINDS.items():
+    for excitation_name, function in KINDS.items():
         descriptions = _parameter_descriptions(cleandoc(function.__doc__ or ""))
         yield (
-            name,
+            excitation_name,
             [
                 {
-                    "name": option.name,
-                    "unit": unit_of(option.name),
-                    "default": None if option.default is Parameter.empty else option.default,
-                    "help": descriptions.get(option.name, ""),
+                    "name": command_option.name,
+                    "unit": unit_of(command_option.name),
+                    "default": None
+                    if command_option.default is Parameter.empty
+                    else command_option.default,
+                    "help": descriptions.get(command_option.name, ""),
                 }
-                | ({"text": True} if option.annotation is str else {})
-                for option in signature(function).parameters.values()
-                if option.name not in RIG_ARGUMENTS
+                | ({"text": True} if command_option.annotation is str else {})
+                for command_option in signature(function).parameters.values()
+                if command_option.name not in RIG_ARGUMENTS
             ],
         )
 
 
-def _parameter_descriptions(text: str) -> dict[str, str]:
+def _parameter_descriptions(docstring: str) -> dict[str, str]:
     """Return the descriptions of the parameters in a numpydoc docstring, by name."""
-    section = re.search(r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", text, re.DOTALL | re.MULTILINE)
-    entries = re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section[1], re.MULTILINE) if section else []
+    section_match = re.search(
+        r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", docstring, re.DOTALL | re.MULTILINE
+    )
+    section_entries = (
+        re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section_match[1], re.MULTILINE)
+        if section_match
+        else []
+    )
     return {
-        name.strip(): " ".join(description.split())
-        for names, description in entries
-        for name in names.split(",")
+        parameter_name.strip(): " ".join(description.split())
+        for parameter_names, description in section_entries
+        for parameter_name in parameter_names.split(",")
     }
 
 
@@ -368,23 +382,25 @@ def run_page() -> None:
 async def _serve_until_end(job: Document) -> None:
     """Serve the page of a job until standard input ends or the server fails."""
     try:
-        server, _, listening = await open_page(job)
+        page_server, _, listening_server = await open_page(job)
     except OSError as error:
         _report_to_daemon(error=f"port {job['port']} cannot be had: {error.strerror}")
         return
-    _report_to_daemon(port=port_of(listening))
-    running = asyncio.create_task(server.run())
+    _report_to_daemon(port=port_of(listening_server))
+    server_task = asyncio.create_task(page_server.run())
     input_ended = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
-    await asyncio.wait((running, input_ended), return_when=asyncio.FIRST_COMPLETED)
-    failed = running.done()
-    if failed:
-        _report_to_daemon(error=f"unexpected error ({running.exception()!r})")
+    await asyncio.wait((server_task, input_ended), return_when=asyncio.FIRST_COMPLETED)
+    has_failed = server_task.done()
+    if has_failed:
+        _report_to_daemon(error=f"unexpected error ({server_task.exception()!r})")
     # The successor of this process or of the daemon may need the port.
-    listening.close()
-    server.end(_FAILED_MESSAGE if failed else "The daemon has ended; start it with rigd serve.")
+    listening_server.close()
+    page_server.end(
+        _FAILED_MESSAGE if has_failed else "The daemon has ended; start it with rigd serve."
+    )
     await asyncio.sleep(_LAST_MESSAGES_S)
     # A regular exit would wait for reading clients and for the thread that reads stdin.
-    os._exit(1 if failed else 0)
+    os._exit(1 if has_failed else 0)
 
 
 def _report_to_daemon(**message: Any) -> None:  # noqa: ANN401 - what JSON has
@@ -410,11 +426,11 @@ async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, a
     OSError
         If the port is not available.
     """
-    server, connections = OperatorPageServer(job), Connections()
-    application = server.application()
-    application.middlewares.append(connections.register_request)
-    runner = web.AppRunner(
-        application,
+    page_server, connections = OperatorPageServer(job), Connections()
+    web_application = page_server.application()
+    web_application.middlewares.append(connections.register_request)
+    app_runner = web.AppRunner(
+        web_application,
         access_log=None,
         handle_signals=False,
         auto_decompress=False,
@@ -422,21 +438,25 @@ async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, a
         lingering_time=_LINGERING_TIME_S,
         shutdown_timeout=_LAST_MESSAGES_S,
     )
-    await runner.setup()
-    assert runner.server is not None
-    connections.serving = runner.server
-    loop = asyncio.get_running_loop()
+    await app_runner.setup()
+    assert app_runner.server is not None
+    connections.serving = app_runner.server
+    event_loop = asyncio.get_running_loop()
     try:
-        listening = await loop.create_server(connections.accept_connection, _LOOPBACK, job["port"])
+        listening_server = await event_loop.create_server(
+            connections.accept_connection, _LOOPBACK, job["port"]
+        )
     except OSError:
         if not job["any_port"]:
             raise
-        listening = await loop.create_server(connections.accept_connection, _LOOPBACK, 0)
+        listening_server = await event_loop.create_server(
+            connections.accept_connection, _LOOPBACK, 0
+        )
     connections.close_silent()
-    return server, runner, listening
+    return page_server, app_runner, listening_server
 
 
-def port_of(listening: asyncio.Server) -> int:
+def port_of(listening_server: asyncio.Server) -> int:
     """Return the number of the port on which a server listens."""
-    port: int = listening.sockets[0].getsockname()[1]
-    return port
+    port_number: int = listening_server.sockets[0].getsockname()[1]
+    return port_number

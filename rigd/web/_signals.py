@@ -59,9 +59,15 @@ class PageSignalBlock:
     @classmethod
     def of_event(cls, event: Mapping[str, Any]) -> "PageSignalBlock":
         """Decode the block of signals in the daemon's event ``signals``."""
-        data = b"".join(base64.b64decode(event[name]) for name in _SIGNAL_NAMES)
-        values = np.frombuffer(data, dtype="<f4").reshape(len(_SIGNAL_NAMES), -1).astype(np.float64)
-        return cls(event["first_tick"], event["rate_hz"], values)
+        signal_bytes = b"".join(
+            base64.b64decode(event[signal_name]) for signal_name in _SIGNAL_NAMES
+        )
+        signal_values = (
+            np.frombuffer(signal_bytes, dtype="<f4")
+            .reshape(len(_SIGNAL_NAMES), -1)
+            .astype(np.float64)
+        )
+        return cls(event["first_tick"], event["rate_hz"], signal_values)
 
 
 # Strips
@@ -84,58 +90,67 @@ class SignalEnvelopes:
         self._next_tick = 0
         """Tick that is expected next."""
 
-    def feed(self, block: PageSignalBlock) -> Document | None:
-        """Add a block, and return the message with the points that it completes, or None."""
-        ticks = max(1, round(ENVELOPE_POINT_S * block.rate_hz))
-        values = block.values
-        missing_ticks = block.first_tick - self._next_tick
-        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * block.rate_hz:
+    def feed(self, signal_block: PageSignalBlock) -> Document | None:
+        """Add a block; return the message with the envelope points it completes, or None."""
+        ticks_per_point = max(1, round(ENVELOPE_POINT_S * signal_block.rate_hz))
+        signal_values = signal_block.values
+        missing_ticks = signal_block.first_tick - self._next_tick
+        if missing_ticks < 0 or missing_ticks > _STORED_DURATION_S * signal_block.rate_hz:
             self._points.clear()
-            self._next_point = block.first_tick // ticks
+            self._next_point = signal_block.first_tick // ticks_per_point
             self._incomplete_point = []
-            missing_ticks = block.first_tick - self._next_point * ticks
+            missing_ticks = signal_block.first_tick - self._next_point * ticks_per_point
         if missing_ticks:
             self._incomplete_point.append(np.full((3, missing_ticks), np.nan))
-        self._incomplete_point.append(values)
-        self._next_tick = block.first_tick + values.shape[1]
-        pending = np.concatenate(self._incomplete_point, axis=1)
-        count = pending.shape[1] // ticks
-        self._incomplete_point = [pending[:, count * ticks :]]
-        if count == 0:
+        self._incomplete_point.append(signal_values)
+        self._next_tick = signal_block.first_tick + signal_values.shape[1]
+        pending_values = np.concatenate(self._incomplete_point, axis=1)
+        point_count = pending_values.shape[1] // ticks_per_point
+        self._incomplete_point = [pending_values[:, point_count * ticks_per_point :]]
+        if point_count == 0:
             return None
-        bins = pending[:, : count * ticks].reshape(3, count, ticks)
+        point_bins = pending_values[:, : point_count * ticks_per_point].reshape(
+            3, point_count, ticks_per_point
+        )
         # Unlike nanmin and nanmax, these do not warn of points without known values.
-        smallest, largest = np.fmin.reduce(bins, axis=2), np.fmax.reduce(bins, axis=2)
-        extremes = np.stack((smallest, largest), axis=1).reshape(6, count).round(_DECIMALS)
-        points = [tuple(_without_nan(column)) for column in extremes.T]
-        first, self._next_point = self._next_point, self._next_point + count
+        smallest, largest = np.fmin.reduce(point_bins, axis=2), np.fmax.reduce(point_bins, axis=2)
+        extremes = np.stack((smallest, largest), axis=1).reshape(6, point_count).round(_DECIMALS)
+        points = [tuple(_without_nan(point_values)) for point_values in extremes.T]
+        first_point, self._next_point = self._next_point, self._next_point + point_count
         self._points.extend(points)
-        return _envelope_message(first, points)
+        return _envelope_message(first_point, points)
 
     def last(self) -> Document | None:
         """Return the message with all stored points for a new page, or None if there are none."""
-        points = list(self._points)
-        return _envelope_message(self._next_point - len(points), points) if points else None
+        stored_points = list(self._points)
+        return (
+            _envelope_message(self._next_point - len(stored_points), stored_points)
+            if stored_points
+            else None
+        )
 
 
-def _envelope_message(first: int, points: list[tuple[float | None, ...]]) -> Document:
-    """Return the message with points of the envelopes; `first` is the index of the first one."""
-    names = (
+def _envelope_message(first_index: int, points: list[tuple[float | None, ...]]) -> Document:
+    """Return the message with points of the envelopes, the first of which has `first_index`."""
+    column_names = (
         *("angle_min", "angle_max", "reference_min", "reference_max"),
         *("torque_min", "torque_max"),
     )
-    columns = zip(*points, strict=True)
+    point_columns = zip(*points, strict=True)
     return {
         "type": "strip",
-        "t0_s": round(first * ENVELOPE_POINT_S, 3),
+        "t0_s": round(first_index * ENVELOPE_POINT_S, 3),
         "dt_s": ENVELOPE_POINT_S,
-        **{name: list(column) for name, column in zip(names, columns, strict=True)},
+        **{
+            column_name: list(column_values)
+            for column_name, column_values in zip(column_names, point_columns, strict=True)
+        },
     }
 
 
-def _without_nan(values: Real) -> list[float | None]:
-    """Return values as a list with None instead of NaN."""
-    return [None if value != value else value for value in values.tolist()]
+def _without_nan(numbers: Real) -> list[float | None]:
+    """Return an array's numbers as a list, with None instead of NaN."""
+    return [None if number != number else number for number in numbers.tolist()]
 
 
 # Frequency response
@@ -158,9 +173,9 @@ class SessionResponse:
         self._has_new_data = False
         self._reached_hz = 0.0
 
-    def feed(self, block: PageSignalBlock) -> None:
+    def feed(self, signal_block: PageSignalBlock) -> None:
         """Add a block of signals; its unknown values are ignored."""
-        self._queued_blocks.append(block)
+        self._queued_blocks.append(signal_block)
         if len(self._queued_blocks) >= _BLOCKS_PER_UPDATE:
             self._feed_sweep()
 
@@ -168,45 +183,52 @@ class SessionResponse:
         """Pass the queued blocks to the estimate; many of them cost about as much as one."""
         if not self._queued_blocks:
             return
-        values = np.concatenate([block.values for block in self._queued_blocks], axis=1)
-        ticks = np.concatenate(
-            [block.first_tick + np.arange(block.values.shape[1]) for block in self._queued_blocks]
+        signal_values = np.concatenate(
+            [queued_block.values for queued_block in self._queued_blocks], axis=1
+        )
+        tick_numbers = np.concatenate(
+            [
+                queued_block.first_tick + np.arange(queued_block.values.shape[1])
+                for queued_block in self._queued_blocks
+            ]
         )
         self._queued_blocks.clear()
-        is_known = np.isfinite(values[0])
+        is_known = np.isfinite(signal_values[0])
         if is_known.any():
-            samples = np.zeros(int(is_known.sum()), dtype=_SAMPLE_TYPE)
-            samples["tick"] = ticks[is_known]
-            for name, signal in zip(_SIGNAL_NAMES, values, strict=True):
-                samples[name] = signal[is_known]
-            self._sweep.feed(samples)
+            known_samples = np.zeros(int(is_known.sum()), dtype=_SAMPLE_TYPE)
+            known_samples["tick"] = tick_numbers[is_known]
+            for field_name, signal in zip(_SIGNAL_NAMES, signal_values, strict=True):
+                known_samples[field_name] = signal[is_known]
+            self._sweep.feed(known_samples)
             self._has_new_data = True
 
     def document(self) -> Document | None:
         """Return the message with the estimated response, or None if it has not changed."""
         self._feed_sweep()
-        estimate = self._sweep.estimate() if self._has_new_data else None
+        sweep_estimate = self._sweep.estimate() if self._has_new_data else None
         self._has_new_data = False
-        if estimate is None or not estimate.excited.any():
+        if sweep_estimate is None or not sweep_estimate.excited.any():
             return None
-        reached_hz = float(estimate.response.frequency_hz[estimate.excited][-1])
-        if estimate.final and reached_hz < self._reached_hz:
+        reached_hz = float(sweep_estimate.response.frequency_hz[sweep_estimate.excited][-1])
+        if sweep_estimate.final and reached_hz < self._reached_hz:
             return None  # the last complete segment ends before the sweep
         self._reached_hz = reached_hz
-        response = estimate.response.without_delays(
+        response = sweep_estimate.response.without_delays(
             input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
         )
-        grid = response.frequency_hz
+        grid_hz = response.frequency_hz
         if self._thinning is None:
-            self._thinning = response_decimation(grid)
-        shown = np.where(estimate.excited, response.response, np.nan)
+            self._thinning = response_decimation(grid_hz)
+        shown_response = np.where(sweep_estimate.excited, response.response, np.nan)
         # The unknown values at both ends of a gap interrupt the line.
-        size = np.abs(shown)
-        shown_points = np.union1d(self._thinning.extremes(size), self._thinning.gaps(size))
+        magnitude = np.abs(shown_response)
+        shown_points = np.union1d(
+            self._thinning.extremes(magnitude), self._thinning.gaps(magnitude)
+        )
         coherence = None
         if response.coherence is not None:
             coherence = _without_nan(np.round(response.coherence[shown_points], 4))
-        return _response_document(grid[shown_points], shown[shown_points]) | {
+        return _response_document(grid_hz[shown_points], shown_response[shown_points]) | {
             "type": "response",
             "coherence": coherence,
             "reached_hz": round(reached_hz, 3),
@@ -223,9 +245,12 @@ def nominal_document(beam: Beam, damping: Damping, tool_inertia_kg_m2: float) ->
     tool_inertia_kg_m2
         Inertia between sensor and beam.
     """
-    grid, model = nominal_response(beam, damping, tool_inertia_kg_m2)
-    shown_points = response_decimation(grid).extremes(np.abs(model))
-    return {"type": "nominal", **_response_document(grid[shown_points], model[shown_points])}
+    grid_hz, model_response = nominal_response(beam, damping, tool_inertia_kg_m2)
+    shown_points = response_decimation(grid_hz).extremes(np.abs(model_response))
+    return {
+        "type": "nominal",
+        **_response_document(grid_hz[shown_points], model_response[shown_points]),
+    }
 
 
 def _response_document(frequency_hz: Real, response: npt.NDArray[np.complex128]) -> Document:
@@ -233,8 +258,8 @@ def _response_document(frequency_hz: Real, response: npt.NDArray[np.complex128])
     return {
         "frequency_hz": np.round(frequency_hz, 4).tolist(),
         "magnitude": [
-            None if value is None else float(f"{value:.4g}")
-            for value in _without_nan(np.abs(response))
+            None if complex_value is None else float(f"{complex_value:.4g}")
+            for complex_value in _without_nan(np.abs(response))
         ],
         "phase_rad": _without_nan(np.round(np.angle(response), 4)),
     }

@@ -41,7 +41,7 @@ def test_ticks_missed_at_the_start_count():
 
 def test_scheduled_ticks_are_recorded_or_missed():
     found = record_measurement(
-        "a", 1000.0, samples([0, 1, 5], 0), scheduled=10, cpu_percent=None, page_faults=None
+        "a", 1000.0, samples([0, 1, 5], 0), scheduled_ticks=10, cpu_percent=None, page_faults=None
     )
     assert (found.missed, found.held) == (7, pytest.approx(0.3))
 
@@ -52,7 +52,7 @@ def test_ticks_that_pass_in_a_stall_are_told_apart():
         "a",
         1000.0,
         samples(ticks, [0, 0, 500_000, 0, 900_000, 0]),
-        scheduled=37,
+        scheduled_ticks=37,
         cpu_percent=None,
         page_faults=None,
     )

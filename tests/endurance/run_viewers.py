@@ -166,7 +166,7 @@ def run(name: str, seconds: float) -> Outcome:
         samples = read_session(path).samples
     scheduled = round(seconds * RATE_HZ)
     found = record_measurement(
-        name, RATE_HZ, samples, scheduled=scheduled, cpu_percent=None, page_faults=None
+        name, RATE_HZ, samples, scheduled_ticks=scheduled, cpu_percent=None, page_faults=None
     )
     return Outcome(
         name,
