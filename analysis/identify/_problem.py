@@ -96,7 +96,7 @@ class Objective:
         Record, reduced to the band.
     unknowns : Unknowns
         Free parameters of the structure.
-    columns : ndarray of complex, shape (c, K), optional
+    effect_spectra : ndarray of complex, shape (c, K), optional
         Torque spectra of known form, in N·m per unit of amplitude. Their amplitudes are free, like
         those of the free decay.
     """

@@ -130,7 +130,7 @@ class DecaySpectra:
 
     Parameters
     ----------
-    samples : int
+    sample_count : int
         Number of samples. The decays start at the first one.
     rate_hz : float
         Rate of the samples.
@@ -254,7 +254,7 @@ class LaterDecaySpectra(DecaySpectra):
 
     Parameters
     ----------
-    samples : int
+    sample_count : int
         Number of compared samples.
     rate_hz : float
         Rate of the compared samples.

@@ -103,7 +103,7 @@ class PoleFit:
     ----------
     dynamics : Dynamics
         Response and poles to be realised.
-    near : PoleFit, optional
+    similar_fit : PoleFit, optional
         Fit of almost the same dynamics, from whose zeros the search for zeros starts.
     """
 

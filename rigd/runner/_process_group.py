@@ -53,7 +53,7 @@ class ProcessGroup:
     ----------
     live
         Start the publisher of the live view too.
-    also
+    extra_processes
         Further processes to start at once. Others are started when they are needed.
 
     Raises

@@ -152,7 +152,7 @@ class RigLock:
         Name of this program, for error messages of a second program.
     hardware
         Whether the rig is hardware, which is common to all users of this computer.
-    alone
+    exclusive
         Whether the lock is exclusive. Programs with a non-exclusive lock can run at the same time,
         because each simulates a rig of its own.
     """

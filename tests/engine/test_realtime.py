@@ -27,7 +27,7 @@ import json, os, resource, sys
 from pathlib import Path
 from rigd.engine.realtime import apply_realtime
 {before}
-obtained = apply_realtime(priority={priority}, cpu={cpu}, root=Path({root!r}))
+obtained = apply_realtime(priority={priority}, cpu={cpu}, root_folder=Path({root!r}))
 print(json.dumps([obtained, sorted(os.sched_getaffinity(0)), os.sched_getscheduler(0)]))
 """
 NO_RIGHTS = """
@@ -180,7 +180,7 @@ def as_child():
     return json.loads(os.read(there, 1000))
 
 told = dict(before=state())
-precedence = Precedence({priority}, {cpu}, root=Path("{root}"))
+precedence = Precedence({priority}, {cpu}, root_folder=Path("{root}"))
 told["obtained"], told["with"] = precedence.take(), state()
 wait = threading.Event()
 thread = threading.Thread(target=wait.wait, daemon=True)

@@ -187,7 +187,7 @@ def test_too_few_passes_are_refused():
     windows = windows_for(Truth())
     one_way = [window for window in windows if window.speed_rad_s > 0]
     for few in ((), one_way, windows[:3] + windows[8:11]):
-        with pytest.raises(MotorEstimateError, match="too few"):
+        with pytest.raises(MotorEstimateError, match="Too few passes"):
             estimate_motor(few, timing_for(Truth()))
 
 

@@ -184,12 +184,12 @@ def test_the_last_look_is_that_of_the_latest_session(tmp_path):
     write(tmp_path, "none", start_utc_ns=7)
     quick_look_path(tmp_path / "torn.mcap").write_text("{")
 
-    def last(specimen, usable=bool, **but):
-        found = last_quick_look(tmp_path, specimen, is_usable=usable, **but)
+    def last(specimen, usable=bool, **limits):
+        found = last_quick_look(tmp_path, specimen, is_usable=usable, **limits)
         return None if found is None else found[0].name
 
     assert last("A") == "late.mcap"
-    assert last("A", but="late") == last("A", before_utc_ns=9) == "early.mcap"
+    assert last("A", excluded_session="late") == last("A", before_utc_ns=9) == "early.mcap"
     assert last("A", usable=lambda look: look["response"]) == "early.mcap"
     assert last("") == "none.mcap"
     assert last("C") is None
