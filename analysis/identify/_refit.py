@@ -257,7 +257,7 @@ class Refit:
         )
 
     def candidate(self) -> Candidate:
-        """Return the fit at this minimum as a candidate of its structure."""
+        """Return this minimum as a candidate for the best fit of the record, with its structure."""
         unknowns = self.objective.unknowns
         return Candidate(unknowns.structure, self.fit(), len(self.columns))
 

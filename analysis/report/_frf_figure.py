@@ -108,7 +108,7 @@ def _draw_type_panel(
     phase_axes: Axes,
     style_by_weighting: dict[str, dict[str, Any]],
 ) -> dict[str, Line2D]:
-    """Draw the measured and modelled curves of one type, and return their lines by label."""
+    """Draw measured and fitted responses of one damping type; return the lines by label."""
     line_by_label = {}
     type_curves: list[tuple[str, NDArray[np.float64], NDArray[np.complex128], dict[str, Any]]] = []
     if analysis.settings.estimator != "fft":

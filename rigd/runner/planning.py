@@ -547,7 +547,7 @@ def _precision_search_text(excitation: Excitation) -> str:
 
 
 def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
-    """Return the predicted peak magnitudes of a session.
+    """Return the peaks of angle, speed and torques that are predicted for a session.
 
     Parameters
     ----------

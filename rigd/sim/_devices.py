@@ -238,7 +238,7 @@ class SimulatedRig:
             self._start_preparation()
 
     def _use_prepared_plant(self, plant: SimulatedPlant) -> None:
-        """Let the plant use a prepared plant's obstacles and impacts, except the removed ones."""
+        """Use the obstacles and impacts of a prepared plant, except those removed since then."""
         self.plant.use_obstacles_of(plant)
         for disturbance in self._removed_disturbances:
             self.plant.remove_obstacle(disturbance)

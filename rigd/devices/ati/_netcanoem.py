@@ -159,7 +159,7 @@ class GaugePolls:
         self.answer: PollReply | None = None
 
     def open(self, exchange: CanExchange) -> None:
-        """Use an open CAN exchange for the polls; no reply is outstanding."""
+        """Poll over this open CAN exchange from now on, and expect no reply to earlier polls."""
         self._exchange = exchange
         self.forget()
 

@@ -662,7 +662,7 @@ class BusSimulation:
         )
 
     def _schedule_delivery(self, delay_s: float, action: Callable[[], None]) -> None:
-        """Schedule the delivery of a delayed frame; in real time by the wall clock."""
+        """Deliver a frame after a delay in simulated time, or by the wall clock in real time."""
         self._action_count += 1
         now_ns = self.periods * self._period_ns if self._lock_step else self._now_ns
         heapq.heappush(

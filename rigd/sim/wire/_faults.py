@@ -65,7 +65,7 @@ def _integer_key(low: int, high: int, **key_options: Any) -> _FaultKey:  # noqa:
 
 
 def _positive_number_key(**key_options: Any) -> _FaultKey:  # noqa: ANN401 - passed on
-    """Return a key whose value is a number above 0."""
+    """Describe a key of the fault description whose value must be a number above 0."""
 
     def read(text: str) -> float:
         parsed_number = float(text)
