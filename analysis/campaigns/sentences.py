@@ -343,16 +343,10 @@ def _order_clause(pooled_order: PooledOrder) -> str:
         return f"no {damping_name}"
     if pooled_order.status == "compatible" and pooled_order.interval is None:
         return f"{damping_name} of order 1 ({pooled_order.order} was not fitted)"
-    if (
-        pooled_order.value is None
-        or pooled_order.interval is None
-        or pooled_order.reason is not None
-    ):
+    value_text = _value_and_half_width(pooled_order)
+    if value_text is None:
         return f"{damping_name} of an order that is not established"
-    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
-    value_text = " ± ".join(
-        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
-    )
+    assert pooled_order.value is not None
     order_text = f"{pooled_order.order} = {value_text}"
     if pooled_order.status == "compatible":
         return f"{damping_name} of integer order ({order_text})"
@@ -363,19 +357,21 @@ def _order_clause(pooled_order: PooledOrder) -> str:
     return f"{damping_name} of fractional order ({order_text})"
 
 
+def _value_and_half_width(pooled_order: PooledOrder) -> str | None:
+    """Return an order as "value ± half width of its interval", or None if not established."""
+    value, interval = pooled_order.value, pooled_order.interval
+    if value is None or interval is None or pooled_order.reason is not None:
+        return None
+    half_width = (interval[1] - interval[0]) / 2
+    return " ± ".join(to_uncertainty((value, half_width), pooled_order.std or half_width))
+
+
 def _slope_clause(pooled_order: PooledOrder) -> str:
     """Describe how one loss grows with frequency over the visible modes, as a clause."""
     loss_name = LOSS_NAMES[pooled_order.order]
-    if (
-        pooled_order.value is None
-        or pooled_order.interval is None
-        or pooled_order.reason is not None
-    ):
+    slope_text = _value_and_half_width(pooled_order)
+    if slope_text is None:
         return f"{loss_name} with a slope that is not established"
-    half_width = (pooled_order.interval[1] - pooled_order.interval[0]) / 2
-    slope_text = " ± ".join(
-        to_uncertainty((pooled_order.value, half_width), pooled_order.std or half_width)
-    )
     conclusion = {
         "compatible": "consistent with order 1",
         "fractional": "which excludes order 1",

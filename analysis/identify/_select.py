@@ -302,23 +302,17 @@ def _select_with_known_impacts(
             )
             if impact_assessment.explained:
                 return impact_assessment
-    stiffness_step = None
-    if modal_fit is not None and measurement.is_single_sweep:
-        if not (is_linear_and_constant or small_effect_suffices) or (
-            small_linear_effect is not None and small_linear_effect.large
-        ):
-            stiffness_step = _likely_stiffness_step(
-                linear_candidates, modal_fit, small_linear_effect
-            )
-        if stiffness_step is not None:
-            small_linear_effect, modal_fit_with_effect, small_effect_suffices = (
-                None,
-                modal_fit,
-                is_linear_and_constant,
-            )
-    if not (is_linear_and_constant or small_effect_suffices) or (
+    needs_further_effects = not (is_linear_and_constant or small_effect_suffices) or (
         small_linear_effect is not None and small_linear_effect.large
-    ):
+    )
+    stiffness_step = None
+    if needs_further_effects and modal_fit is not None and measurement.is_single_sweep:
+        stiffness_step = _likely_stiffness_step(linear_candidates, modal_fit, small_linear_effect)
+        if stiffness_step is not None:
+            small_linear_effect, modal_fit_with_effect = None, modal_fit
+            small_effect_suffices = is_linear_and_constant
+            needs_further_effects = not is_linear_and_constant
+    if needs_further_effects:
         candidate_set, nonlinear_forces, temporal_changes = _fit_further_effects(
             linear_candidates, test_amplitude_effects=stiffness_step is None
         )
