@@ -61,7 +61,7 @@ def uniformity_figure(uniformity_test: UniformBeamTest) -> Figure:
     )
     figure = style.new_figure(9.0, 4.0)
     grid = figure.add_gridspec(
-        2, len(MODE_CONSTANT_NAMES), left=0.075, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
+        2, len(MODE_CONSTANT_NAMES), left=0.1, right=0.985, top=0.87, bottom=0.115, hspace=0.28,
         wspace=0.34,
     )  # fmt: skip
     for panel_number, constant_name in enumerate(MODE_CONSTANT_NAMES):
