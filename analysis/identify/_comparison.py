@@ -25,7 +25,7 @@ from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -444,7 +444,9 @@ class Comparison:
             with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),
         )
 
-    def remove_drag_torque(self, plant: Plant, law: DragLaw) -> Comparison:
+    def remove_drag_torque(
+        self, plant: Plant, law: DragLaw, poles_rad_s: Mapping[int, complex] | None = None
+    ) -> Comparison:
         """Return the comparison without the torque by air drag, with that torque's derivatives.
 
         Parameters
@@ -453,6 +455,8 @@ class Comparison:
             Beam on which the drag acts.
         law : DragLaw
             Drag coefficient as a function of the speed.
+        poles_rad_s : mapping of int to complex, optional
+            Measured upper poles of modes, as for `DragResponse`.
 
         Raises
         ------
@@ -461,7 +465,7 @@ class Comparison:
         """
         # Drag acts on the whole motion, whether or not it followed a reference.
         whole_angle_rad = self.angle_rad + self.incoherent_rad
-        drag_response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant)
+        drag_response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant, poles_rad_s)
         drag_torque = drag_response.torque(law, range(1, self.visible_modes + 1))
 
         def band(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:

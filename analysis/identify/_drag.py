@@ -35,6 +35,8 @@ from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
+    from collections.abc import Mapping
+
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
@@ -235,10 +237,15 @@ def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
     return False
 
 
-def small_drag_spectrum(comparison: Comparison, plant: Plant) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a small air drag per metre of C_D d, in N·m/m, shape (1, K)."""
+def small_drag_spectrum(
+    comparison: Comparison, plant: Plant, poles_rad_s: Mapping[int, complex] | None = None
+) -> NDArray[np.complex128]:
+    """Return the torque spectrum of a small air drag per metre of C_D d, in N·m/m, shape (1, K).
+
+    `poles_rad_s` are measured upper poles by mode number, which replace those of the plant.
+    """
     whole_angle_rad = comparison.angle_rad + comparison.incoherent_rad
-    drag_response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant)
+    drag_response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant, poles_rad_s)
     return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
 
 

@@ -22,9 +22,14 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._modal_model import BACKGROUND_COEFFICIENTS, ModalEstimate, ModalModel
+from analysis.identify._modal_model import (
+    BACKGROUND_COEFFICIENTS,
+    MODE_CONSTANT_NAMES,
+    ModalEstimate,
+    ModalModel,
+)
 from analysis.identify._result import Ringing
-from analysis.identify.free_decay import Pole, mode_poles
+from analysis.identify.free_decay import Pole
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
 from analysis.optimizer import Box, NormalEquations, RecentValues, descend
@@ -106,6 +111,11 @@ class ModalFit(ModalEstimate):
     span : ndarray, shape (r, 2 K)
         Orthonormal rows that span all derivatives of the whitened residual, with real and imaginary
         parts interleaved.
+    ln_damping_by_torque : ndarray, shape (n, 2 K)
+        Derivative of the logarithm of each estimated damping ratio by the whitened torque.
+    effect_sizes, effect_stds : tuple of float
+        Amplitude of each torque spectrum that was fitted with the modes, and its standard
+        deviation.
     """
 
     evidence: tuple[float, ...]
@@ -115,6 +125,9 @@ class ModalFit(ModalEstimate):
     input_relation: InputRelation
     ringing: Ringing
     span: NDArray[np.float64]
+    ln_damping_by_torque: NDArray[np.float64]
+    effect_sizes: tuple[float, ...]
+    effect_stds: tuple[float, ...]
 
     def cost_reduction_by_spectrum(
         self, torque_spectra: NDArray[np.complex128]
@@ -129,12 +142,51 @@ class ModalFit(ModalEstimate):
         torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra in N·m, not whitened.
         """
-        whitened = np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
+        whitened = self._whiten(torque_spectra)
         whitened -= (whitened @ self.span.T) @ self.span
         projections = whitened @ self.residual.view(np.float64)
         squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
         cost_reductions: NDArray[np.float64] = projections**2 / squares
         return cost_reductions
+
+    def _whiten(self, torque_spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
+        """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
+        return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
+
+    def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
+        """Return the standard deviation that the size of an additional effect would have.
+
+        Parameters
+        ----------
+        torque_spectrum : ndarray of complex, shape (K,)
+            Torque spectrum of the effect in N·m per unit of its size, not whitened.
+        """
+        whitened = self._whiten(torque_spectrum)
+        remainder = whitened - (whitened @ self.span.T) @ self.span
+        return 1 / math.sqrt(max(float(remainder @ remainder), np.finfo(float).tiny))
+
+    def damping_std_ratios(
+        self, torque_spectrum: NDArray[np.complex128], prior_std: float
+    ) -> NDArray[np.float64]:
+        """Return how much less certain damping ratios are with an additional effect, shape (n,).
+
+        Each is the standard deviation with a free size of the effect, over that without it.
+
+        Parameters
+        ----------
+        torque_spectrum : ndarray of complex, shape (K,)
+            Torque spectrum of the effect in N·m per unit of its size, not whitened.
+        prior_std : float
+            Standard deviation of the size before the record.
+        """
+        whitened = self._whiten(torque_spectrum)
+        size_variance = 1 / (self.effect_std(torque_spectrum) ** -2 + prior_std**-2)
+        damping_variance = np.diag(self.covariance)[
+            MODE_CONSTANT_NAMES.index("ln_damping_ratio") :: len(MODE_CONSTANT_NAMES)
+        ]
+        added_variance = (self.ln_damping_by_torque @ whitened) ** 2 * size_variance
+        std_ratios: NDArray[np.float64] = np.sqrt(1 + added_variance / damping_variance)
+        return std_ratios
 
     @property
     def explained(self) -> bool:
@@ -172,9 +224,8 @@ class ModalFit(ModalEstimate):
             or len(visible_modes) != visible_modes[-1]
         ):
             return plant
-        poles_by_mode = dict(zip(self.numbers, self.model.poles_rad_s, strict=True))
         frequency_hz = [
-            poles_by_mode[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
+            self.poles_rad_s[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
         ]
         try:
             loaded_beam = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
@@ -408,6 +459,8 @@ class _ModalSearch:
         constants, covariance = problem.constants(solution, x, joint_covariance)
         residual_spectrum = solution.residual.view(np.complex128)
         used_bins = search.noise.counts
+        effect_count = len(search.effect_spectra)
+        effect_variances = np.diag(joint_covariance)[joint_covariance.shape[0] - effect_count :]
         return ModalFit(
             model=problem.model(x),
             numbers=numbers,
@@ -422,6 +475,13 @@ class _ModalSearch:
             input_relation=search.residual_dependence_on_angle(solution),
             ringing=problem.ringing(solution, joint_covariance),
             span=np.concatenate([solution.span, _orthonormal_rows(solution.jacobian)[0]]),
+            ln_damping_by_torque=problem.ln_damping_by_torque(solution, x),
+            effect_sizes=tuple(
+                solution.linear_parameters[
+                    solution.linear_parameters.size - effect_count :
+                ].tolist()
+            ),
+            effect_stds=tuple(np.sqrt(effect_variances).tolist()),
         )
 
 
@@ -547,19 +607,23 @@ class _ModalProblem:
         drag_expansion = self._comparison.drag
         if drag_expansion is None:
             return change_and_derivatives
-        reference_poles = {
-            pole.mode: pole.at_rad_s
-            for pole in mode_poles(drag_expansion.plant, len(drag_expansion.by_pole), ())
-        }
         for pole in poles:
-            if pole.mode in drag_expansion.by_pole and pole.mode in reference_poles:
+            if pole.mode in drag_expansion.by_pole:
+                own_pole = complex(drag_expansion.response.poles[pole.mode - 1])
+                pole_difference = pole.at_rad_s - own_pole
+                remainder, remainder_slopes = drag_expansion.torque_beyond_first_order(
+                    pole.mode, own_pole, pole.at_rad_s
+                )
+                change_and_derivatives[0] -= remainder
                 by_real, by_imaginary = drag_expansion.by_pole[pole.mode]
-                pole_difference = pole.at_rad_s - reference_poles[pole.mode]
                 change_and_derivatives[0] += (
                     pole_difference.real * by_real + pole_difference.imag * by_imaginary
                 )
-                change_and_derivatives[1:] += np.outer(pole.derivative.real, by_real)
-                change_and_derivatives[1:] += np.outer(pole.derivative.imag, by_imaginary)
+                by_real_at_pole, by_imaginary_at_pole = (
+                    drag_expansion.by_pole[pole.mode] - remainder_slopes
+                )
+                change_and_derivatives[1:] += np.outer(pole.derivative.real, by_real_at_pole)
+                change_and_derivatives[1:] += np.outer(pole.derivative.imag, by_imaginary_at_pole)
         return change_and_derivatives
 
     def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
@@ -654,6 +718,16 @@ class _ModalProblem:
         )
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
         return covariance
+
+    def ln_damping_by_torque(
+        self, solution: _LinearSolution, x: NDArray[np.float64]
+    ) -> NDArray[np.float64]:
+        """Return the derivative of each ln(eta) at the minimum by the whitened torque, (n, 2 K)."""
+        unit_rows, gram, row_lengths = _scaled_gram(solution.jacobian, 1e-14)
+        # The residual is predicted minus measured: the torque enters it with the opposite sign.
+        x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
+        derivatives: NDArray[np.float64] = x_by_torque[1::2] / x[1::2, None]
+        return derivatives
 
     def ringing(self, solution: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
         """Return amplitudes and chi-square of the free decay at the beginning of the record.

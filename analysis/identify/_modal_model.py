@@ -174,6 +174,15 @@ class ModalEstimate:
         """Return the numbers of the beam modes that are visible in the data, in ascending order."""
         return tuple(sorted(number for number in self.numbers if number))
 
+    @property
+    def poles_rad_s(self) -> dict[int, complex]:
+        """Return the upper pole of each mode of the beam in rad/s, by mode number."""
+        return {
+            number: pole
+            for number, pole in zip(self.numbers, self.model.poles_rad_s, strict=True)
+            if number
+        }
+
     def rows(self, mode_numbers: Sequence[int]) -> NDArray[np.intp]:
         """Return the indices of the constants of some modes in `constants`, shape (4 m,).
 

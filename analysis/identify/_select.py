@@ -18,6 +18,7 @@ from analysis.identify._diagnostics import findings, setting_findings, unexplain
 from analysis.identify._drag import (
     damping_with_amplitude,
     refit_with_air_drag,
+    small_drag_spectrum,
 )
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
@@ -29,6 +30,7 @@ from analysis.identify._modal_headline import (
     order_verdict_with_geometry_tolerance,
     replace_by_modal_model,
 )
+from analysis.identify._modes_with_drag import fit_modes_with_drag
 from analysis.identify._nonlinear import add_nonlinear_forces
 from analysis.identify._result import RecordAnalysis
 from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
@@ -95,6 +97,10 @@ _MODES_WITHOUT_REDUNDANCY: Final = 2
 _ROUGH_DAMPING_RATIO: Final = 0.01
 """Damping ratio from which the search for a mode begins if no beam provides one."""
 
+
+_ONLINE_DRAG_COMPUTATIONS: Final = 3
+"""Number of computations of the drag torque in a fit of the freest structure alone, which a running
+session repeats."""
 
 _TILTED_AXIS_REASON: Final = (
     "the axis is tilted, and fits to the whole record are of one that is plumb"
@@ -281,16 +287,34 @@ def _select_with_known_impacts(
     is_linear_and_constant = modal_fit is not None and _is_linear_and_constant(
         linear_candidates, modal_fit, band_hz
     )
+    modes_with_drag = None
     if modal_fit is not None:
-        small_linear_effect = small_effect(
-            linear_candidates.comparison,
-            modal_fit,
-            modal_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant),
+        plant = modal_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant)
+        [drag_spectrum] = small_drag_spectrum(
+            linear_candidates.comparison, plant, modal_fit.poles_rad_s
         )
+        small_linear_effect = small_effect(
+            linear_candidates.comparison, modal_fit, plant, drag_spectrum
+        )
+        # What changes a single sweep much is searched for by models of its own.
+        if not (measurement.is_single_sweep and small_linear_effect and small_linear_effect.large):
+            modes_with_drag = fit_modes_with_drag(linear_candidates, modal_fit, drag_spectrum)
     modal_fit_with_effect, small_effect_suffices = modal_fit, is_linear_and_constant
+    if modes_with_drag is not None and _is_linear_and_constant(
+        linear_candidates, modes_with_drag.modal_fit, band_hz
+    ):
+        is_linear_and_constant, modal_fit_with_effect = True, modes_with_drag.modal_fit
+        if small_linear_effect is not None and not small_linear_effect.significant_beside(
+            modes_with_drag.modal_fit
+        ):
+            small_linear_effect = None
+    else:
+        modes_with_drag = None
     if small_linear_effect is not None:
-        modal_fit_with_effect = _fit_modal_model(
-            linear_candidates, small_linear_effect.column[None]
+        modal_fit_with_effect = (
+            _fit_modal_model(linear_candidates, small_linear_effect.column[None])
+            if modes_with_drag is None
+            else modes_with_drag.fit_with_effect(linear_candidates, small_linear_effect.column)
         )
         small_effect_suffices = modal_fit_with_effect is not None and _is_linear_and_constant(
             linear_candidates, modal_fit_with_effect, band_hz
@@ -328,6 +352,11 @@ def _select_with_known_impacts(
             )
         else:
             small_linear_effect = None
+    elif modes_with_drag is not None:
+        modal_fit = modal_fit_with_effect
+        candidate_set = replace(
+            linear_candidates, comparison=modes_with_drag.comparison
+        ).refit_with_additional_effect(modes_with_drag.drag_spectra)
     elif small_linear_effect is not None and small_linear_effect.saved > LARGE_DEVIANCE_REDUCTION:
         candidate_set = linear_candidates.refit_with_additional_effect(
             small_linear_effect.column[None]
@@ -403,6 +432,7 @@ def _select_with_known_impacts(
         )
         all_findings += _setting_findings(leading_candidates, reported_headline, finding_kinds)
         all_findings += () if small_linear_effect is None else (small_linear_effect.finding(),)
+        all_findings += () if modes_with_drag is None else (modes_with_drag.finding(),)
         if (
             modal_fit is not None
             and beam_test is not None
@@ -721,6 +751,19 @@ def _fit_freest_with_known_impacts(
     if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()
     modal_fit = _fit_modal_model(candidate_set)
+    modes_with_drag = None
+    if modal_fit is not None and not measurement.is_single_sweep:
+        plant = modal_fit.plant_with_modal_frequencies(candidate_set.likeliest.plant)
+        [drag_spectrum] = small_drag_spectrum(
+            candidate_set.comparison, plant, modal_fit.poles_rad_s
+        )
+        modes_with_drag = fit_modes_with_drag(
+            candidate_set, modal_fit, drag_spectrum, max_computations=_ONLINE_DRAG_COMPUTATIONS
+        )
+    if modes_with_drag is not None and modes_with_drag.modal_fit.explained:
+        modal_fit = modes_with_drag.modal_fit
+    else:
+        modes_with_drag = None
     visible_numbers = _visible_mode_numbers(candidate_set, modal_fit)
     whiteness_test, input_test, harmonic_tests = _test_residual(candidate_set, modal_fit, band_hz)
     all_findings = findings(candidate_set, (), harmonic_tests)
@@ -746,6 +789,7 @@ def _fit_freest_with_known_impacts(
         )
     else:
         all_findings += _setting_findings(candidate_set, reported_headline, finding_kinds)
+        all_findings += () if modes_with_drag is None else (modes_with_drag.finding(),)
         all_findings = _mark_doubtful_findings(
             all_findings,
             (),

@@ -14,7 +14,6 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._drag import small_drag_spectrum
 from analysis.identify._finding import Finding
 from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
 from analysis.identify._time_varying import UNIT_PLAY_RAD, play_spectrum
@@ -43,6 +42,9 @@ _EXACT_KINDS: Final[frozenset[Kind]] = frozenset({"nonlinear gain", "friction"})
 _FRICTION_SPEED_RAD_S: Final = 0.01
 """Motor speed at which 70 % of the dry friction is reached. Its value matters at the turning points
 only."""
+
+_OVERSAMPLING: Final = 4
+"""Samples of the friction per sample of the angle, since friction has harmonics of the motion."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,6 +78,11 @@ class SmallEffect:
         """Return whether the nonlinear effect is so large that it needs a model of its own."""
         return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
 
+    def significant_beside(self, modal_fit: ModalFit) -> bool:
+        """Return whether the effect would improve a modal model that contains other effects."""
+        [cost_reduction] = modal_fit.cost_reduction_by_spectrum(self.column[None])
+        return bool(cost_reduction >= MIN_DEVIANCE_REDUCTION)
+
     def finding(self) -> Finding:
         """Return the finding that this effect is possible, but not established."""
         return Finding(
@@ -89,12 +96,21 @@ class SmallEffect:
         )
 
 
-def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> SmallEffect | None:
+def small_effect(
+    comparison: Comparison,
+    modal: ModalFit,
+    plant: Plant,
+    drag_spectrum: NDArray[np.complex128],
+) -> SmallEffect | None:
     """Return the small effect that improves the modal model most, or None if none is significant.
 
     The effects are computed for the motion of `plant`, a beam close to the modal model.
+    `drag_spectrum`, shape (K,), is that of a small air drag per metre of C_D d.
     """
-    possible_effects = list(_possible_effects(comparison, modal, plant))
+    possible_effects: list[tuple[Kind, str, NDArray[np.complex128]]] = [
+        *_possible_effects(comparison, modal, plant),
+        ("air drag", "Air drag", drag_spectrum),
+    ]
     cost_reductions = modal.cost_reduction_by_spectrum(
         np.array([torque_spectrum for _, _, torque_spectrum in possible_effects])
     )
@@ -110,7 +126,7 @@ def small_effect(comparison: Comparison, modal: ModalFit, plant: Plant) -> Small
 def _possible_effects(
     comparison: Comparison, modal: ModalFit, plant: Plant
 ) -> Iterator[tuple[Kind, str, NDArray[np.complex128]]]:
-    """Yield kind, description and torque spectrum, shape (K,), of each possible small effect."""
+    """Yield kind, description and torque spectrum, (K,), of small effects other than air drag."""
     force_spectra = NonlinearForceSpectra(comparison, plant)
     for mode_number in modal.visible:
         yield (
@@ -123,8 +139,6 @@ def _possible_effects(
             f"A stiffness of mode {mode_number} that differs from side to side",
             force_spectra.column(NonlinearTerm("quadratic stiffness", mode_number)),
         )
-    (drag_spectrum,) = small_drag_spectrum(comparison, plant)
-    yield "air drag", "Air drag", drag_spectrum
     yield (
         "play",
         "Backlash between encoder and beam",
@@ -143,11 +157,21 @@ def _possible_effects(
 
 
 def _friction_spectrum(comparison: Comparison) -> NDArray[np.complex128]:
-    """Return the torque spectrum of a dry friction of 1 N·m against the motion, (K,)."""
-    measurement = comparison.measurement
-    angle_rad = measurement.angle_from_rest(float(comparison.frequency_hz[-1]))
-    speed_rad_s = np.gradient(angle_rad) * measurement.rate_hz
-    friction_torque = comparison.decimation.apply(
-        speed_rad_s / np.hypot(speed_rad_s, _FRICTION_SPEED_RAD_S)
+    """Return the torque spectrum of a dry friction of 1 N·m against the motion, (K,).
+
+    The motion is that part of the angle that follows the reference: the sensor's noise moves the
+    motor as well, and friction against that motion would be correlated with the noise.
+    """
+    angle_rad = comparison.angle_rad
+    # The mirrored angle continues without a step at its end.
+    mirrored_spectrum = np.fft.rfft(np.concatenate([angle_rad, angle_rad[::-1]]))
+    fine_angle_rad = _OVERSAMPLING * np.fft.irfft(
+        mirrored_spectrum, 2 * _OVERSAMPLING * angle_rad.size
     )
-    return comparison.spectrum(friction_torque[comparison.retained])
+    speed_rad_s = np.gradient(fine_angle_rad) * (_OVERSAMPLING * comparison.decimation.rate_hz)
+    retained = slice(
+        _OVERSAMPLING * comparison.retained.start, _OVERSAMPLING * comparison.retained.stop
+    )
+    friction_torque = (speed_rad_s / np.hypot(speed_rad_s, _FRICTION_SPEED_RAD_S))[retained]
+    friction_spectrum: NDArray[np.complex128] = comparison.spectrum(friction_torque) / _OVERSAMPLING
+    return friction_spectrum

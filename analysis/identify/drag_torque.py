@@ -51,11 +51,10 @@ import numpy as np
 from analysis.identify._data import fast_length
 from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify._predictor import eigenvalues, torque_channel_response
-from analysis.identify.free_decay import mode_poles
 from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
@@ -190,6 +189,9 @@ class DragResponse:
         Sampling rate of the angle.
     plant : Plant
         Rig with the linear beam.
+    poles_rad_s : mapping of int to complex, optional
+        Upper poles of modes of the beam, by mode number. They replace those of the plant, so that
+        the speeds are right on a beam that is not uniform.
 
     Attributes
     ----------
@@ -197,7 +199,13 @@ class DragResponse:
         Points of the transforms, on a line parallel to the imaginary axis, in rad/s.
     """
 
-    def __init__(self, angle_rad: Real, rate_hz: float, plant: Plant) -> None:
+    def __init__(
+        self,
+        angle_rad: Real,
+        rate_hz: float,
+        plant: Plant,
+        poles_rad_s: Mapping[int, complex] | None = None,
+    ) -> None:
         n = angle_rad.size
         self.plant, self._samples, self._rate_hz = plant, n, rate_hz
         self._length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
@@ -212,6 +220,15 @@ class DragResponse:
         log_s = np.log(s)
         p = beam.density_over_stiffness * s * s + damping.gamma * np.exp(damping.lambda_ * log_s)
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
+        self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
+        self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
+        for mode_number, pole in (poles_rad_s or {}).items():
+            pole_pair = np.array([pole, pole.conjugate()])
+            z[mode_number - 1] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
+            self._pole_pairs[mode_number - 1] = pole_pair
+            self._impedance_slopes[mode_number - 1] = beam.density_over_stiffness * (
+                pole_pair - pole_pair.conjugate()
+            )
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
@@ -221,7 +238,6 @@ class DragResponse:
             self._inertial_response * s * angle_transform
         )
         self._speed_transform = s * angle_transform
-        self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
 
     def first_order(self) -> Real:
         """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
@@ -447,9 +463,8 @@ class DragResponse:
         state_count = 2 * n + _PAST_FORCES * n
         by_state, by_force = np.zeros((state_count, state_count)), np.zeros((state_count, n))
         speed_output = np.zeros((n, state_count))
-        impedance_slopes = self._impedance_slopes()
         for i, (pole_pair, impedance_slope_pair) in enumerate(
-            zip(self._pole_pairs, impedance_slopes, strict=True)
+            zip(self._pole_pairs, self._impedance_slopes, strict=True)
         ):
             state_rows = slice(2 * i, 2 * i + 2)
             step_decay = np.exp(pole_pair * step_s)
@@ -479,22 +494,6 @@ class DragResponse:
             force_columns = slice((2 + steps_back) * n, (3 + steps_back) * n)
             extrapolating_matrix[:, force_columns] += extrapolation_factor * by_force[: 2 * n]
         return speed_output[:, : 2 * n] @ extrapolating_matrix, by_state, by_force
-
-    def _impedance_slopes(self) -> Complex:
-        """Return the derivative of the modal impedance Z_i by s at both poles, shape (modes, 2)."""
-        s, damping = self._pole_pairs, self.plant.damping
-        density_over_stiffness = self.plant.beam.density_over_stiffness
-        log_s = np.log(s)
-        external_damping = damping.gamma * np.exp(damping.lambda_ * log_s)
-        internal_damping = damping.zeta * np.exp(damping.alpha * log_s)
-        k = -(density_over_stiffness * s * s + external_damping) / (
-            1 + internal_damping
-        )  # since Z = 0 at the poles
-        impedance_slopes: Complex = (
-            2 * density_over_stiffness * s
-            + (damping.lambda_ * external_damping + damping.alpha * k * internal_damping) / s
-        )
-        return impedance_slopes
 
     @property
     def _point_to_modal_forces(self) -> Real:
@@ -590,6 +589,23 @@ def _pole_pairs(k_of_length: Real, plant: Plant) -> Complex:
     """Return both poles of each mode in rad/s, shape (modes, 2), from its ``(k L)^4``."""
     pole_pairs = poles_for_eigenvalues(k_of_length**0.25, plant.beam, plant.damping)
     return pole_pairs.astype(np.complex128)
+
+
+def _impedance_slopes(pole_pairs: Complex, plant: Plant) -> Complex:
+    """Return the derivative of the modal impedance Z_i by s at both poles, shape (modes, 2)."""
+    s, damping = pole_pairs, plant.damping
+    density_over_stiffness = plant.beam.density_over_stiffness
+    log_s = np.log(s)
+    external_damping = damping.gamma * np.exp(damping.lambda_ * log_s)
+    internal_damping = damping.zeta * np.exp(damping.alpha * log_s)
+    k = -(density_over_stiffness * s * s + external_damping) / (
+        1 + internal_damping
+    )  # since Z = 0 at the poles
+    impedance_slopes: Complex = (
+        2 * density_over_stiffness * s
+        + (damping.lambda_ * external_damping + damping.alpha * k * internal_damping) / s
+    )
+    return impedance_slopes
 
 
 def _force_weights_of_step(poles_per_s: Complex, step_s: float) -> Complex:
@@ -697,14 +713,12 @@ class DragExpansion:
             Derivatives of the change by the unknowns.
         """
         derivative_spectra, parameter_steps, step_slopes = [], [], []
-        own_poles = {
-            pole.mode: pole.at_rad_s for pole in mode_poles(self.plant, len(self.by_pole), ())
-        }
         for pole in poles:
-            if pole.mode in self.by_pole and pole.oscillates and pole.mode in own_poles:
-                pole_step = pole.at_rad_s - own_poles[pole.mode]
-                higher_order_torque, remainder_slopes = self._torque_beyond_first_order(
-                    pole.mode, own_poles[pole.mode], pole.at_rad_s
+            if pole.mode in self.by_pole and pole.oscillates:
+                own_pole = complex(self.response.poles[pole.mode - 1])
+                pole_step = pole.at_rad_s - own_pole
+                higher_order_torque, remainder_slopes = self.torque_beyond_first_order(
+                    pole.mode, own_pole, pole.at_rad_s
                 )
                 by_pole = self.by_pole[pole.mode]
                 # Derivatives at the pole of the other beam; the remainder itself is a separate row.
@@ -773,13 +787,20 @@ class DragExpansion:
             )
         return linear_terms
 
-    def _torque_beyond_first_order(
+    def torque_beyond_first_order(
         self, mode_number: int, own_pole: complex, other_pole: complex
     ) -> tuple[Complex, Complex]:
         """Return the change of one mode's torque with its pole, without the first-order part.
 
         The spectrum has the shape (K,). It is returned with its derivatives by the real and
         the imaginary part of the pole, shape (2, K).
+
+        Parameters
+        ----------
+        mode_number : int
+            Number of the mode.
+        own_pole, other_pole : complex
+            Upper pole of the mode on this beam, and that on the other beam, in rad/s.
         """
         s, torque_spectrum = self.response.s, self.response.modal_torque(mode_number)
         pole_step = other_pole - own_pole

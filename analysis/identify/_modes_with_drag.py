@@ -1,0 +1,212 @@
+"""Modal model of a beam in air, together with air drag of unknown size.
+
+Drag damps a mode in proportion to its amplitude. A record in which each mode vibrates with one
+amplitude hardly distinguishes drag from the damping of the beam itself: the residual is white
+without drag, and the damping ratios are those in air at that amplitude. Drag of unknown size is
+therefore fitted with the modes unless the record excludes that of a thin wire. The damping ratios
+then are those without air, and as uncertain as the drag makes them.
+
+The drag torque depends on the poles of the modes, and these depend on the drag that is fitted with
+them. The torque is computed for the last poles and the last drag, until the drag does not change.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.identify._finding import Finding
+from analysis.identify._modal_fit import fit_modes
+from analysis.identify.drag_torque import DragError, DragLaw
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.identify._candidates import CandidateSet
+    from analysis.identify._comparison import Comparison
+    from analysis.identify._modal_fit import ModalFit
+
+_SMALLEST_DRAG_M: Final = 3e-4
+"""Smallest C_D d of a beam in air: that of a wire of about 0.2 mm."""
+
+_LARGEST_DRAG_M: Final = 1e-2
+"""C_D d that a thick beam may have: the standard deviation of C_D d before the record."""
+
+_MIN_DRAG_STDS: Final = 5.0
+"""Smallest drag over its standard deviation, above which a record without drag excludes any drag.
+"""
+
+_MIN_STD_RATIO: Final = 1.1
+"""Ratio of the standard deviation of a damping ratio with drag of unknown size to that without
+drag, above which the drag matters."""
+
+_LIKELY_DRAG_DEVIANCE: Final = 6.6
+"""Reduction of the deviance from which drag is fitted although the record could exclude it. It
+happens by chance in one record of a hundred."""
+
+MAX_DRAG_COMPUTATIONS: Final = 8
+"""Maximum number of computations of the drag torque for one record."""
+
+_SMALL_CHANGE: Final = 0.1
+"""Relative change of the damping ratios by insignificant drag up to which the first order
+suffices."""
+
+_INSIGNIFICANT_STDS: Final = 1.5
+"""Drag in standard deviations up to which it is insignificant."""
+
+_TOLERANCE_STDS: Final = 0.1
+"""Change of the drag, in standard deviations, below which its computation has converged."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModesWithDrag:
+    """Modal model of a record together with air drag of unknown size.
+
+    Attributes
+    ----------
+    modal_fit : ModalFit
+        Modes without air.
+    law : DragLaw
+        Drag coefficient times width, C_D d.
+    std_m : float
+        Standard deviation of the part of C_D d that does not depend on the speed, in m.
+    comparison : Comparison
+        Record without the torque of this drag, which the expansion of the torque corrects.
+    drag_spectra : ndarray of complex, shape (1, K)
+        Derivative of the torque by the first number of the law.
+    """
+
+    modal_fit: ModalFit
+    law: DragLaw
+    std_m: float
+    comparison: Comparison
+    drag_spectra: NDArray[np.complex128]
+
+    def fit_with_effect(
+        self, candidate_set: CandidateSet, effect_spectrum: NDArray[np.complex128]
+    ) -> ModalFit | None:
+        """Return the modes fitted with this drag and another effect, or None if none is visible.
+
+        Parameters
+        ----------
+        candidate_set : CandidateSet
+            Candidates without drag.
+        effect_spectrum : ndarray of complex, shape (K,)
+            Torque spectrum of the other effect in N·m per unit of its size.
+        """
+        return fit_modes(
+            self.comparison,
+            candidate_set.noise,
+            _mode_starts(self.modal_fit),
+            np.concatenate([self.drag_spectra, effect_spectrum[None]]),
+        )
+
+    def finding(self) -> Finding:
+        """Return the finding that the damping ratios are those without air, and less certain."""
+        drag_mm, std_mm = 1e3 * self.law.constant_m, 1e3 * self.std_m
+        return Finding(
+            kind="air drag",
+            sentence=(
+                "The modes were fitted together with air drag, since this record hardly "
+                f"distinguishes drag from other damping: C_D d = {drag_mm:.2g} ± {std_mm:.2g} mm "
+                "(standard deviation). Damping ratios are those without air."
+            ),
+            remedy="Repeat the session at twice and at half the amplitude.",
+        )
+
+
+def fit_modes_with_drag(
+    candidate_set: CandidateSet,
+    modal_fit: ModalFit,
+    drag_spectrum: NDArray[np.complex128],
+    *,
+    max_computations: int = MAX_DRAG_COMPUTATIONS,
+) -> ModesWithDrag | None:
+    """Return the modes fitted together with air drag, or None if drag does not matter.
+
+    Drag does not matter if the record excludes that of a thin wire, or if it hardly makes a damping
+    ratio less certain.
+
+    Parameters
+    ----------
+    candidate_set : CandidateSet
+        Candidates without drag; the plant of the likeliest one provides what the modes do not.
+    modal_fit : ModalFit
+        Modes fitted without drag.
+    drag_spectrum : ndarray of complex, shape (K,)
+        Torque spectrum of a small drag on a beam with these modes, in N·m per metre of C_D d.
+    max_computations : int
+        Maximum number of computations of the drag torque.
+    """
+    if not _drag_matters(modal_fit, drag_spectrum):
+        return None
+    current = ModesWithDrag(
+        modal_fit, DragLaw(0.0), 0.0, candidate_set.comparison, drag_spectrum[None]
+    )
+    for remaining in reversed(range(max_computations)):
+        fit_with_drag = fit_modes(
+            current.comparison,
+            candidate_set.noise,
+            _mode_starts(current.modal_fit),
+            current.drag_spectra,
+        )
+        if fit_with_drag is None:
+            return None
+        [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
+        law = DragLaw(current.law.constant_m + change_m)
+        current = replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m)
+        is_first_order = current.comparison is candidate_set.comparison
+        suffices = is_first_order and (
+            law.constant_m < _INSIGNIFICANT_STDS * std_m
+            and _largest_change(modal_fit, fit_with_drag) < _SMALL_CHANGE
+        )
+        # Negative drag is an error of the estimate. No torque is computed for it.
+        is_negative = law.constant_m <= 0
+        is_converged = abs(change_m) < _TOLERANCE_STDS * std_m
+        if suffices or is_negative or is_converged or not remaining:
+            break
+        try:
+            comparison = candidate_set.comparison.recompute_incoherent_torque(
+                fit_with_drag.model
+            ).remove_drag_torque(candidate_set.likeliest.plant, law, fit_with_drag.poles_rad_s)
+        except DragError:
+            return None
+        assert comparison.drag is not None
+        spectra = comparison.drag.by_law[:1]
+        current = replace(current, comparison=comparison, drag_spectra=spectra)
+    return current
+
+
+def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
+    """Return number, frequency in hertz and damping ratio at which the search for modes starts."""
+    return [
+        (mode_number, pole.imag / (2 * math.pi), -pole.real / abs(pole))
+        for mode_number, pole in modal_fit.poles_rad_s.items()
+    ]
+
+
+def _largest_change(without_drag: ModalFit, with_drag: ModalFit) -> float:
+    """Return the largest change of the logarithm of a damping ratio by the drag."""
+    changes = [
+        math.log(
+            with_drag.mode(mode_number).damping_ratio / without_drag.mode(mode_number).damping_ratio
+        )
+        for mode_number in set(with_drag.visible) & set(without_drag.visible)
+    ]
+    return max(map(abs, changes), default=0.0)
+
+
+def _drag_matters(modal_fit: ModalFit, drag_spectrum: NDArray[np.complex128]) -> bool:
+    """Return whether drag may bias a damping ratio by more than a fraction of its uncertainty.
+
+    `drag_spectrum`, shape (K,), is that of a small drag.
+    """
+    std_ratios = modal_fit.damping_std_ratios(drag_spectrum, _LARGEST_DRAG_M)
+    if std_ratios.max() < _MIN_STD_RATIO:
+        return False
+    is_excludable = modal_fit.effect_std(drag_spectrum) < _SMALLEST_DRAG_M / _MIN_DRAG_STDS
+    [cost_reduction] = modal_fit.cost_reduction_by_spectrum(drag_spectrum[None])
+    return not is_excludable or bool(cost_reduction > _LIKELY_DRAG_DEVIANCE)
