@@ -146,6 +146,12 @@ def sessions():
 
 
 @pytest.fixture(scope="session")
+def responding():
+    """Make the session of a plant whose motor follows a reference: see `response`."""
+    return lambda reference, damping, beam: response(reference, damping, beam, 0.0, 0.0, ())
+
+
+@pytest.fixture(scope="session")
 def moved_unseen():
     """Make a session in which the motor also makes a bump of a size in each of some gaps."""
 
