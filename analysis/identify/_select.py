@@ -296,8 +296,12 @@ def _select_with_known_impacts(
         small_linear_effect = small_effect(
             linear_candidates.comparison, modal_fit, plant, drag_spectrum
         )
-        # What changes a single sweep much is searched for by models of its own.
-        if not (measurement.is_single_sweep and small_linear_effect and small_linear_effect.large):
+        # In a single sweep another effect, or large drag, has a model of its own.
+        if (
+            small_linear_effect is None
+            or not measurement.is_single_sweep
+            or (small_linear_effect.kind == "air drag" and not small_linear_effect.large)
+        ):
             modes_with_drag = fit_modes_with_drag(linear_candidates, modal_fit, drag_spectrum)
     modal_fit_with_effect, small_effect_suffices = modal_fit, is_linear_and_constant
     if modes_with_drag is not None and _is_linear_and_constant(
