@@ -45,6 +45,7 @@ from rigd.engine.realtime import REFUSED, apply_realtime, collect_no_garbage
 from rigd.engine.reference import ReferenceReader, map_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
 from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
+from rigd.errors import RigdError
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.runtime.processes import name_this_process
@@ -77,7 +78,7 @@ def main() -> None:
         )
     try:
         devices = open_devices(job.profile.rig, job.moving)
-    except DeviceError as error:
+    except RigdError as error:  # of a device, or of a beam that cannot be simulated
         parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
