@@ -451,6 +451,16 @@ def test_a_file_s_name_that_is_no_text_is_written_as_well_as_it_can_be(rigd, tmp
     assert read_session(path).metadata["file"] == r"f\udcff.csv"
 
 
+def test_a_beam_that_cannot_be_simulated_is_refused_in_one_sentence(rigd, write_profile, tmp_path):
+    values = {"simulation.density_ratio": "1000.0", "simulation.stiffness_ratio": "1e-3"}
+    profile = write_profile("sim", values)
+    done = rigd("run", "hold", "--profile", str(profile), "--fast", "--output", str(tmp_path))
+    assert done.returncode == 1
+    error = done.stderr.splitlines()[-1]
+    assert error.startswith("Error: ") and "modes below" in error
+    assert "Traceback" not in done.stderr
+
+
 def test_closed_descriptors_are_no_obstacle(tmp_path):
     done = subprocess.run(
         ["sh", "-c", f"exec {RIGD} run hold --duration 1 --fast --output out <&- >&- 2>&-"],
