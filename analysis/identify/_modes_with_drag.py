@@ -57,7 +57,7 @@ suffices."""
 _INSIGNIFICANT_STDS: Final = 1.5
 """Drag in standard deviations up to which it is insignificant."""
 
-_TOLERANCE_STDS: Final = 0.1
+_TOLERANCE_STDS: Final = 0.2
 """Change of the drag, in standard deviations, below which its computation has converged."""
 
 
