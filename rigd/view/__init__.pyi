@@ -3,12 +3,9 @@ from . import chart as chart
 from . import frequency_charts as frequency_charts
 from . import plots as plots
 from . import rrd_file as rrd_file
-from ._gauges import Gauge as Gauge
-from ._gauges import Gauges as Gauges
 from ._layout import chart_page as chart_page
 from ._layout import chart_view as chart_view
 from ._recorded import draw_session as draw_session
-from ._recorded import nominal_damping as nominal_damping
 from ._scene import Drawing as Drawing
 from ._scene import Scene as Scene
 from ._session_info import Health as Health
@@ -16,4 +13,3 @@ from ._session_info import Note as Note
 from ._session_info import Subject as Subject
 from ._session_info import linear_sweep_band_hz as linear_sweep_band_hz
 from ._session_info import outcome_note as outcome_note
-from ._session_info import sweep_ticks as sweep_ticks
