@@ -6,7 +6,6 @@ from . import rrd_file as rrd_file
 from ._layout import chart_page as chart_page
 from ._layout import chart_view as chart_view
 from ._recorded import draw_session as draw_session
-from ._scene import Drawing as Drawing
 from ._scene import Scene as Scene
 from ._session_info import Health as Health
 from ._session_info import Note as Note

@@ -30,19 +30,15 @@ from rigd.view.frequency_charts import (
     ResponseCharts,
     SpectrogramChart,
 )
-from rigd.view.plots import HEALTH, READINGS, SIGNALS, Source, send_columns
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, Drawing, Source, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
-    from rerun import RecordingStream
 
     from rigd.view._session_info import Health, Note, Subject
 
 Records = npt.NDArray[Any]
 """Structured array of samples, timings or other records of a session, shape (n,)."""
-
-Drawing = Callable[["RecordingStream"], None]
-"""Function that sends one item to a Rerun recording."""
 
 _LEAST_BLOCK_S: Final = 0.1
 """Least duration of a block of records that is drawn at once.
