@@ -75,6 +75,5 @@ def offences(root: Path) -> Iterator[str]:
 
 if __name__ == "__main__":
     root = Path(sys.argv[1]) if len(sys.argv) > 1 else Path(__file__).parents[1]
-    lines = list(offences(root))
-    sys.stdout.writelines(f"{line}\n" for line in lines)
+    sys.stdout.writelines(lines := [f"{line}\n" for line in offences(root)])
     sys.exit(f"{len(lines)} offences; move a definition to a module below both" if lines else 0)

@@ -12,3 +12,4 @@ from ._session_info import Note as Note
 from ._session_info import Subject as Subject
 from ._session_info import linear_sweep_band_hz as linear_sweep_band_hz
 from ._session_info import outcome_note as outcome_note
+from .plots import Drawing as Drawing
