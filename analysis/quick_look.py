@@ -219,7 +219,7 @@ def _model_document(
 
     from analysis.report import ShownModel
     from analysis.report.bands import dense_grid
-    from rigd.view.frequency_charts import response_decimation
+    from rigd.sweep_response import response_decimation
 
     if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
@@ -248,7 +248,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     from analysis.models import LARGEST_FRACTION_OF_RATE
     from analysis.suited import welch_exclusion_reason
     from rigd.spectral import SpectralError, segmentation_of
-    from rigd.view.frequency_charts import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
+    from rigd.sweep_response import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
 
     last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
@@ -460,7 +460,7 @@ def _compare_modes(
 
 def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     """Yield the lines of text that show a quick look in a terminal."""
-    from rigd.view.frequency_charts import LOW_COHERENCE
+    from rigd.sweep_response import LOW_COHERENCE
 
     specimen_text = f" ({document['specimen']})" if document["specimen"] else ""
     # The intervals do not include scale of the torque, length and density of the beam.

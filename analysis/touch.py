@@ -29,6 +29,7 @@ from analysis.validity import record_validity
 from rigd.beam import Damping
 from rigd.session import Session, SessionError, Validity, read_session, readable_texts
 from rigd.session.layout import Status
+from rigd.sweep_response import nominal_damping
 from rigd.touch import (
     ChannelNoise,
     DetectorSettings,
@@ -48,7 +49,6 @@ from rigd.touch.samples import (
     base_shear_n,
     touch_record,
 )
-from rigd.view import nominal_damping
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -26,7 +26,7 @@ import numpy as np
 
 from rigd.devices.ati import AtiCanSensor, AtiSerialSensor
 from rigd.devices.canbus import CanExchange
-from rigd.devices.canbus.port import SocketPort
+from rigd.devices.canbus.adapters import SocketPort
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import Wrench, WrenchSensor
 from rigd.devices.running_simulator import SimulatorAddress, find_simulator

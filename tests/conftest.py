@@ -17,11 +17,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
 import pytest
 from hypothesis import settings
 
 from rigd import testing
 from rigd.runtime import use_one_thread
+from rigd.session.layout import SAMPLE_DTYPE
 
 pytest_plugins = [
     "browsers", "library_folders", "paper_sweeps", "patient_drives",
@@ -345,3 +347,18 @@ def analysed(tmp_path):
         return path
 
     return write
+
+
+@pytest.fixture
+def make_samples():
+    """Make samples (n,) at 1 kHz from a tick on, at rest but for the fields given."""
+
+    def make(n: int, first_tick: int = 0, **fields) -> np.ndarray:
+        samples = np.zeros(n, SAMPLE_DTYPE)
+        samples["tick"] = np.arange(first_tick, first_tick + n)
+        samples["t_ns"] = samples["tick"].astype(np.int64) * 1_000_000
+        for name, values in fields.items():
+            samples[name] = values
+        return samples
+
+    return make

@@ -6,6 +6,7 @@ from ._campaign import campaign as campaign
 from ._estimates import RecordEstimate as RecordEstimate
 from ._estimates import WelchFit as WelchFit
 from ._experiment import CampaignError as CampaignError
+from ._experiment import SessionFailure as SessionFailure
 from ._experiment import SingleSessionError as SingleSessionError
 from ._experiment import differing_fact_keys as differing_fact_keys
 from ._experiment import fact_text as fact_text
@@ -14,7 +15,6 @@ from ._headlines import headlines as headlines
 from ._homogeneity import Heterogeneity as Heterogeneity
 from ._homogeneity import Homogeneity as Homogeneity
 from ._session import SessionAnalysis as SessionAnalysis
-from ._session import SessionFailure as SessionFailure
 from ._session import SessionTask as SessionTask
 from ._session import analyse_session as analyse_session
 from ._statistics import NominalModel as NominalModel

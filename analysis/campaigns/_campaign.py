@@ -10,6 +10,7 @@ import numpy as np
 
 from analysis.campaigns._experiment import (
     CampaignError,
+    SessionFailure,
     complete_labels,
     distinct_names,
     most_common_index,
@@ -17,10 +18,8 @@ from analysis.campaigns._experiment import (
 )
 from analysis.campaigns._homogeneity import Homogeneity, homogeneity
 from analysis.campaigns._modal import PooledModal, pooled_modal
-from analysis.campaigns._orders import freest_estimate
 from analysis.campaigns._session import (
     SessionAnalysis,
-    SessionFailure,
     SessionTask,
     analyse_session,
 )
@@ -35,7 +34,7 @@ from analysis.campaigns._statistics import (
 from analysis.campaigns._validation import FEWEST_SESSIONS, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
-from analysis.campaigns.pooling import PooledEstimate, PooledMode, pooled_estimates
+from analysis.campaigns.pooling import PooledEstimate, PooledMode, freest_estimate, pooled_estimates
 from analysis.campaigns.workers import LostTask, available_cores, dask_cluster, process_pool
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.validity import combined_validity

@@ -15,7 +15,6 @@ from rigd.units import unit_of
 if TYPE_CHECKING:
     from collections.abc import Iterable, Mapping, Sequence
 
-    from analysis.campaigns._session import SessionFailure
     from analysis.record import Record
 
 
@@ -200,6 +199,23 @@ class Experiment:
             and not _equal_values(other_experiment.facts.get(key, self.facts[key]), self.facts[key])
             for key in _SPECIMEN_KEYS
         )
+
+
+@dataclass(frozen=True, slots=True)
+class SessionFailure:
+    """A session that a campaign does not use, and the reason."""
+
+    path: Path
+    """Path of the session file."""
+    message: str
+    """Sentence that states for the operator why the session is not used."""
+    experiment: Experiment | None = None
+    """Specimen and excitation stated in the file; None if the file could not be read."""
+    name: str = ""
+    """Name in tables (see `distinct_names`); the name of the file by default."""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "name", self.name or self.path.name)
 
 
 def distinct_names(paths: Sequence[Path]) -> list[str]:

@@ -17,8 +17,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.campaigns._orders import common_structure, freest_estimate
-from analysis.campaigns.pooling import random_effects
+from analysis.campaigns.pooling import common_structure, freest_estimate, random_effects
 from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.statistics import chi_square_p_value
 

@@ -1,11 +1,4 @@
-"""Freest common structure of all sessions, and their joint result on the orders of the damping.
-
-All sessions are compared and pooled by the freest structure that they support. The structure that a
-session selects by itself depends on its noise. If each session were compared by the structure that
-it selects, the sessions would differ by the difference between structures, and forty sessions of
-one beam would seem to be of two beams. The intervals of the freest structure are valid for any
-simpler structure, too.
-"""
+"""Joint result of all sessions on the orders of the damping."""
 
 from __future__ import annotations
 
@@ -13,7 +6,7 @@ from collections import Counter
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
-from analysis.campaigns.pooling import estimates_by_structure
+from analysis.campaigns.pooling import freest_estimate
 from analysis.identify import effective_reason, order_status_with_geometry_tolerance
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
@@ -23,75 +16,12 @@ from analysis.statistics import student_t_quantile
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._homogeneity import Homogeneity
-    from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
     from analysis.identify.profile_likelihood import Order
     from analysis.identify.uniform_beam import TolerantEstimate
     from analysis.identify.verdict import Verdict
 
-
-# Common structure
-
-_DETERMINING_FRACTION: Final = 0.9
-"""Fraction of the sessions determining the structure of the lowest BIC that must determine a freer
-structure for it to be reported."""
-
-
-def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimate | None:
-    """Return the estimate of the freest damping structure that at least 90 % of sessions determine.
-
-    The freest structure has the largest number of free parameters. The 90 %
-    (`_DETERMINING_FRACTION`) are of the sessions that determine the structure of the lowest BIC.
-
-    Parameters
-    ----------
-    pooled_estimates : sequence of PooledEstimate
-        Pooled estimates, the lowest BIC first; None is returned if there are none.
-    """
-    if not pooled_estimates:
-        return None
-    lowest_bic_estimate = pooled_estimates[0]
-    return max(
-        (
-            estimate
-            for estimate in pooled_estimates
-            if estimate.sessions >= _DETERMINING_FRACTION * lowest_bic_estimate.sessions
-        ),
-        key=lambda estimate: len(STRUCTURES[estimate.structure].free),
-    )
-
-
-def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
-    """Return the name of the damping structure by which all sessions are compared.
-
-    Parameters
-    ----------
-    sessions : sequence of SessionAnalysis
-        Sessions of the campaign.
-
-    Returns
-    -------
-    str or None
-        The freest structure that was fitted to every session. None without whole-record fits.
-    """
-    estimates_by_name = estimates_by_structure(sessions)
-    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
-    structure_estimates = [
-        estimates[0]
-        for estimates in estimates_by_name.values()
-        if len(estimates) == fitted_sessions
-    ]
-    return max(structure_estimates, key=_free_parameter_count).name if structure_estimates else None
-
-
-def _free_parameter_count(estimate: RecordEstimate) -> int:
-    """Return the number of free parameters of an estimate's damping structure."""
-    return len(STRUCTURES[estimate.structure].free)
-
-
-# Orders
 
 PooledStatus = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 """Result of the test whether an order is 1 (see `PooledOrder`)."""

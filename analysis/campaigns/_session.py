@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
-from analysis.campaigns._experiment import Experiment, session_error_types
+from analysis.campaigns._experiment import Experiment, SessionFailure, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
 from analysis.paper import Indices, fit_indices
 from analysis.results import RecordResult, whole_record, with_uniformity
@@ -40,23 +40,6 @@ _PAPER_SETTINGS: Final = WelchSettings()
 """Welch settings of the paper."""
 _NO_INDICES: Final = Indices(math.nan, math.nan, math.nan)
 """Fit indices of a model without a measured response."""
-
-
-@dataclass(frozen=True, slots=True)
-class SessionFailure:
-    """A session that a campaign does not use, and the reason."""
-
-    path: Path
-    """Path of the session file."""
-    message: str
-    """Sentence that states for the operator why the session is not used."""
-    experiment: Experiment | None = None
-    """Specimen and excitation stated in the file; None if the file could not be read."""
-    name: str = ""
-    """Name in tables (see `distinct_names`); the name of the file by default."""
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "name", self.name or self.path.name)
 
 
 @dataclass(frozen=True, slots=True)

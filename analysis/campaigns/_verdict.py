@@ -14,11 +14,11 @@ from analysis.campaigns import sentences as specimen_sentences
 from analysis.campaigns._modal import OppositeSweeps, opposite_sweeps
 from analysis.campaigns._orders import (
     PooledOrder,
-    freest_estimate,
     pooled_order,
     rival_estimates,
     tolerant_pooled_order,
 )
+from analysis.campaigns.pooling import freest_estimate
 from analysis.identify import loss_factors_with_geometry_tolerance, uniform_beam_refusal_reason
 from analysis.identify.sentences import uniformity
 from analysis.identify.verdict import BIC_DECISIVE, BIC_TIE

@@ -507,3 +507,67 @@ def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) 
         delay_s=parameter_values["delay_s"],
         tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
     )
+
+
+# Freest structure that all sessions support
+#
+# All sessions are compared and pooled by it. The structure that a session selects by itself depends
+# on its noise. If each session were compared by that one, the sessions would differ by the
+# difference between structures, and forty sessions of one beam would seem to be of two beams. The
+# intervals of the freest structure are valid for any simpler structure, too.
+
+_DETERMINING_FRACTION: Final = 0.9
+"""Fraction of the sessions determining the structure of the lowest BIC that must determine a freer
+structure for it to be reported."""
+
+
+def freest_estimate(pooled_estimates: Sequence[PooledEstimate]) -> PooledEstimate | None:
+    """Return the estimate of the freest damping structure that at least 90 % of sessions determine.
+
+    The freest structure has the largest number of free parameters. The 90 %
+    (`_DETERMINING_FRACTION`) are of the sessions that determine the structure of the lowest BIC.
+
+    Parameters
+    ----------
+    pooled_estimates : sequence of PooledEstimate
+        Pooled estimates, the lowest BIC first; None is returned if there are none.
+    """
+    if not pooled_estimates:
+        return None
+    lowest_bic_estimate = pooled_estimates[0]
+    return max(
+        (
+            estimate
+            for estimate in pooled_estimates
+            if estimate.sessions >= _DETERMINING_FRACTION * lowest_bic_estimate.sessions
+        ),
+        key=lambda estimate: len(STRUCTURES[estimate.structure].free),
+    )
+
+
+def common_structure(sessions: Sequence[SessionAnalysis]) -> str | None:
+    """Return the name of the damping structure by which all sessions are compared.
+
+    Parameters
+    ----------
+    sessions : sequence of SessionAnalysis
+        Sessions of the campaign.
+
+    Returns
+    -------
+    str or None
+        The freest structure that was fitted to every session. None without whole-record fits.
+    """
+    estimates_by_name = estimates_by_structure(sessions)
+    fitted_sessions = max(map(len, estimates_by_name.values()), default=0)
+    structure_estimates = [
+        estimates[0]
+        for estimates in estimates_by_name.values()
+        if len(estimates) == fitted_sessions
+    ]
+    return max(structure_estimates, key=_free_parameter_count).name if structure_estimates else None
+
+
+def _free_parameter_count(estimate: RecordEstimate) -> int:
+    """Return the number of free parameters of an estimate's damping structure."""
+    return len(STRUCTURES[estimate.structure].free)

@@ -4,7 +4,7 @@ from ._channels import parse_choice as parse_choice
 from ._export import export_frf as export_frf
 from ._export import export_model as export_model
 from ._export import export_record as export_record
-from ._import_record import ImportPlan as ImportPlan
+from ._import_plan import ImportPlan as ImportPlan
 from ._import_record import import_record as import_record
 from ._import_record import write_session as write_session
 from ._source import ExchangeError as ExchangeError

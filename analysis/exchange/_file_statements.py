@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.exchange._channels import Timebase
-    from analysis.exchange._import_record import ImportPlan
+    from analysis.exchange._import_plan import ImportPlan
     from analysis.exchange._source import FileTimes, SourceChannel
 
 IGNORE_OPTION: Final = "--ignore-file-metadata"

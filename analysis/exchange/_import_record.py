@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import hashlib
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 import rigd
 from analysis.exchange._file_statements import FileStatements, plan_timebase
+from analysis.exchange._import_plan import REQUIRED_FIELDS, ImportPlan
 from analysis.exchange._source import ExchangeError, read_source
 from analysis.record_checks import first_mode_hz, unknown_fraction_message
 from rigd.beam import Damping, transfer, undamped_frequencies_rad_s
@@ -29,69 +30,9 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.exchange._channels import ChannelChoice, Timebase
+    from analysis.exchange._channels import Timebase
     from analysis.exchange._source import SourceChannel
     from analysis.exchange._specimen import SpecimenFile
-
-
-# Import
-
-REQUIRED_FIELDS: Final = ("angle_rad", "coupling_torque_nm")
-"""Fields of a sample that every analysis needs."""
-
-
-@dataclass(frozen=True, slots=True)
-class ImportPlan:
-    """User's statements on channels, units and circumstances of a record to be imported.
-
-    Attributes
-    ----------
-    channels : mapping of str to ChannelChoice
-        Channel and unit by the field of a sample (`analysis.exchange.QUANTITIES`). The fields in
-        `REQUIRED_FIELDS` must be present.
-    specimen : SpecimenFile
-        Beam and clamp.
-    time : ChannelChoice, optional
-        Channel with the time of each sample.
-    rate_hz : float, optional
-        Sampling rate of a record without gaps; required if `time` is not given.
-    segments_s : mapping of str to (float, float)
-        Begin and end, in seconds after the first sample, by the segment's name: rest, sweep or
-        ring_down.
-    angle_delay_s, torque_delay_s : float
-        Age of the angle and of the torque at their time stamps.
-    reverse_torque : bool
-        Whether the sign of the coupling torque is reversed, because the sensor measures the
-        reaction.
-    note, label, operator : str
-        Note, label of the specimen, and name of the operator.
-    ignore_file_metadata : bool
-        Whether the plan overrides the file's rate, times, start, units and scale.
-    """
-
-    channels: Mapping[str, ChannelChoice]
-    specimen: SpecimenFile
-    time: ChannelChoice | None = None
-    rate_hz: float | None = None
-    segments_s: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    angle_delay_s: float = 0.0
-    torque_delay_s: float = 0.0
-    reverse_torque: bool = False
-    note: str = ""
-    label: str = ""
-    operator: str = ""
-    ignore_file_metadata: bool = False
-
-    def __post_init__(self) -> None:
-        if any(name not in self.channels for name in REQUIRED_FIELDS):
-            raise ValueError(f"a plan needs channels for {' and '.join(REQUIRED_FIELDS)}")
-        if (self.time is None) == (self.rate_hz is None):
-            raise ValueError("a plan needs either a channel of times or a rate")
-
-    @property
-    def choices(self) -> tuple[ChannelChoice, ...]:
-        """Choices of all channels that are to be read."""
-        return (*self.channels.values(), *(() if self.time is None else (self.time,)))
 
 
 @dataclass(frozen=True, slots=True)

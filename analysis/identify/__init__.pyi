@@ -14,6 +14,8 @@ from ._comparison import Comparison as Comparison
 from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError
 from ._data import fast_length as fast_length
+from ._estimates import DampingSize as DampingSize
+from ._estimates import ModeEstimate as ModeEstimate
 from ._finding import Finding as Finding
 from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record
@@ -39,8 +41,6 @@ from ._plant import Setting as Setting
 from ._predictor import ResponseGrid as ResponseGrid
 from ._predictor import TorquePredictor as TorquePredictor
 from ._problem import Objective as Objective
-from ._result import DampingSize as DampingSize
-from ._result import ModeEstimate as ModeEstimate
 from ._result import RecordAnalysis as RecordAnalysis
 from ._result import RecordFit as RecordFit
 from ._select import ORDER_ONE_STRUCTURE as ORDER_ONE_STRUCTURE

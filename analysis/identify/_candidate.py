@@ -1,4 +1,4 @@
-"""Candidate: one structure fitted to one record, with its information criteria."""
+"""Candidate: one structure fitted to one record, with its information criteria; air drag."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 if TYPE_CHECKING:
     from analysis.identify._result import RecordFit
+    from analysis.identify.drag_torque import DragLaw
     from analysis.models import Structure
 
 
@@ -81,3 +82,33 @@ class Candidate:
     def name(self) -> str:
         """Return the name of the damping structure, as tables show it: "III", for example."""
         return self.structure.name
+
+
+@dataclass(frozen=True, slots=True)
+class DragEstimate:
+    """Estimate of the air drag on the beam: the drag coefficient C_D times the width d, in metres.
+
+    Attributes
+    ----------
+    value_m : float
+        Drag coefficient times diameter, C_D d, at `speed_m_s`, for an assumed density of the air of
+        1.2 kg/m³.
+    std_m : float
+        Standard deviation of `value_m`.
+    interval_95_m : tuple of float
+        95 % interval of `value_m`, not below 0.
+    speed_m_s : float
+        Speed at which C_D d has the smallest uncertainty; if only a mean is determined, the speed
+        with the largest weight in it.
+    law : DragLaw
+        C_D d at all speeds.
+    covariance : tuple of tuple of float
+        Covariance of the estimated numbers of the law: of the first, or of both.
+    """
+
+    value_m: float
+    std_m: float
+    interval_95_m: tuple[float, float]
+    speed_m_s: float
+    law: DragLaw
+    covariance: tuple[tuple[float, ...], ...]

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE, Candidate
+from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE, Candidate, DragEstimate
 from analysis.identify._channel_checks import sign_and_unit_findings
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
@@ -31,7 +31,6 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._drag import DragEstimate
     from analysis.identify._finding import Finding
     from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit

@@ -1,4 +1,4 @@
-"""Checks of the recorded channels: clipping, stopped motor, wrong sign or unit, sensor drift.
+"""Checks of the recorded channels: clipping, stopped motor, wrong sign or unit.
 
 Sign and unit are checked by the ratio of torque and angle to the response of the beam that the file
 states, as a median over the band. The median depends neither on the exact mode frequencies nor on
@@ -19,7 +19,6 @@ from rigd.beam import Damping, transfer
 if TYPE_CHECKING:
     from collections.abc import Iterator
 
-    from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
     from analysis.identify._data import Measurement
 
@@ -188,40 +187,4 @@ def sign_and_unit_findings(comparison: Comparison) -> Iterator[Finding]:
         ),
         value=median_magnitude,
         remedy="Check the units of angle and torque, and import the record again.",
-    )
-
-
-# Drift of the zero
-
-_DRIFT_SEGMENTS: Final = 16
-"""Number of segments of a record whose mean residual torques are compared."""
-
-_MIN_SCATTER_RATIO: Final = 10.0
-"""Minimum scatter of the mean residual torques that is reported as drift, relative to the scatter
-due to noise."""
-
-
-def torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
-    """Return how far the torque sensor's zero point drifts, in N·m; 0 if noise explains it.
-
-    It is the range of the mean residuals of segments of the record.
-    """
-    comparison = candidate_set.comparison
-    predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
-    residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
-    segment_length = residual_nm.size // _DRIFT_SEGMENTS
-    segment_means_nm = (
-        residual_nm[: _DRIFT_SEGMENTS * segment_length]
-        .reshape(_DRIFT_SEGMENTS, segment_length)
-        .mean(axis=1)
-    )
-    # Expected scatter for white noise with the power of the band's upper half.
-    upper_half_power = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
-    noise_std_nm = math.sqrt(
-        float(np.median(upper_half_power)) / comparison.samples / segment_length
-    )
-    return (
-        float(np.ptp(segment_means_nm))
-        if float(segment_means_nm.std()) > _MIN_SCATTER_RATIO * noise_std_nm
-        else 0.0
     )

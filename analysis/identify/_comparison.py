@@ -30,12 +30,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._hum import Hum
     from analysis.identify._modal_model import ModalModel
     from analysis.identify._plant import Plant
     from analysis.identify.drag_torque import DragLaw
     from analysis.identify.free_decay import Pole
-    from analysis.identify.noise import NoiseSpectrum
+    from analysis.identify.noise import Hum, NoiseSpectrum
 
 _MIN_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""

@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 from typing import TYPE_CHECKING, Final
 
-from analysis.identify._channel_checks import (
-    clipping_findings,
-    standstill_findings,
-    torque_zero_drift_nm,
-)
+import numpy as np
+
+from analysis.identify._channel_checks import clipping_findings, standstill_findings
 from analysis.identify._finding import Finding
 from analysis.identify._leakage import repetition_period_s
 from analysis.identify.residual_tests import SIGNIFICANT_STD
@@ -24,9 +22,9 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._estimates import ModeEstimate
     from analysis.identify._nonlinear import NonlinearForce
     from analysis.identify._plant import Setting
-    from analysis.identify._result import ModeEstimate
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.headline import Headline
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
@@ -388,11 +386,45 @@ def unexplained(
     )
 
 
+_DRIFT_SEGMENTS: Final = 16
+"""Number of segments of a record whose mean residual torques are compared."""
+
+_MIN_SCATTER_RATIO: Final = 10.0
+"""Minimum scatter of the mean residual torques that is reported as drift, relative to the scatter
+due to noise."""
+
+
+def _torque_zero_drift_nm(candidate_set: CandidateSet) -> float:
+    """Return how far the torque sensor's zero point drifts, in N·m; 0 if noise explains it.
+
+    It is the range of the mean residuals of segments of the record.
+    """
+    comparison = candidate_set.comparison
+    predicted_nm, _ = comparison.prediction.torque(candidate_set.best.fit.plant)
+    residual_nm = comparison.torque_nm[comparison.retained] - predicted_nm
+    segment_length = residual_nm.size // _DRIFT_SEGMENTS
+    segment_means_nm = (
+        residual_nm[: _DRIFT_SEGMENTS * segment_length]
+        .reshape(_DRIFT_SEGMENTS, segment_length)
+        .mean(axis=1)
+    )
+    # Expected scatter for white noise with the power of the band's upper half.
+    upper_half_power = candidate_set.noise.power[candidate_set.noise.power.size // 2 :]
+    noise_std_nm = math.sqrt(
+        float(np.median(upper_half_power)) / comparison.samples / segment_length
+    )
+    return (
+        float(np.ptp(segment_means_nm))
+        if float(segment_means_nm.std()) > _MIN_SCATTER_RATIO * noise_std_nm
+        else 0.0
+    )
+
+
 def _hum_findings(candidate_set: CandidateSet) -> Iterator[Finding]:
     """Yield findings of torque-sensor drift and of narrow-band disturbances of the torque."""
     comparison = candidate_set.comparison
     duration_s = comparison.samples / comparison.decimation.rate_hz
-    drift_nm = torque_zero_drift_nm(candidate_set)
+    drift_nm = _torque_zero_drift_nm(candidate_set)
     if drift_nm > 0:
         yield _drift_finding(drift_nm)
     period_s = repetition_period_s(comparison)

@@ -23,6 +23,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._candidate import DragEstimate
 from analysis.identify._refit import MISSED_COST_FRACTION, Refit
 from analysis.identify.drag_torque import (
     HALF_AIR_DENSITY_KG_PER_M3,
@@ -109,36 +110,6 @@ would be too narrow otherwise."""
 _LOWEST_RELATIVE_SPEED: Final = 0.02
 """Lowest speed at which C_D d is reported, relative to the highest speed: below it the record
 contains no information."""
-
-
-@dataclass(frozen=True, slots=True)
-class DragEstimate:
-    """Estimate of the air drag on the beam: the drag coefficient C_D times the width d, in metres.
-
-    Attributes
-    ----------
-    value_m : float
-        Drag coefficient times diameter, C_D d, at `speed_m_s`, for an assumed density of the air of
-        1.2 kg/m³.
-    std_m : float
-        Standard deviation of `value_m`.
-    interval_95_m : tuple of float
-        95 % interval of `value_m`, not below 0.
-    speed_m_s : float
-        Speed at which C_D d has the smallest uncertainty; if only a mean is determined, the speed
-        with the largest weight in it.
-    law : DragLaw
-        C_D d at all speeds.
-    covariance : tuple of tuple of float
-        Covariance of the estimated numbers of the law: of the first, or of both.
-    """
-
-    value_m: float
-    std_m: float
-    interval_95_m: tuple[float, float]
-    speed_m_s: float
-    law: DragLaw
-    covariance: tuple[tuple[float, ...], ...]
 
 
 def refit_with_air_drag(candidate_set: CandidateSet) -> CandidateSet:

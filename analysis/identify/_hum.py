@@ -10,12 +10,11 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.noise import NoiseLine
+from analysis.identify.noise import Hum
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -68,34 +67,6 @@ _FREQUENCY_OVERSAMPLING: Final = 4
 
 _FREQUENCY_STEPS: Final = 4
 """Number of Gauss-Newton steps for the frequency of a hum."""
-
-
-@dataclass(frozen=True, slots=True)
-class Hum:
-    """Narrow-band disturbance: a sinusoid in the torque.
-
-    Attributes
-    ----------
-    frequency_hz : float
-        Frequency of the sinusoid.
-    phasor_nm : complex
-        The torque is the real part of ``phasor_nm exp(2j pi frequency_hz t)``, with the time t
-        since the first compared sample.
-    """
-
-    frequency_hz: float
-    phasor_nm: complex
-
-    @property
-    def line(self) -> NoiseLine:
-        """Return frequency in Hz and amplitude in N·m of the hum, as a line of the noise."""
-        return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
-
-    def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the torque of the hum in N·m at times since the first compared sample."""
-        phase_rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
-        torque_nm: NDArray[np.float64] = (self.phasor_nm * phase_rotation).real
-        return torque_nm
 
 
 def resonance_half_width_hz(pole: Pole, spacing_hz: float) -> float:

@@ -22,13 +22,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._estimates import Ringing
 from analysis.identify._modal_model import (
     BACKGROUND_COEFFICIENTS,
     MODE_CONSTANT_NAMES,
     ModalEstimate,
     ModalModel,
 )
-from analysis.identify._result import Ringing
 from analysis.identify.free_decay import Pole
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness

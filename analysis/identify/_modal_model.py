@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._result import ModeEstimate
+from analysis.identify._estimates import ModeEstimate
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -27,12 +27,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
-from analysis.identify._data import fast_length
 from analysis.identify._predictor import torque_channel_response
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
-from rigd.beam import clamped_free_eigenvalues, participation
+from rigd.beam import CausalTransform, clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -59,12 +58,11 @@ _OVERSAMPLING: Final = 3
 """Factor by which the sampling rate is raised to compute a nonlinear force. The band ends at 0.4 of
 the rate, so harmonics up to three times its end do not alias into the band."""
 
-_PADDED_LENGTH_RATIO: Final = 1.5
-"""Length of the padded Fourier transforms relative to the record."""
+_PADDING_RATIO: Final = 1.5
+"""Length of the transforms over that of the record."""
 
-_WRAPPED_DECAY_EXPONENT: Final = 9.0
-"""Product of the damping rate sigma and the padded duration: the response that wraps around is
-attenuated by its exponential."""
+_DECAY_EXPONENT: Final = 9.0
+"""Exponent of the transforms' damping: substitution repeats what wraps round."""
 
 _MAX_SUBSTITUTIONS: Final = 12
 """Maximum number of substitutions that compute the motion of a mode with its nonlinear force."""
@@ -100,26 +98,15 @@ class NonlinearForceSpectra:
         Linear plant.
     """
 
-    __slots__ = (
-        "_comparison",
-        "_growth",
-        "_inertia_and_external",
-        "_length",
-        "_plant",
-        "_s",
-        "_samples",
-    )
+    __slots__ = ("_comparison", "_inertia_and_external", "_plant", "_s", "_samples", "_transform")
 
     def __init__(self, comparison: Comparison, plant: Plant) -> None:
-        n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-        self._comparison, self._plant, self._samples = comparison, plant, n
-        self._length = fast_length(int(np.ceil(_PADDED_LENGTH_RATIO * n)))
-        # On s = sigma + j omega the part that wraps around has decayed: see `TorquePredictor`.
-        decay_rate_per_s = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
-        bin_indices = np.arange(self._length // 2 + 1)
-        self._s = decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
-        oversampled_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
-        self._growth = np.exp(decay_rate_per_s * oversampled_time_s)
+        self._comparison, self._plant = comparison, plant
+        self._samples = comparison.angle_rad.size
+        self._transform = CausalTransform.for_record(
+            self._samples, comparison.decimation.rate_hz, _PADDING_RATIO, _DECAY_EXPONENT
+        )
+        self._s = self._transform.s
         damping, density_over_stiffness = plant.damping, plant.beam.density_over_stiffness
         self._inertia_and_external = (
             density_over_stiffness * self._s**2 + damping.gamma * self._s**damping.lambda_
@@ -140,12 +127,10 @@ class NonlinearForceSpectra:
         """
         k, damped_stiffness = self._modal_stiffness(term.mode)
         dynamic_stiffness = self._inertia_and_external + damped_stiffness
-        angle_rad = self._comparison.angle_rad
-        decaying_angle = angle_rad / self._growth[::_OVERSAMPLING]
         linear_motion = (
             -self._inertia_and_external
             / dynamic_stiffness
-            * np.fft.rfft(decaying_angle, self._length)
+            * self._transform.forward(self._comparison.angle_rad)
         )
         force_transform = self._force_transform(term.kind, linear_motion, linear_motion)
         if force_size:
@@ -176,10 +161,8 @@ class NonlinearForceSpectra:
             * force_transform
             * torque_channel_response(self._plant, self._s)
         )
-        torque_nm = np.fft.irfft(torque_transform, self._length)[: self._samples]
-        torque_nm *= self._growth[::_OVERSAMPLING]
         torque_spectrum: NDArray[np.complex128] = self._comparison.spectrum(
-            torque_nm[self._comparison.retained]
+            self._transform.inverse(torque_transform, self._comparison.retained)
         )
         return torque_spectrum
 
@@ -219,17 +202,13 @@ class NonlinearForceSpectra:
             largest_deflection = np.abs(self._oversampled_values(linear_motion_transform)).max()
             deflection_exponent = 3 if force_kind == "cubic stiffness" else 2
             n = deflection**deflection_exponent / largest_deflection ** (deflection_exponent - 1)
-        n /= self._growth
-        force_transform = np.fft.rfft(n, _OVERSAMPLING * self._length)[: self._s.size]
-        return force_transform / _OVERSAMPLING
+        return self._transform.forward(n, oversampling=_OVERSAMPLING)
 
     def _oversampled_values(self, motion_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return the oversampled time series, over the record, of a mode's Laplace transform."""
-        decayed_values = np.fft.irfft(
-            _OVERSAMPLING * motion_transform, _OVERSAMPLING * self._length
+        return self._transform.inverse(
+            motion_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
         )
-        oversampled_values: NDArray[np.float64] = decayed_values[: self._growth.size] * self._growth
-        return oversampled_values
 
 
 # Search

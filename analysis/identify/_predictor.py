@@ -10,8 +10,7 @@ compliance, between tool and beam. Q is the response of the low-pass filters of 
 ``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the
 delay of the torque channel relative to the angle channel.
 
-The angle is convolved with H causally, over the whole record, on ``s = sigma + j omega``: see
-`TorquePredictor`.
+The angle is convolved with H causally, over the whole record (`CausalTransform`).
 """
 
 from __future__ import annotations
@@ -22,10 +21,15 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._data import fast_length
 from analysis.identify._modal_model import ModalModel
 from analysis.identify._plant import Plant
-from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, differentiated_response
+from rigd.beam import (
+    PARAMETERS,
+    CausalTransform,
+    TransferGrid,
+    clamped_free_eigenvalues,
+    differentiated_response,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -188,25 +192,9 @@ class ResponseGrid:
 
 # Prediction
 
-_PADDED_LENGTH_RATIO: Final = 1.1
-"""Length of the padded Fourier transforms relative to the record."""
-
-_WRAPPED_DECAY_EXPONENT: Final = 6.6
-"""Product of the damping rate sigma and the padded duration.
-
-The part that wraps around shrinks by exp(-6.6), to 1e-3 of the response of a beam after a whole
-record. It has the form of a free decay, which no fit mistakes for the response. Rounding errors and
-what the decimation left beyond the band grow by exp(6.6 / 1.1) = 400."""
-
 
 class TorquePredictor:
     """Prediction of the torque from one motor angle, with derivatives by the plant's parameters.
-
-    A finite convolution by discrete transforms wraps around, and a lightly damped beam rings longer
-    than any padding. So the angle is multiplied with exp(-sigma t) before the transform, which
-    gives its Laplace transform on s = sigma + j omega. There it is multiplied with the response,
-    and after the inverse transform the exponential is removed: the part that wrapped around has
-    decayed.
 
     Parameters
     ----------
@@ -218,35 +206,19 @@ class TorquePredictor:
         Samples at which the torque is returned.
     """
 
-    __slots__ = (
-        "_decay",
-        "_growth",
-        "_length",
-        "_response",
-        "_retained",
-        "_sigma",
-        "_spectrum",
-        "rate_hz",
-    )
+    __slots__ = ("_response", "_retained", "_spectrum", "_transform", "rate_hz")
 
     def __init__(self, angle_rad: NDArray[np.float64], rate_hz: float, retained: slice) -> None:
         self.rate_hz = rate_hz
         self._retained = retained
-        self._length = fast_length(int(np.ceil(_PADDED_LENGTH_RATIO * angle_rad.size)))
-        self._sigma = decay_rate_per_s = _WRAPPED_DECAY_EXPONENT * rate_hz / self._length
-        time_s = np.arange(angle_rad.size) / rate_hz
-        bin_indices = np.arange(self._length // 2 + 1)
-        self._response = ResponseGrid(
-            decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
-        )
-        self._decay = np.exp(-decay_rate_per_s * time_s)
-        self._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
-        self._growth = np.exp(decay_rate_per_s * time_s[retained])
+        self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
+        self._response = ResponseGrid(self._transform.s)
+        self._spectrum = self._transform.forward(angle_rad)
 
     def with_angle(self, angle_rad: NDArray[np.float64]) -> TorquePredictor:
         """Return the torque predictor for another motor angle of the same length, shape (n,)."""
         predictor = copy(self)
-        predictor._spectrum = np.fft.rfft(angle_rad * self._decay, self._length)
+        predictor._spectrum = self._transform.forward(angle_rad)
         return predictor
 
     @property
@@ -262,11 +234,7 @@ class TorquePredictor:
         responses : ndarray of complex, shape (..., n)
             Transfer functions on the grid `s`.
         """
-        torque_spectra = responses * self._spectrum
-        torque_nm: NDArray[np.float64] = np.fft.irfft(torque_spectra, self._length)[
-            ..., self._retained
-        ]
-        return torque_nm * self._growth
+        return self._transform.inverse(responses * self._spectrum, self._retained)
 
     def torque(
         self, plant: Plant | ModalModel, wrt: Sequence[str] = ()
@@ -286,9 +254,7 @@ class TorquePredictor:
         gradient : ndarray, shape (k, m)
         """
         torque_spectra = self._torque_spectra(plant, wrt)
-        torque_and_derivatives = (
-            np.fft.irfft(torque_spectra, self._length)[:, self._retained] * self._growth
-        )
+        torque_and_derivatives = self._transform.inverse(torque_spectra, self._retained)
         return torque_and_derivatives[0], torque_and_derivatives[1:]
 
     def _torque_spectra(
@@ -324,22 +290,8 @@ class TorquePredictor:
         torque : ndarray, shape (p,)
         gradient : ndarray, shape (k, p)
         """
-        sample_growth = np.exp(self._sigma * fine_indices / (rate_factor * self.rate_hz))
         torque_spectra = self._torque_spectra(plant, wrt)
-        # One short transform for each sample of the higher rate within a sample of the lower one:
-        # they fit into the cache, and take less than half the time of one long transform.
-        shift_factors = np.ones((rate_factor, torque_spectra.shape[1]), dtype=np.complex128)
-        shift_factors[1:] = np.exp(
-            2j * np.pi / (rate_factor * self._length) * np.arange(torque_spectra.shape[1])
+        torque_and_derivatives = self._transform.inverse_at(
+            torque_spectra, fine_indices, rate_factor
         )
-        np.cumprod(shift_factors, axis=0, out=shift_factors)
-        if self._length % 2 == 0:
-            # At the higher rate this bin and its mirror image are distinct.
-            shift_factors[:, -1] *= 2
-        torque_and_derivatives = np.empty((len(torque_spectra), fine_indices.size))
-        for row, torque_spectrum in zip(torque_and_derivatives, torque_spectra, strict=True):
-            row[:] = np.fft.irfft(shift_factors * torque_spectrum, self._length).T.ravel()[
-                fine_indices
-            ]
-        torque_and_derivatives *= sample_growth
         return torque_and_derivatives[0], torque_and_derivatives[1:]

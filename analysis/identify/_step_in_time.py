@@ -9,13 +9,12 @@ likely cause.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify._data import fast_length
+from rigd.beam import CausalTransform
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
@@ -32,13 +31,6 @@ _COARSE_INSTANTS: Final = 80
 
 _FINE_INSTANTS_PER_SIDE: Final = 3
 """Number of instants tried to either side of the best one."""
-
-_PADDING_RATIO: Final = 1.1
-"""Length of the transforms over that of the record."""
-
-_DECAY_EXPONENT: Final = 6.6
-"""Exponent by which the transforms decay over their length, as in `analysis.identify._predictor`:
-on s = sigma + j omega the part that wraps round has decayed."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,12 +117,10 @@ class _StiffnessStepTorque:
 
     def __init__(self, comparison: Comparison, fit: ModalFit) -> None:
         self._comparison = comparison
-        sample_count, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-        self._length = fast_length(math.ceil(_PADDING_RATIO * sample_count))
-        decay_rate = _DECAY_EXPONENT * rate_hz / self._length
-        s = decay_rate + 2j * np.pi * rate_hz / self._length * np.arange(self._length // 2 + 1)
-        self._decay = np.exp(-decay_rate * np.arange(sample_count) / rate_hz)
-        angle_transform = np.fft.rfft(comparison.angle_rad * self._decay, self._length)
+        sample_count = comparison.angle_rad.size
+        self._transform = CausalTransform.for_record(sample_count, comparison.decimation.rate_hz)
+        s = self._transform.s
+        angle_transform = self._transform.forward(comparison.angle_rad)
         mode_vibrations, torque_per_force = [], []
         for mode_index, pole, residue in zip(
             fit.numbers, fit.model.poles_rad_s, fit.model.residues, strict=True
@@ -140,7 +130,7 @@ class _StiffnessStepTorque:
                 omega_squared, modal_inertia = abs(pole) ** 2, 2 * abs(residue) / abs(pole) ** 3
                 mode_response = s * s / (s * s - 2 * pole.real * s + omega_squared)
                 mode_vibrations.append(
-                    np.fft.irfft(angle_transform * mode_response, self._length)[:sample_count]
+                    self._transform.inverse(angle_transform * mode_response, sample_count)
                 )
                 phase_factor = residue / (1j * abs(residue))
                 torque_per_force.append(
@@ -159,9 +149,8 @@ class _StiffnessStepTorque:
         retained_samples = self._comparison.retained
         later_vibrations = self._vibrations.copy()
         later_vibrations[:, : retained_samples.start + sample_index] = 0.0
-        force_transforms = np.fft.rfft(later_vibrations, self._length)
-        growing_torque = np.fft.irfft(
-            np.sum(force_transforms * self._torque_per_force, axis=0), self._length
+        force_transforms = self._transform.forward(later_vibrations)
+        torque_nm = self._transform.inverse(
+            np.sum(force_transforms * self._torque_per_force, axis=0), retained_samples
         )
-        growing_torque = growing_torque[: self._decay.size] / self._decay
-        return self._comparison.spectrum(growing_torque[retained_samples])
+        return self._comparison.spectrum(torque_nm)

@@ -28,7 +28,6 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
 from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel_response
 from analysis.identify._refit import DESCENT_EVALUATIONS, Refit
@@ -36,6 +35,7 @@ from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.beam import CausalTransform
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -354,8 +354,7 @@ _PADDING_RATIO: Final = 1.5
 """Length of the transforms over that of the record."""
 
 _DECAY_EXPONENT: Final = 9.0
-"""Exponent by which the transforms decay over their length, as in `analysis.identify._nonlinear`:
-on s = sigma + j omega the part that wraps round has decayed."""
+"""Exponent of the transforms' damping, as in `analysis.identify._nonlinear`."""
 
 _MAX_SIZE_ORDER: Final = 12
 """Highest order in the size of the change to which the torque is computed."""
@@ -378,11 +377,11 @@ def memory_torque(
     mass is constant.
     `change_size` is e.
     """
-    n, rate_hz = comparison.angle_rad.size, comparison.decimation.rate_hz
-    padded_length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
-    decay_rate = _DECAY_EXPONENT * rate_hz / padded_length
-    s = decay_rate + 2j * np.pi * rate_hz / padded_length * np.arange(padded_length // 2 + 1)
-    time_growth = np.exp(decay_rate * np.arange(n) / rate_hz)
+    n = comparison.angle_rad.size
+    transform = CausalTransform.for_record(
+        n, comparison.decimation.rate_hz, _PADDING_RATIO, _DECAY_EXPONENT
+    )
+    s = transform.s
     retained_samples = comparison.retained
     w = np.interp(
         np.arange(n), np.arange(retained_samples.start, retained_samples.stop), relative_change
@@ -392,24 +391,16 @@ def memory_torque(
     external_damping = damping.gamma * s**damping.lambda_
     inertial_term = beam.density_over_stiffness * s * s + external_damping
     changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
-    angle_transform = np.fft.rfft(
-        comparison.angle_rad / time_growth, padded_length
-    ) * torque_channel_response(plant, s)
+    angle_transform = transform.forward(comparison.angle_rad) * torque_channel_response(plant, s)
     total_torque = np.zeros(n)
 
     def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Convert a Laplace transform to values over time, shape (n,)."""
-        time_values: NDArray[np.float64] = (
-            np.fft.irfft(laplace_transform, padded_length)[:n] * time_growth
-        )
-        return time_values
+        return transform.inverse(laplace_transform, n)
 
     def weighted(laplace_transform: NDArray[np.complex128]) -> NDArray[np.complex128]:
         """Return the transform of w times a quantity, from the transform of the quantity."""
-        weighted_transform: NDArray[np.complex128] = np.fft.rfft(
-            w * in_time(laplace_transform) / time_growth, padded_length
-        )
-        return weighted_transform
+        return transform.forward(w * in_time(laplace_transform))
 
     k4_of_modes = (eigenvalues(comparison.visible_modes) / beam.length_m) ** 4
     modal_stiffnesses = 4 * beam.bending_stiffness_n_m2 / (beam.length_m * k4_of_modes)

@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
 from analysis.identify._plant import LOGARITHMIC_PARAMETERS
-from analysis.identify._result import DampingSize, ModeEstimate, Ringing
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.statistics import NORMAL_95
 

@@ -48,10 +48,9 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import fast_length
 from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify._predictor import eigenvalues, torque_channel_response
-from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
+from rigd.beam import AIR_DENSITY_KG_PER_M3, CausalTransform, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -75,12 +74,6 @@ DRAG_POINTS: Final = 16
 _OVERSAMPLING: Final = 3
 """Time steps per sample. The band ends at 0.4 of the rate, so up to three times its end nothing is
 aliased into it."""
-
-_PADDING_RATIO: Final = 1.1
-"""Length of the transforms over that of the record, as in `TorquePredictor`."""
-
-_DECAY_EXPONENT: Final = 6.6
-"""Exponent by which the transforms decay over their length, as in `TorquePredictor`."""
 
 _PAST_FORCES: Final = 3
 """Number of earlier forces, besides the present one, that the interpolation polynomial passes
@@ -206,14 +199,9 @@ class DragResponse:
         plant: Plant,
         poles_rad_s: Mapping[int, complex] | None = None,
     ) -> None:
-        n = angle_rad.size
-        self.plant, self._samples, self._rate_hz = plant, n, rate_hz
-        self._length = fast_length(int(np.ceil(_PADDING_RATIO * n)))
-        self._sigma = decay_rate_per_s = _DECAY_EXPONENT * rate_hz / self._length
-        bin_indices = np.arange(self._length // 2 + 1)
-        self.s = s = decay_rate_per_s + 2j * np.pi * rate_hz / self._length * bin_indices
-        fine_time_s = np.arange(_OVERSAMPLING * n) / (_OVERSAMPLING * rate_hz)
-        self._growth = np.exp(decay_rate_per_s * fine_time_s)
+        self.plant, self._samples, self._rate_hz = plant, angle_rad.size, rate_hz
+        self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
+        self.s = s = self._transform.s
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
@@ -233,7 +221,7 @@ class DragResponse:
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
         self._torque_channel = torque_channel_response(plant, s)
-        angle_transform = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
+        angle_transform = self._transform.forward(angle_rad)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
             self._inertial_response * s * angle_transform
         )
@@ -516,9 +504,7 @@ class DragResponse:
 
         Its shape is (modes + 1, bins).
         """
-        fine_transforms = np.fft.rfft(modal_forces / self._growth, _OVERSAMPLING * self._length)
-        force_spectra: Complex = fine_transforms[:, : self.s.size] / _OVERSAMPLING
-        return force_spectra
+        return self._transform.forward(modal_forces, oversampling=_OVERSAMPLING)
 
     def _torque_transform(self, force_spectra: Complex) -> Complex:
         """Return the Laplace transform of the torque that modal forces and root moment cause.
@@ -544,11 +530,7 @@ class DragResponse:
         torque_transform : ndarray of complex, shape (..., bins)
             Transform of the torque at the points `s`.
         """
-        torque_nm = np.fft.irfft(torque_transform * self._torque_channel, self._length)[
-            ..., : self._samples
-        ]
-        torque_nm *= self._growth[::_OVERSAMPLING]
-        return torque_nm
+        return self._transform.inverse(torque_transform * self._torque_channel, self._samples)
 
     def modal_torque(self, mode_number: int) -> Complex:
         """Return the transform of the linear torque by one mode, without the delay, shape (bins,).
@@ -570,9 +552,9 @@ class DragResponse:
 
         Their shape is (..., 3 m).
         """
-        fine_samples = np.fft.irfft(_OVERSAMPLING * laplace_transform, _OVERSAMPLING * self._length)
-        oversampled_values: Real = fine_samples[..., : self._growth.size] * self._growth
-        return oversampled_values
+        return self._transform.inverse(
+            laplace_transform, _OVERSAMPLING * self._samples, oversampling=_OVERSAMPLING
+        )
 
 
 def _drag_force(speed_m_s: Real, law: DragLaw) -> Real:

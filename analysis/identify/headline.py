@@ -29,9 +29,10 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
+    from analysis.identify._estimates import DampingSize, ModeEstimate
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._result import DampingSize, ModeEstimate, RecordFit
+    from analysis.identify._result import RecordFit
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify.verdict import OrderVerdict
 

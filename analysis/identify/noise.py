@@ -61,6 +61,34 @@ class NoiseLine:
 
 
 @dataclass(frozen=True, slots=True)
+class Hum:
+    """Narrow-band disturbance: a sinusoid in the torque.
+
+    Attributes
+    ----------
+    frequency_hz : float
+        Frequency of the sinusoid.
+    phasor_nm : complex
+        The torque is the real part of ``phasor_nm exp(2j pi frequency_hz t)``, with the time t
+        since the first compared sample.
+    """
+
+    frequency_hz: float
+    phasor_nm: complex
+
+    @property
+    def line(self) -> NoiseLine:
+        """Return frequency in Hz and amplitude in N·m of the hum, as a line of the noise."""
+        return NoiseLine(self.frequency_hz, float(abs(self.phasor_nm)))
+
+    def torque(self, time_s: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the torque of the hum in N·m at times since the first compared sample."""
+        phase_rotation = np.exp(2j * np.pi * self.frequency_hz * time_s)
+        torque_nm: NDArray[np.float64] = (self.phasor_nm * phase_rotation).real
+        return torque_nm
+
+
+@dataclass(frozen=True, slots=True)
 class NoiseSpectrum:
     """Noise spectrum of the torque, as estimated from the residual of a fit.
 

@@ -21,7 +21,7 @@ from analysis.paper._estimate import (
     estimate_warnings,
 )
 from analysis.paper._fit import FitError, FrfFit, fit_many
-from rigd.beam import modes, transfer, undamped_frequencies_rad_s
+from rigd.beam import CausalTransform, modes, transfer, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -200,10 +200,8 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
     """Return the torque that the exact model predicts from the measured angle of a whole record.
 
     The beam is assumed at rest before the first sample, at the angle of the segment ``rest`` or
-    else at the first angle. The angle times exp(-sigma t) is padded with zeros and transformed,
-    which gives its transform at s = sigma + j omega; the exponential makes the circular
-    wrap-around decay. The transform is multiplied by ``G(s) + J_tool s²`` and by the difference of
-    the two channels' delays, transformed back, and divided by the exponential.
+    else at the first angle. The angle is convolved with ``G(s) + J_tool s²`` and the difference of
+    the two channels' delays (`rigd.beam.CausalTransform`).
 
     Parameters
     ----------
@@ -219,18 +217,14 @@ def modelled_torque(record: Record, damping: Damping) -> NDArray[np.float64]:
     """
     sample_count = len(record.angle_rad)
     padded_samples = 1 << (2 * sample_count - 1).bit_length()
-    duration_s = sample_count / record.rate_hz
-    sigma_per_s = _DECAY_OVER_RECORD / duration_s
-    decay_factors = np.exp(-sigma_per_s * np.arange(sample_count) / record.rate_hz)
-    s = sigma_per_s + 2j * np.pi * np.fft.rfftfreq(padded_samples, 1.0 / record.rate_hz)
+    transform = CausalTransform(
+        padded_samples, record.rate_hz, _DECAY_OVER_RECORD * padded_samples / sample_count
+    )
+    s = transform.s
     origin_rad = record.angle_rad[0] if record.rest_angle_rad is None else record.rest_angle_rad
-    angle_transform = np.fft.rfft((record.angle_rad - origin_rad) * decay_factors, padded_samples)
     torque_response = transfer(s, record.beam, damping) + record.tool_inertia_kg_m2 * s**2
     torque_response *= np.exp(-s * (record.torque_delay_s - record.angle_delay_s))
-    return np.asarray(
-        np.fft.irfft(angle_transform * torque_response, padded_samples)[:sample_count]
-        / decay_factors
-    )
+    return transform.convolve(record.angle_rad - origin_rad, torque_response)
 
 
 def band_limited(

@@ -14,7 +14,7 @@ from analysis.report._frf_figure import line_styles
 from analysis.report._paper_tables import welch_method_text
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.table import NOT_REPORTED_MARK, unreported_parameters
-from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.spectral import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

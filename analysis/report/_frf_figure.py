@@ -9,7 +9,7 @@ import numpy as np
 
 from analysis.models import ESTIMATOR_NAMES, estimate_text
 from analysis.report import _style as style
-from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.spectral import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -19,7 +19,7 @@ from analysis.report._campaign_figures import (
 from analysis.report._pooled_tables import exact_condition_text, session_count_text
 from analysis.report.bands import dense_grid, loss_factors, response_band
 from analysis.statistics import NORMAL_95, student_t_quantile
-from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.spectral import magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

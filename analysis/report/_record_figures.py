@@ -25,8 +25,7 @@ from analysis.report._uniformity import UNIFORMITY, uniformity_description, unif
 from analysis.report.bands import dense_grid, loss_estimate, loss_factors, supported_band_hz
 from analysis.statistics import KOLMOGOROV_95, NORMAL_95
 from rigd.beam import undamped_frequencies_rad_s
-from rigd.spectral import fft_response
-from rigd.view.frequency_charts import magnitude_db, phase_deg
+from rigd.spectral import fft_response, magnitude_db, phase_deg
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence

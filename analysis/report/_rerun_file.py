@@ -12,16 +12,15 @@ from analysis.report._shown_model import ShownModel
 from analysis.report._text import analysis_tables, as_text, damping_sentences, record_tables
 from analysis.report.folder import OutputError, OutputExistsError
 from rigd.session import read_session, read_timings
+from rigd.spectral import CurveDecimation, magnitude_db, phase_deg
 from rigd.view import chart_page, chart_view
-from rigd.view.chart import Chart, CurveDecimation, LegendEntry
+from rigd.view.chart import Chart, LegendEntry
 from rigd.view.frequency_charts import (
     COHERENCE_AXIS,
     COHERENCE_ENTRY,
     MEASURED_ENTRY,
     PHASE_AXIS,
     magnitude_axis,
-    magnitude_db,
-    phase_deg,
     response_chart,
 )
 from rigd.view.plots import (

@@ -26,7 +26,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLo
 from analysis.models import QUANTITIES, STRUCTURES
 from analysis.report.folder import write_new
 from analysis.results import FIGURE_FORMATS
-from rigd.view.frequency_charts import magnitude_db
+from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Sequence

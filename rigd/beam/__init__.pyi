@@ -2,6 +2,8 @@ from . import realisation as realisation
 from . import tip as tip
 from ._air_drag import AIR_DENSITY_KG_PER_M3 as AIR_DENSITY_KG_PER_M3
 from ._air_drag import DragGrid as DragGrid
+from ._causal_transform import CausalTransform as CausalTransform
+from ._causal_transform import fast_transform_length as fast_transform_length
 from ._deflection import DeflectionFilter as DeflectionFilter
 from ._force_realisation import check_force_damping_order as check_force_damping_order
 from ._force_realisation import realise_force as realise_force

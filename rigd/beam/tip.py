@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam._causal_transform import CausalTransform, fast_transform_length
 from rigd.beam._model import Beam, Damping
 from rigd.beam._tip_mass import LoadedBeam
 
@@ -30,9 +31,7 @@ from the linear ones by fractions of that size, the accuracy of a careful sessio
 _EXTENSION_FACTOR = 1.125
 """Length of the extended record relative to the record."""
 _DECAY_EXPONENT = 7.0
-"""Exponent of the decay of the weighting by which the record is multiplied before its FFT.
-
-The weighting suppresses the wrap-around."""
+"""Exponent of the transform's damping."""
 _BLOCK_POINTS = 1 << 15
 """Number of frequencies evaluated at once: those of an hour at 1 kHz would take a gigabyte."""
 
@@ -106,21 +105,12 @@ def tip_motion(
     14.2 mm, 0.0201 rad
     """
     n = angle_rad.size
-    padded_length = _fast_fft_length(int(np.ceil(_EXTENSION_FACTOR * n)))
-    # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY_EXPONENT * rate_hz / padded_length
-    s = np.asarray(2j * np.pi * np.fft.rfftfreq(padded_length, 1 / rate_hz), np.complex128)
-    s += sigma
+    transform = CausalTransform(
+        fast_transform_length(int(np.ceil(_EXTENSION_FACTOR * n))), rate_hz, _DECAY_EXPONENT
+    )
+    s = transform.s
     # The angle stays at its final value: a jump back would ring at the last samples.
-    angle_samples = np.full(padded_length, angle_rad[-1] - angle_rad[0])
-    np.subtract(angle_rad, angle_rad[0], out=angle_samples[:n])
-    for block_start in range(0, padded_length, _BLOCK_POINTS):
-        tick_numbers = np.arange(block_start, min(block_start + _BLOCK_POINTS, padded_length))
-        angle_samples[block_start : block_start + _BLOCK_POINTS] *= np.exp(
-            -sigma * tick_numbers / rate_hz
-        )
-    deflection_spectrum = np.fft.rfft(angle_samples)
-    del angle_samples
+    deflection_spectrum = transform.forward(angle_rad - angle_rad[0], hold=True)
     tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
     loaded_beam = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
     # Block by block and without copies: these arrays have the record's length.
@@ -142,18 +132,10 @@ def tip_motion(
         tip_speed[block_slice] = s[block_slice] * (
             deflection_spectrum[block_slice] + beam.length_m * root_angle
         )
-    del s
 
     def largest(spectrum: Complex) -> float:
-        motion_samples = np.fft.irfft(spectrum, padded_length)[:n]
-        block_peaks = []
-        for block_start in range(0, n, _BLOCK_POINTS):
-            motion_block = motion_samples[block_start : block_start + _BLOCK_POINTS]
-            growth_factor = np.exp(
-                sigma * np.arange(block_start, block_start + motion_block.size) / rate_hz
-            )
-            block_peaks.append(float(np.max(np.abs(motion_block * growth_factor))))
-        return float(np.max(block_peaks))  # NaN stays NaN
+        motion = transform.inverse(spectrum, n)
+        return float(max(motion.max(), -motion.min()))  # NaN stays NaN
 
     return TipMotion(
         deflection_m=largest(deflection_spectrum),
@@ -193,9 +175,3 @@ def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Com
     displacement: Complex = beam.length_m * sines * reciprocal / z
     tip_slope: Complex = cosines * reciprocal
     return displacement, tip_slope
-
-
-def _fast_fft_length(min_length: int) -> int:
-    """Return a length of at least `min_length`, at most an eighth more, whose FFT is fast."""
-    length_unit = 1 << max(0, min_length.bit_length() - 4)
-    return -(-min_length // length_unit) * length_unit

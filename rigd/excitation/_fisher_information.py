@@ -23,7 +23,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import transfer, transfer_and_gradient
+from rigd.beam import CausalTransform, fast_transform_length, transfer, transfer_and_gradient
 from rigd.beam.tip import tip_response
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
@@ -55,7 +55,7 @@ _SAMPLE_RATE_OVER_BAND: Final = 2.4
 _FADED_OVER_BAND: Final = 1.1
 """Frequency at which the weight of the noise has faded to 0, over the upper end of the band."""
 _WRAP_AROUND_DECAY: Final = 5.0
-"""Exponent by which the wrap-around of a transform of twice the length has decayed: exp(-5)."""
+"""Exponent of the damping of a transform of twice the length."""
 
 
 # Whitened derivatives of the torque
@@ -76,8 +76,8 @@ class TorqueModel:
     """Length of the records in ticks, a multiple of `factor`."""
     factor: int
     """Number of ticks from one sample to the next."""
-    sigma_per_s: float
-    """Real part of the Laplace variable in 1/s."""
+    transform: CausalTransform
+    """Laplace transform of records, at the rate of the samples."""
     kernels: Complex
     """Whitened derivatives of the response from angle to torque by the free parameters, shape
     (k, K)."""
@@ -98,26 +98,22 @@ class TorqueModel:
             Smallest length of the records in ticks.
         """
         ticks_per_point = ticks_per_sample(rate_hz)
-        # Twice the length, and one of which a transform is quick.
-        half_samples = -(-tick_count // ticks_per_point)
-        half_samples = _fast_transform_length(half_samples)
-        tick_count = half_samples * ticks_per_point
-        sample_count = 2 * half_samples
-        sample_hz = rate_hz / ticks_per_point
-        sigma_per_s = _WRAP_AROUND_DECAY * sample_hz / sample_count
-        frequency_hz = np.fft.rfftfreq(sample_count, 1.0 / sample_hz)
+        sample_count = fast_transform_length(-(-tick_count // ticks_per_point))
         # Higher frequencies belong neither to the band nor to a visible mode.
-        frequency_hz = frequency_hz[frequency_hz <= _FADED_OVER_BAND * BAND_HZ]
-        s = sigma_per_s + 2j * pi * frequency_hz
-        kernels = whitened_kernels(estimate, s, sample_hz)
+        transform = CausalTransform(
+            2 * sample_count,
+            rate_hz / ticks_per_point,
+            _WRAP_AROUND_DECAY,
+            highest_hz=_FADED_OVER_BAND * BAND_HZ,
+        )
         return cls(
             estimate,
             rate_hz,
-            tick_count,
+            sample_count * ticks_per_point,
             ticks_per_point,
-            sigma_per_s,
-            kernels,
-            np.stack(responses(estimate, s)[1:]),
+            transform,
+            whitened_kernels(estimate, transform.s, transform.rate_hz),
+            np.stack(responses(estimate, transform.s)[1:]),
         )
 
     @property
@@ -130,35 +126,23 @@ class TorqueModel:
 
         The angle in rad begins at rest and has the shape (n,), with n at most `ticks`.
         """
-        time_s = np.arange(angle_rad.size) / self.rate_hz
-        decaying_angle_rad = angle_rad * np.exp(-self.sigma_per_s * time_s)
-        spectrum: Complex = np.fft.rfft(decaying_angle_rad, 2 * self.ticks)[: self.kernels.shape[1]]
-        return spectrum
+        return self.transform.forward(angle_rad, oversampling=self.factor)
 
     def whitened_derivatives(self, angle_transform: Complex) -> Real:
         """Return derivatives of the torque by the free parameters over the noise, at each sample.
 
         `angle_transform` is the transform of the angle. The shape is (k, ticks / factor).
         """
-        return self._inverse_transform(
-            self.kernels * (angle_transform / self.factor), self.ticks // self.factor, 1
-        )
+        return self.transform.inverse(self.kernels * angle_transform, self.ticks // self.factor)
 
     def torque_and_slope(self, angle_transform: Complex) -> Real:
         """Return torque in N·m and slope of the tip in rad at every tick, shape (2, ticks).
 
         `angle_transform` is the transform of the angle.
         """
-        return self._inverse_transform(self.channels * angle_transform, self.ticks, self.factor)
-
-    def _inverse_transform(
-        self, laplace_spectra: Complex, sample_count: int, values_per_sample: int
-    ) -> Real:
-        """Return functions of time, with some values per sample, from Laplace transforms."""
-        time_s = np.arange(sample_count) * (self.factor / values_per_sample / self.rate_hz)
-        time_values = np.fft.irfft(laplace_spectra, 2 * sample_count)[:, :sample_count]
-        time_values *= np.exp(self.sigma_per_s * time_s)
-        return time_values
+        return self.transform.inverse(
+            self.channels * angle_transform, self.ticks, oversampling=self.factor
+        )
 
 
 def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Complex]:
@@ -284,12 +268,6 @@ def _whitening_weights(
     whitening_weights: Real = np.exp(-0.5 * log_noise_density) * np.sqrt(2.0 / sample_hz)
     whitening_weights *= 0.5 + 0.5 * np.cos(pi * fade_factors)
     return whitening_weights
-
-
-def _fast_transform_length(min_length: int) -> int:
-    """Return a length for a fast Fourier transform: `min_length`, or at most an eighth more."""
-    length_unit = 1 << max(0, min_length.bit_length() - 4)
-    return -(-min_length // length_unit) * length_unit
 
 
 # Information

@@ -18,7 +18,8 @@ from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner.request import Order
 from rigd.runtime import StopRequest
-from rigd.view import Subject, linear_sweep_band_hz, sweep_ticks
+from rigd.sweep_response import sweep_ticks
+from rigd.view import Subject, linear_sweep_band_hz
 from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0

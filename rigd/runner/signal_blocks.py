@@ -11,10 +11,10 @@ import numpy.typing as npt
 from rigd.engine import Observer, Ring
 from rigd.engine.channels import Channels
 from rigd.engine.shared_state import Phase, StateField
+from rigd.gauges import Gauge, Gauges
 from rigd.profile import Profile
 from rigd.runner._live_view import gauge_limits
 from rigd.session.layout import decode_samples
-from rigd.view import Gauge, Gauges
 
 _SIGNAL_FIELDS: Final = ("angle_rad", "angle_reference_rad", "coupling_torque_nm")
 _MAX_BLOCK_TICKS: Final = 2500

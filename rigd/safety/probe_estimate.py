@@ -1,12 +1,12 @@
 """Estimate of scales and friction from the record of a probing move, and its assessment."""
 
 from dataclasses import asdict, dataclass, replace
-from math import hypot, log, pi, sqrt
+from math import hypot, log, sqrt
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import transfer
+from rigd.beam import CausalTransform, transfer
 from rigd.safety.probing_move import ProbedRig, ProbeEnd, ProbingMove
 
 Real = NDArray[np.float64]
@@ -32,9 +32,7 @@ _MIN_SAMPLES = 50
 _WINDOW_CUTOFF_HZ = 100.0
 """Frequency in Hz above which the smoothing window passes nothing."""
 _DECAY_EXPONENT = 12.0
-"""Exponent of the decay of the weighting by which the angle is multiplied before its FFT.
-
-The weighting suppresses the wrap-around."""
+"""Exponent of the transform's damping."""
 _MAX_CONDITION_NUMBER = 1e6
 """Largest condition number of the normal equations that gives an estimate."""
 _MAX_RELATIVE_STD = 0.1
@@ -193,24 +191,17 @@ def _beam_torques(rig: ProbedRig, angle_rad: Real) -> Real:
     There is a row for each candidate factor of the beam's frequencies.
     """
     n = angle_rad.size
-    padded_length = 1 << (2 * n - 1).bit_length()
-    # On s = sigma + j omega the wrap-around has decayed.
-    sigma = _DECAY_EXPONENT * rig.rate_hz / padded_length
-    frequency_hz = np.fft.rfftfreq(padded_length, 1.0 / rig.rate_hz)
-    within_window_band = frequency_hz <= _WINDOW_CUTOFF_HZ
-    s = sigma + 2j * pi * frequency_hz[within_window_band]
-    growth = np.exp(sigma * np.arange(padded_length) / rig.rate_hz)
-    extended_angle = np.full(padded_length, angle_rad[-1])
-    extended_angle[:n] = angle_rad
-    angle_spectrum = np.fft.rfft(extended_angle / growth)[within_window_band]
+    transform = CausalTransform(
+        1 << (2 * n - 1).bit_length(), rig.rate_hz, _DECAY_EXPONENT, highest_hz=_WINDOW_CUTOFF_HZ
+    )
+    s = transform.s
+    angle_spectrum = transform.forward(angle_rad, hold=True)
     torques_nm = np.empty((len(_FREQUENCY_FACTORS), n))
-    spectrum = np.zeros(frequency_hz.size, dtype=np.complex128)
     for row, frequency_factor in zip(torques_nm, _FREQUENCY_FACTORS, strict=True):
         stiffness = rig.beam.bending_stiffness_n_m2 * frequency_factor**2
         scaled_beam = replace(rig.beam, bending_stiffness_n_m2=stiffness)
         torque_per_angle = transfer(s, scaled_beam, rig.damping) + rig.tool_inertia_kg_m2 * s * s
-        spectrum[within_window_band] = torque_per_angle * angle_spectrum
-        row[:] = (np.fft.irfft(spectrum, padded_length) * growth)[:n]
+        row[:] = transform.inverse(torque_per_angle * angle_spectrum, n)
     return torques_nm
 
 

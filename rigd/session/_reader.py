@@ -1,24 +1,21 @@
 """Reader of session files: returns the whole file as arrays, or raises an error with a remedy."""
 
-import mmap
 import shlex
-import stat
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from math import isfinite
 from os import PathLike
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
 
 from rigd.session import limits
-from rigd.session._errors import SessionAccessError, SessionError
-from rigd.session._mcap_limits import McapError, McapTooLargeError
-from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock, read_mcap
-from rigd.session._mcap_writer import MAGIC, MESSAGE_HEAD_FORMAT
+from rigd.session._contents import load_contents, recovery_advice
+from rigd.session._errors import SessionError
+from rigd.session._mcap_reader import McapContents, MessageBlock, OnBlock
+from rigd.session._mcap_writer import MESSAGE_HEAD_FORMAT
 from rigd.session._message_decoder import (
     CONTROLS,
     SAMPLES,
@@ -414,84 +411,8 @@ def no_samples_error(path: Path) -> SessionError:
     )
 
 
-def load_contents(
-    path: Path,
-    topics: Sequence[str] | None,
-    *,
-    on_block: OnBlock | None = None,
-    salvage: bool = False,
-    on_progress: Callable[[float], None] | None = None,
-) -> McapContents:
-    """Return the contents of an MCAP file up to its end or its first damage.
-
-    The arguments are those of `rigd.session._mcap_reader.read_mcap`. Raises SessionError if the
-    file is missing, empty, too large or not an MCAP file.
-    """
-    with open_mcap_file(path) as file:
-        mapped_file = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
-        return read_mcap(
-            memoryview(mapped_file),
-            topics,
-            on_block=on_block,
-            salvage=salvage,
-            on_progress=on_progress,
-        )
-
-
-def check_beginning(path: Path) -> None:
-    """Raise if a file does not begin with the magic bytes of an MCAP file.
-
-    Raises
-    ------
-    SessionError
-        If the file is missing, empty or not an MCAP file.
-    """
-    with open_mcap_file(path) as file:
-        read_mcap(memoryview(file.read(len(MAGIC))), ())
-
-
-@contextmanager
-def open_mcap_file(path: Path) -> Iterator[BinaryIO]:
-    """Open a file for reading, and convert errors of the enclosed code into SessionError."""
-    try:
-        _require_nonempty_file(path)
-        with path.open("rb") as file:
-            yield file
-    except OSError as error:
-        raise _access_error(path, error) from None
-    except McapTooLargeError as error:
-        raise SessionError(f"{path} {error}. Give a shorter session.") from None
-    except McapError as error:
-        raise _format_error(path, error) from None
-
-
-def _require_nonempty_file(path: Path) -> None:
-    """Raise if the path is not that of a regular file, or if the file is empty."""
-    file_status = path.stat()
-    if not stat.S_ISREG(file_status.st_mode):
-        raise SessionError(f"{path} is not a file. Give the path of a session file (*.mcap).")
-    if file_status.st_size == 0:
-        raise SessionError(f"{path} is empty, nothing was recorded to it. Record it again.")
-
-
-def _access_error(path: Path, error: OSError) -> SessionAccessError:
-    """Return the error for a file that the operating system does not let the program read."""
-    return SessionAccessError(
-        f"{path} cannot be read: {error.strerror or error}. Check the path and its permissions."
-    )
-
-
-def _format_error(path: Path, error: McapError) -> SessionError:
-    """Return the error for a file that is not a usable MCAP file."""
-    return SessionError(f"{path} {error}. Give a session file (*.mcap).")
-
-
 def _damage_message(path: Path, contents: McapContents) -> str:
     """Return the error message for an incomplete or damaged file, with the remedy."""
-    from rigd.session._recovery import (
-        recovery_advice,
-    )  # imported here, because it imports this module
-
     if contents.complete:
         return f"{path} is damaged: it {contents.damage}{recovery_advice(path, was_whole=True)}"
     if is_being_written(path):

@@ -5,15 +5,12 @@ records ``session`` and ``segments`` are taken from the copy in such a chunk, an
 has its own checksum. The record ``outcome`` is used only if the checksum of the whole data section
 is correct. The file of another program may lack some checksums. It is recovered and marked as
 unprotected.
-
-`recovery_advice` states how much of an incomplete file can be recovered, and by which command.
 """
 
 import contextlib
 import hashlib
 import os
 import secrets
-import shlex
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -25,15 +22,14 @@ from mcap.records import Channel
 
 import rigd
 from rigd.session import limits
+from rigd.session._contents import load_contents, recovered_path
 from rigd.session._errors import SessionError, SessionExistsError
-from rigd.session._mcap_limits import McapError
-from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts, read_mcap
+from rigd.session._mcap_reader import McapContents, MessageBlock, message_starts
 from rigd.session._mcap_writer import INDEX_DTYPE, LOG_TIME_OFFSET, McapWriter
 from rigd.session._message_decoder import SAMPLES, MessageDecoder
 from rigd.session._reader import (
     ORDER_AND_FLAG_FIELDS,
     TopicBuffer,
-    load_contents,
     merged_metadata,
     read_session,
 )
@@ -55,8 +51,6 @@ from rigd.session.layout import SAMPLE_DTYPE, SAMPLE_FIELDS, Status
 RECOVERED_FROM: Final = "recovered_from"
 """Key of the record ``outcome`` of a recovered file; its value is the damaged file's name."""
 
-_SESSION_SUFFIX: Final = ".mcap"
-_RECOVERED_SUFFIX: Final = ".recovered.mcap"
 _MIN_CHUNK_BYTES: Final = 1 << 14
 _LONG_CHUNK_BYTES: Final = 4 << 20
 """Length of the collected messages, in bytes, above which a chunk is written in any case."""
@@ -66,9 +60,6 @@ _MAX_COPIED_CHANNELS: Final = 32
 """Maximum number of channels to copy with the session's own topics, and likewise with others."""
 _FIRST_READING_FRACTION: Final = 0.3
 """Fraction of the reported progress at which the first reading of the damaged file ends."""
-
-_SEARCHED_BYTES: Final = 1 << 20
-"""Number of bytes at the start of a file in which its first samples lie, if there are any."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -127,16 +118,6 @@ class Recovery:
                 "segments (rigd info) with what you know of the session."
             )
         return lines
-
-
-def recovered_path(path: Path) -> Path:
-    """Return the path of the recovered file: ``X.mcap`` for ``X.mcap.part``.
-
-    For ``X.mcap`` the path is ``X.recovered.mcap``.
-    """
-    if path.name.endswith(_SESSION_SUFFIX + PART_SUFFIX):
-        return path.with_name(path.name.removesuffix(PART_SUFFIX))
-    return path.with_name(path.name.removesuffix(_SESSION_SUFFIX) + _RECOVERED_SUFFIX)
 
 
 def recover(
@@ -300,54 +281,6 @@ class _SampleSelection:
             )
             if is_chunk_duplicate
         }
-
-
-def holds_samples(path: Path) -> bool:
-    """Return whether `recover` may find a sample in a file.
-
-    Only the first mebibyte is searched. The result is True for a longer MCAP file, and for a file
-    that cannot be opened.
-    """
-    try:
-        with path.open("rb") as file:
-            beginning = file.read(_SEARCHED_BYTES)
-            is_longer = bool(file.read(1))
-    except OSError:
-        return True
-    try:
-        mcap_contents = read_mcap(memoryview(beginning), (), salvage=True)
-    except McapError:
-        return False
-    return is_longer or mcap_contents.count(SAMPLE_TOPIC) > 0
-
-
-def recovery_advice(path: Path, *, was_whole: bool) -> str:
-    """Return the end of an error message: how much of a damaged file is intact and recoverable.
-
-    The text begins with the punctuation mark that follows the description of the damage.
-    `was_whole` states whether the file was complete once, so that an intact copy may exist.
-    """
-    try:
-        sample_count = load_contents(path, (), salvage=True).count(SAMPLE_TOPIC)
-    except SessionError:
-        sample_count = 0
-    copy_advice = ". Copy it again from where it was recorded"
-    readable_samples = f"; {sample_count} complete samples are readable before that"
-    if not sample_count:
-        no_samples_text = ", so there is nothing to recover"
-        if was_whole:
-            return f"{readable_samples}{no_samples_text}{copy_advice}."
-        return (
-            f"{readable_samples}{no_samples_text}. Copy it again if there is a complete one, or "
-            "record it again."
-        )
-    recovered_file = recovered_path(path)
-    recover_command = f"`rigd recover {shlex.quote(str(path))}`"
-    if os.path.lexists(recovered_file):
-        recover_command += f", once {recovered_file}, which may hold it already, is moved away"
-    if was_whole:
-        return f"{copy_advice}, or save what is intact with {recover_command}."
-    return f"{readable_samples}. Save them with {recover_command}."
 
 
 def _increasing_ticks_mask(ticks: npt.NDArray[np.uint32]) -> npt.NDArray[np.bool_]:

@@ -17,6 +17,7 @@ from typing import BinaryIO, Final
 from mcap.opcode import Opcode
 from mcap.records import Channel, Metadata, MetadataIndex, Statistics
 
+from rigd.session._contents import load_contents, open_mcap_file
 from rigd.session._mcap_limits import McapDamageError
 from rigd.session._mcap_reader import (
     FOOTER_FORMAT,
@@ -26,7 +27,7 @@ from rigd.session._mcap_reader import (
     read_mcap,
 )
 from rigd.session._mcap_writer import MAGIC
-from rigd.session._reader import load_contents, merged_metadata, no_samples_error, open_mcap_file
+from rigd.session._reader import merged_metadata, no_samples_error
 from rigd.session._schema import SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
 

@@ -2,9 +2,9 @@
 
 The package offers Welch's estimate (`welch_response`: H1, H2, Hv), the instrumental-variable
 estimate within a control loop (`instrumental_response`: Hiv), the ratio of the transforms of whole
-records (`fft_response`), Welch's estimate of a record that is still growing (`RunningResponse`) and
-a running spectrogram (`RunningSpectrogram`). It works on arrays and depends on neither sessions nor
-the beam.
+records (`fft_response`), Welch's estimate of a record that is still growing (`RunningResponse`), a
+running spectrogram (`RunningSpectrogram`) and the decimation of curves (`CurveDecimation`). It
+works on arrays and depends on neither sessions nor the beam.
 """
 
 import lazy_loader as lazy

@@ -1,3 +1,7 @@
+from ._curves import PHASE_START_DEG as PHASE_START_DEG
+from ._curves import CurveDecimation as CurveDecimation
+from ._curves import magnitude_db as magnitude_db
+from ._curves import phase_deg as phase_deg
 from ._frf import PAPER_OVERLAP_FRACTION as PAPER_OVERLAP_FRACTION
 from ._frf import PAPER_RATE_HZ as PAPER_RATE_HZ
 from ._frf import PAPER_SEGMENTS as PAPER_SEGMENTS

@@ -283,7 +283,7 @@ def _causal_response(
 ) -> NDArray[np.float64]:
     """Return the causal response (n,) of a transfer function to values that begin at rest.
 
-    The transform is evaluated on ``s = sigma + j omega``, for the values followed by zeros.
+    Independent of `rigd.beam.CausalTransform`, so that tests with these signals verify it.
     """
     n = len(input_values)
     padded_length = 1 << (4 * n).bit_length()

@@ -12,13 +12,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
+    CausalTransform,
     PointForceGrid,
     clamped_free_eigenvalues,
     mode_shape,
     poles,
     root_shear_ratio,
 )
-from rigd.touch._kernels import LaplaceLine, chebyshev_nodes
+from rigd.touch._kernels import DECAY_EXPONENT, chebyshev_nodes
 from rigd.touch._model import TouchModel
 
 Real = NDArray[np.float64]
@@ -93,10 +94,10 @@ class FreeBeam:
         "_sample",
         "_shear",
         "_torque",
-        "line",
         "model",
         "modes",
         "rate_hz",
+        "transform",
         "x_m",
     )
 
@@ -105,8 +106,9 @@ class FreeBeam:
 
         self.model, self.x_m, self.rate_hz = model, x_m, rate_hz
         n = next_fast_len(STEPS_PER_SAMPLE * round(1.6 * sample_count + 0.1 * rate_hz), real=True)
-        self.line = LaplaceLine(n, 1 / (STEPS_PER_SAMPLE * rate_hz), _BAND_FRACTION)
-        s = self.line.s
+        step_hz = STEPS_PER_SAMPLE * rate_hz
+        self.transform = CausalTransform(n, step_hz, DECAY_EXPONENT, _BAND_FRACTION * step_hz / 2)
+        s = self.transform.s
         self._grid = force_grid = PointForceGrid(s, model.beam, model.damping)
         filter_response = model.sensor_filter.response(s)
         filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
@@ -117,7 +119,9 @@ class FreeBeam:
         self._set_positions(x_m)
         unit_sample = np.zeros(3 * SPLINE_FADE_SAMPLES)
         unit_sample[SPLINE_FADE_SAMPLES] = 1.0
-        self._sample = self.line.to_laplace(_interpolate_angle(unit_sample, rate_hz, self.line)[0])
+        self._sample = self.transform.forward(
+            _interpolate_angle(unit_sample, rate_hz, self.transform)[0]
+        )
 
     def at_positions(self, x_m: Real) -> "FreeBeam":
         """Return a copy that computes the displacement at other positions along the beam.
@@ -160,7 +164,7 @@ class FreeBeam:
             sample of the angle, because the spline through the samples acts ahead of each sample.
         """
         laplace_response = (self._between[position_index] @ self._displacement) * self._sample
-        return self.line.to_time(
+        return self.transform.inverse(
             laplace_response, STEPS_PER_SAMPLE * (SPLINE_FADE_SAMPLES + sample_count)
         )
 
@@ -187,7 +191,7 @@ class FreeBeam:
         n = touch_record.angle_rad.size
         rate_hz = self.rate_hz
         angle_transform = angle_transform or AngleTransform.from_samples(
-            touch_record.angle_rad, rate_hz, self.line
+            touch_record.angle_rad, rate_hz, self.transform
         )
         spectrum, start_rad, speed_rad_s = (
             angle_transform.spectrum,
@@ -202,9 +206,9 @@ class FreeBeam:
         vibration_columns = self.modes.channels(t - delay_s)
         innovations, design_matrices = [], []
         for i, (measured_samples, transfer_function) in enumerate(measured_channels):
-            free_reading = self.line.to_time(transfer_function * spectrum, STEPS_PER_SAMPLE * n)[
-                ::STEPS_PER_SAMPLE
-            ]
+            free_reading = self.transform.inverse(
+                transfer_function * spectrum, STEPS_PER_SAMPLE * n
+            )[::STEPS_PER_SAMPLE]
             innovations.append(measured_samples - free_reading)
             offset_and_drift = np.zeros((n, 2 * len(measured_channels)))
             offset_and_drift[:, 2 * i] = 1.0
@@ -212,7 +216,7 @@ class FreeBeam:
             design_matrices.append(np.hstack([vibration_columns[i], offset_and_drift]))
         motion_fit = _FreeMotionFit.fit(innovations, design_matrices, quiet_samples)
         step_count = STEPS_PER_SAMPLE * n
-        node_displacement_m = self.line.to_time(self._displacement * spectrum, step_count)
+        node_displacement_m = self.transform.inverse(self._displacement * spectrum, step_count)
         displacement_m = self._between @ node_displacement_m[:, STEPS_PER_SAMPLE * first_sample :]
         step_times_s = np.arange(STEPS_PER_SAMPLE * first_sample, step_count) / (
             STEPS_PER_SAMPLE * rate_hz
@@ -285,17 +289,15 @@ class AngleTransform:
 
     @classmethod
     def from_samples(
-        cls, angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+        cls, angle_rad: Real, rate_hz: float, transform: CausalTransform
     ) -> "AngleTransform":
-        """Return the transform of an angle's samples at the frequencies of a Laplace line."""
-        remaining_angle, start_rad, speed_rad_s = _interpolate_angle(
-            angle_rad, rate_hz, laplace_line
-        )
-        return cls(laplace_line.to_laplace(remaining_angle), start_rad, speed_rad_s)
+        """Return the transform of an angle's samples."""
+        remaining_angle, start_rad, speed_rad_s = _interpolate_angle(angle_rad, rate_hz, transform)
+        return cls(transform.forward(remaining_angle), start_rad, speed_rad_s)
 
 
 def _interpolate_angle(
-    angle_rad: Real, rate_hz: float, laplace_line: LaplaceLine
+    angle_rad: Real, rate_hz: float, transform: CausalTransform
 ) -> tuple[Real, float, float]:
     """Interpolate an angle to the time steps of a transform, and subtract constant speed.
 
@@ -309,9 +311,9 @@ def _interpolate_angle(
     start_rad, speed_rad_s = float(polynomial[2]), float(polynomial[1])
     relative_angle_rad = angle_rad - start_rad - speed_rad_s * t
     angle_spline = CubicSpline(t, relative_angle_rad)
-    step_times_s = np.arange(STEPS_PER_SAMPLE * angle_rad.size) * laplace_line.step_s
+    step_times_s = np.arange(STEPS_PER_SAMPLE * angle_rad.size) / transform.rate_hz
     record_steps_s = step_times_s[step_times_s <= t[-1]]
-    times_after_s = np.arange(1, laplace_line.n - record_steps_s.size + 1) * laplace_line.step_s
+    times_after_s = np.arange(1, transform.length - record_steps_s.size + 1) / transform.rate_hz
     end_speed_rad_s = np.polyfit(t[-6:] - t[-1], relative_angle_rad[-6:], 1)[0]
     ending_angle_rad = relative_angle_rad[-1] + end_speed_rad_s * _SETTLING_S * (
         1 - np.exp(-times_after_s / _SETTLING_S)

@@ -2,9 +2,9 @@
 
 A force that is linear between two time steps is a sum of triangular pulses, here called hats, with
 one hat per step. The response to one hat of unit height at each of the following steps is a kernel.
-Kernels are inverse Laplace transforms of the exact model, by an FFT along a line to the right of
-the origin: the wrap-around is smaller by ``exp(-sigma T)``. By reciprocity, torque and shear per
-force at x are minus the displacement there per angle and per displacement of the root.
+Kernels are inverse Laplace transforms of the exact model (`CausalTransform`). By reciprocity,
+torque and shear per force at x are minus the displacement there per angle and per displacement of
+the root.
 """
 
 from dataclasses import dataclass
@@ -12,15 +12,22 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping, PointForceGrid, clamped_free_eigenvalues, mode_shape
+from rigd.beam import (
+    Beam,
+    CausalTransform,
+    Damping,
+    PointForceGrid,
+    clamped_free_eigenvalues,
+    mode_shape,
+)
 from rigd.touch._sensor_filter import NO_FILTER, SensorFilter
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
-WRAP_AROUND_EXPONENT = 14.0
-"""Exponent ``sigma T`` of the wrap-around's decay, with which it is 1e-6 of the values at the end
-of the period."""
+DECAY_EXPONENT = 14.0
+"""Exponent of the transforms' damping: what wraps round is 1e-6 of the values at the end of the
+period."""
 
 _OVERSAMPLING = 2
 """Number of steps of the inverse transform per step of the kernels, since the spectrum of a hat is
@@ -31,65 +38,6 @@ _CROSS_MODE_COUNT = 20
 
 _FIRST_POSITION_M = 0.003
 """Distance in m of the first position from the root; the last position is the tip."""
-
-
-class LaplaceLine:
-    """Laplace transform of functions on ``n`` time steps, on a line of constant real part.
-
-    Parameters
-    ----------
-    n
-        Number of time steps of the period.
-    step_s
-        Time between two steps.
-    band
-        Fraction of the frequencies below the Nyquist frequency that is used; the transform is zero
-        at the others.
-    """
-
-    __slots__ = ("_growth", "n", "s", "step_s")
-
-    def __init__(self, n: int, step_s: float, band: float = 1.0) -> None:
-        self.n, self.step_s = n, step_s
-        real_part_per_s = WRAP_AROUND_EXPONENT / (n * step_s)
-        frequency_count = round(band * (n // 2)) + 1
-        self.s = real_part_per_s + 2j * np.pi * np.arange(frequency_count) / (n * step_s)
-        self._growth = np.exp(real_part_per_s * step_s * np.arange(n))
-
-    def to_laplace(self, samples: Real) -> Complex:
-        """Return the Laplace transform of a function of time, along the last axis.
-
-        Parameters
-        ----------
-        samples
-            Values of the function at the time steps from the first on, at most `n` along the last
-            axis. The function is zero after them.
-        """
-        from scipy.fft import rfft
-
-        damped_samples = samples / self._growth[: samples.shape[-1]]
-        spectrum: Complex = rfft(damped_samples, self.n, axis=-1)[..., : self.s.size]
-        return spectrum
-
-    def to_time(self, laplace_values: Complex, step_count: int) -> Real:
-        """Return a function of time from its Laplace transform, along the last axis.
-
-        Parameters
-        ----------
-        laplace_values
-            Laplace transform at the frequencies of the line, along the last axis.
-        step_count
-            Number of time steps that are returned, from the first on.
-        """
-        from scipy.fft import irfft
-
-        if laplace_values.shape[-1] == self.n // 2 + 1:
-            laplace_values = laplace_values.copy()
-            laplace_values[..., -1] = laplace_values[..., -1].real
-        samples: Real = (
-            irfft(laplace_values, self.n, axis=-1)[..., :step_count] * self._growth[:step_count]
-        )
-        return samples
 
 
 class ForcePulse:
@@ -103,17 +51,16 @@ class ForcePulse:
         Number of values of a kernel.
     """
 
-    __slots__ = ("_delayed_pulse", "_steps", "line")
+    __slots__ = ("_delayed_pulse", "_steps", "transform")
 
     def __init__(self, step_s: float, step_count: int) -> None:
         from scipy.fft import next_fast_len
 
         self._steps = step_count
         fine_step_s = step_s / _OVERSAMPLING
-        self.line = LaplaceLine(
-            next_fast_len(2 * _OVERSAMPLING * step_count, real=True), fine_step_s
-        )
-        s = self.line.s
+        fine_steps = next_fast_len(2 * _OVERSAMPLING * step_count, real=True)
+        self.transform = CausalTransform(fine_steps, 1 / fine_step_s, DECAY_EXPONENT)
+        s = self.transform.s
         pulse_transform = (2 * (np.cosh(s * step_s) - 1) / (step_s * s) ** 2) * step_s / fine_step_s
         # Two steps later than the force, so that the hat begins within the period.
         self._delayed_pulse = pulse_transform * np.exp(-s * step_s)
@@ -124,9 +71,9 @@ class ForcePulse:
         Parameters
         ----------
         laplace_response
-            Transfer functions from a force, at the frequencies of the line, shape (k, frequencies).
+            Transfer functions from a force at `s` of the transform, shape (k, frequencies).
         """
-        fine_values = self.line.to_time(
+        fine_values = self.transform.inverse(
             self._delayed_pulse * laplace_response, _OVERSAMPLING * (self._steps + 1)
         )
         return fine_values[:, _OVERSAMPLING::_OVERSAMPLING][:, : self._steps]
@@ -234,7 +181,7 @@ def contact_kernels(
         Filters of torque and shear.
     """
     force_pulse = ForcePulse(step_s, step_count)
-    s = force_pulse.line.s
+    s = force_pulse.transform.s
     force_grid = PointForceGrid(s, beam, damping)
     filter_response = sensor_filter.response(s)
     complex_stiffness = beam.bending_stiffness_n_m2 * (1 + damping.zeta * s**damping.alpha)
@@ -291,7 +238,7 @@ def cross_kernels(
     The arguments are those of `contact_kernels`.
     """
     force_pulse = ForcePulse(step_s, step_count)
-    s = force_pulse.line.s
+    s = force_pulse.transform.s
     inertial_factor = beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
     stiffness_factor = 1 + damping.zeta * s**damping.alpha
     wave_numbers = clamped_free_eigenvalues(_CROSS_MODE_COUNT) / beam.length_m

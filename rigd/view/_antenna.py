@@ -20,13 +20,12 @@ import numpy.typing as npt
 
 from rigd.beam import Beam, Damping, DeflectionFilter, undamped_frequencies_rad_s
 from rigd.units import with_half_width
-from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color
+from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, VERMILION, Color, Drawing
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun import RecordingStream
 
-    from rigd.view._scene import Drawing
     from rigd.view._session_info import Subject
 
 Records = npt.NDArray[Any]
@@ -119,11 +118,11 @@ class Antenna:
             maxlen=round(_STORED_LINES_S * DRAWN_HZ)
         )
 
-    def frame(self) -> list["Drawing"]:
+    def frame(self) -> list[Drawing]:
         """Return the functions that draw the motor and set the styles of the moving lines."""
         return static_drawings()
 
-    def samples(self, samples: Records) -> list["Drawing"]:
+    def samples(self, samples: Records) -> list[Drawing]:
         """Return functions that draw the bent beam for new samples (n,) of ``SAMPLE_DTYPE``.
 
         The samples are in order of time. The beam is drawn 20 times per second. Across gaps
@@ -162,7 +161,7 @@ class Antenna:
             self._trail = []
         return drawings + label_drawings
 
-    def touch(self, touch: Mapping[str, Any]) -> list["Drawing"]:
+    def touch(self, touch: Mapping[str, Any]) -> list[Drawing]:
         """Return the function that draws a touch: its point, interval and force on the beam.
 
         Parameters
@@ -269,7 +268,7 @@ def view() -> "rrb.Spatial3DView":
     )
 
 
-def static_drawings() -> list["Drawing"]:
+def static_drawings() -> list[Drawing]:
     """Return functions that draw the motor and send the styles of the moving lines."""
     return [_draw_motor, _draw_direction, _draw_styles]
 

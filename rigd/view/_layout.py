@@ -32,14 +32,12 @@ from rigd.view.frequency_charts import (
     SPECTROGRAM_ENTITY,
 )
 from rigd.view.frequency_charts import SIZE as SPECTROGRAM_SIZE
-from rigd.view.plots import TIMELINE, Plot, Source, Values, send_columns
+from rigd.view.plots import TIMELINE, Drawing, Plot, Source, Values, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
     from rerun.blueprint.encodings import VisualizerComponentMapping
     from rerun.datatypes import EntityPath
-
-    from rigd.view._scene import Drawing
 
 
 WINDOW_S = 10.0
@@ -446,7 +444,7 @@ class Scale:
             if time_view.source is source and time_view.plot.span is None
         ]
 
-    def frame(self) -> list["Drawing"]:
+    def frame(self) -> list[Drawing]:
         """Return the function that sends an empty first point of each axis to Rerun.
 
         Without a point Rerun reports an error.
@@ -455,9 +453,7 @@ class Scale:
         start_ns = np.array([0])
         return [partial(send_columns, entity=self._entity, t_ns=start_ns, columns=empty_values)]
 
-    def draw(
-        self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]
-    ) -> list["Drawing"]:
+    def draw(self, t_ns: npt.NDArray[np.int64], plot_values: Mapping[str, Values]) -> list[Drawing]:
         """Return functions that send the invisible points that the axes need for their labels.
 
         The values have shape (n, k), by component, at times (n,). Values that are not finite are
@@ -494,7 +490,7 @@ class Scale:
 
     def _tick_points_drawing(
         self, component_name: str, tick_points: Sequence[_CurvePoint]
-    ) -> "Drawing":
+    ) -> Drawing:
         """Return the function that sends invisible points (time, value) of one axis."""
         times_ns, tick_values = zip(*tick_points, strict=True)
         point_columns = {component_name: np.array(tick_values)[:, None]}

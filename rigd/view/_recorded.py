@@ -8,12 +8,13 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam
 from rigd.documents import DocumentError, parse_toml
 from rigd.session import Session, SessionError
 from rigd.session.layout import Status
 from rigd.session.quick_look import fit_of
 from rigd.session.touches import touch_line, touches_of
+from rigd.sweep_response import nominal_damping, sweep_ticks
 from rigd.text_table import decode_text
 from rigd.units import unit_of
 from rigd.view._layout import blueprint
@@ -24,7 +25,6 @@ from rigd.view._session_info import (
     Subject,
     linear_sweep_band_hz,
     outcome_note,
-    sweep_ticks,
 )
 from rigd.view.banner import ended
 from rigd.view.plots import AGES, FAULTY_TICKS, HEALTH, REAL_TIME_PLOT_COMPONENTS, TIMELINE
@@ -150,23 +150,6 @@ def _components_without_values(session: Session, tick_timings: Records | None) -
     if not (session.samples["lateness_ns"].any() or session.samples["work_ns"].any()):
         absent_components |= REAL_TIME_PLOT_COMPONENTS
     return frozenset(absent_components)
-
-
-def nominal_damping(profile_bytes: bytes) -> Damping | None:
-    """Return the nominal damping in a profile or specimen; None if it states no usable one.
-
-    Only the damping parameters are read, so the profile may be of any version.
-    """
-    try:
-        damping_table = parse_toml(decode_text(profile_bytes))["beam"]["damping"]
-        zeta, alpha, gamma, lambda_ = (
-            float(damping_table[key]["value"]) for key in ("zeta", "alpha", "gamma", "lambda")
-        )
-    except (KeyError, TypeError, ValueError, OverflowError):
-        return None
-    # Comparisons with NaN are false.
-    is_plausible = 0.0 <= zeta <= 1.0 and 0.0 <= alpha < 2.0 and 0.0 <= gamma < np.inf
-    return Damping(zeta, alpha, gamma, lambda_) if is_plausible and 0.0 <= lambda_ < 2.0 else None
 
 
 def draw_session(

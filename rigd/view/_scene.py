@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from rigd.gauges import Gauge, Gauges
 from rigd.spectral import RunningSpectrogram
+from rigd.sweep_response import LAST_HZ, SweepResponse
 from rigd.view import banner
 from rigd.view._antenna import Antenna
 from rigd.view._fits import fit_record, fit_source, send_table
-from rigd.view._gauges import Gauge, Gauges
 from rigd.view._layout import TIME_VIEWS, Scale, blueprint, fit_views
 from rigd.view._session_info import (
     Health,
@@ -25,25 +26,19 @@ from rigd.view._session_info import (
 )
 from rigd.view.banner import BannerState, preparing
 from rigd.view.frequency_charts import (
-    LAST_HZ,
     LastResponse,
     ResponseCharts,
     SpectrogramChart,
-    SweepResponse,
 )
-from rigd.view.plots import HEALTH, READINGS, SIGNALS, Source, send_columns
+from rigd.view.plots import HEALTH, READINGS, SIGNALS, Drawing, Source, send_columns
 
 if TYPE_CHECKING:
     import rerun.blueprint as rrb
-    from rerun import RecordingStream
 
     from rigd.view._session_info import Health, Note, Subject
 
 Records = npt.NDArray[Any]
 """Structured array of samples, timings or other records of a session, shape (n,)."""
-
-Drawing = Callable[["RecordingStream"], None]
-"""Function that sends one item to a Rerun recording."""
 
 _LEAST_BLOCK_S: Final = 0.1
 """Least duration of a block of records that is drawn at once.
@@ -88,7 +83,7 @@ class Scene:
         )
         last_hz = min(LAST_HZ, subject.rate_hz / 2)
         self._antenna = Antenna(subject)
-        self._response = SweepResponse(subject, last_hz)
+        self._response = SweepResponse(subject.sweep, subject.rate_hz, last_hz)
         self.response_charts = ResponseCharts(subject, last_response)
         self._response_is_final = False
         self._spectrogram = RunningSpectrogram(

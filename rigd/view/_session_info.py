@@ -66,7 +66,7 @@ class Subject:
     specimen
         Name of the specimen as the operator gave it.
     limits
-        Limits by the names of the gauges (`rigd.view.Gauges`), and ``missed`` in percent of all
+        Limits by the names of the gauges (`rigd.gauges.Gauges`), and ``missed`` in percent of all
         ticks. A signal that is absent has no limit.
     thermal_time_constant_s
         Time constant of the motor's rms torque.
@@ -111,23 +111,6 @@ class Subject:
             return None
         sweep_segments = {"sweep": self.sweep} | ({} if self.back is None else {"back": self.back})
         return sweep_frequency_hz(sweep_segments, self.sweep_hz, tick)
-
-
-def sweep_ticks(segments: Mapping[str, tuple[int, int]]) -> tuple[int, int]:
-    """Return the ticks (first, end) over which the frequency response of a record is estimated.
-
-    Parameters
-    ----------
-    segments
-        First tick and end (exclusive) of each segment by its name; one of them is the sweep.
-    """
-    # After its scan, the segments of a search do not sweep the band. The first of two sweeps is the
-    # same as the only sweep of other chirps.
-    return next(
-        segments[segment_name]
-        for segment_name in ("scan", "there", "sweep")
-        if segment_name in segments
-    )
 
 
 def linear_sweep_band_hz(

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
-from rigd.view._gauges import WARNING_FRACTION, Gauge
+from rigd.gauges import WARNING_FRACTION, Gauge
 from rigd.view._session_info import plain
 from rigd.view.chart import LABEL_DROP
 from rigd.view.plots import GREEN, GREY, ORANGE, RED, SKY_BLUE, TIMELINE, Color
@@ -274,7 +274,7 @@ def send_values(
     t_ns
         Time since the start of the session.
     gauges
-        Values and limits by signal name, from `rigd.view.Gauges`.
+        Values and limits by signal name, from `rigd.gauges.Gauges`.
     """
     import rerun as rr
 

@@ -1,10 +1,8 @@
-"""Charts whose horizontal axis is not time, drawn on a canvas, and decimation of their curves.
+"""Charts whose horizontal axis is not time, drawn on a canvas.
 
 Rerun plots over time only. A two-dimensional view shows a canvas of any size with a fixed aspect
 ratio. Each chart therefore has the size in points of its view in a window of 1280 × 800, and is
 scaled with the view. The size of text does not change with the scale.
-
-`CurveDecimation` reduces the points of a curve without losing its peaks.
 """
 
 from collections.abc import Sequence
@@ -515,112 +513,3 @@ def steps(first_value: float, last_value: float, most_steps: int) -> tuple[float
     )
     step_values = step_size * np.arange(first_index, last_index + 1) + 0.0  # adding turns −0 into 0
     return tuple(float(f"{step_value:.9g}") for step_value in step_values)
-
-
-# Decimation of curves
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class CurveDecimation:
-    """Decimation of a curve that retains the least and greatest value of each group of points.
-
-    Attributes
-    ----------
-    grid
-        Increasing values on the horizontal axis of the curve's points, shape (n,).
-    groups
-        Indices of the points in each group, shape (k, m). Smaller groups are padded with their
-        first index.
-    """
-
-    grid: Real
-    groups: npt.NDArray[np.intp]
-
-    @classmethod
-    def logarithmic(
-        cls, grid: Real, first_hz: float, last_hz: float, most_groups: int
-    ) -> "CurveDecimation":
-        """Return the decimation of a curve over frequency, in groups of equal frequency ratio.
-
-        Groups without points are omitted.
-
-        Parameters
-        ----------
-        grid
-            Frequencies of the points, increasing, shape (n,).
-        first_hz, last_hz
-            Lowest and highest frequency. Points outside are dropped.
-        most_groups
-            Largest number of groups.
-        """
-        group_edges = np.geomspace(first_hz, last_hz, most_groups + 1)
-        # A point at the very end belongs to the last group.
-        group_edges[-1] = np.nextafter(last_hz, np.inf)
-        group_bounds = np.unique(np.searchsorted(grid, group_edges))
-        group_starts, group_sizes = group_bounds[:-1], np.diff(group_bounds)
-        index_offsets = np.arange(group_sizes.max(initial=1))  # 1 if there is no group
-        return cls(
-            grid,
-            group_starts[:, None]
-            + np.where(index_offsets < group_sizes[:, None], index_offsets, 0),
-        )
-
-    def strips(self, curve_values: Real) -> list[Real]:
-        """Return the decimated curve as strips (p, 2) of grid value and curve value.
-
-        Each strip contains the least and the greatest value of every group. A new strip begins
-        after each gap of NaN.
-
-        Parameters
-        ----------
-        curve_values
-            Values of the curve on the grid, shape (n,); NaN if unknown.
-        """
-        group_indices, extreme_indices = self._extremes(curve_values)
-        if group_indices.size == 0:
-            return []
-        strip_starts = np.flatnonzero(np.diff(group_indices) > 1) + 1
-        return [
-            np.column_stack([self.grid[strip_indices], curve_values[strip_indices]])
-            for strip_indices in map(np.unique, np.split(extreme_indices, strip_starts))
-        ]
-
-    def extremes(self, curve_values: Real) -> npt.NDArray[np.intp]:
-        """Return the grid indices of the least and greatest value of every group, in order.
-
-        Parameters
-        ----------
-        curve_values
-            Values on the grid, shape (n,); NaN if unknown.
-        """
-        return np.unique(self._extremes(curve_values)[1])
-
-    def gaps(self, curve_values: Real) -> npt.NDArray[np.intp]:
-        """Return the grid indices of both ends of each gap between known values, in order.
-
-        Parameters
-        ----------
-        curve_values
-            Values on the grid, shape (n,); NaN if unknown.
-        """
-        group_indices, _ = self._extremes(curve_values)
-        before_gaps = np.flatnonzero(np.diff(group_indices) > 1)
-        first_indices = self.groups[group_indices[before_gaps] + 1, 0]
-        last_indices = self.groups[group_indices[before_gaps + 1] - 1].max(axis=1)
-        return np.unique(np.concatenate([first_indices, last_indices]))
-
-    def _extremes(self, curve_values: Real) -> tuple[npt.NDArray[np.intp], npt.NDArray[np.intp]]:
-        """Return the indices of groups with known values, and the grid indices of their extremes.
-
-        The extremes are the least and the greatest value, shape (groups, 2).
-        """
-        grouped_values = curve_values[self.groups]
-        is_unknown = np.isnan(grouped_values)
-        group_indices = np.flatnonzero(~is_unknown.all(axis=1))
-        grouped_values, is_unknown = grouped_values[group_indices], is_unknown[group_indices]
-        least_columns = np.where(is_unknown, np.inf, grouped_values).argmin(axis=1)
-        greatest_columns = np.where(is_unknown, -np.inf, grouped_values).argmax(axis=1)
-        extreme_columns = np.stack([least_columns, greatest_columns], axis=1)
-        return group_indices, np.take_along_axis(
-            self.groups[group_indices], extreme_columns, axis=1
-        )

@@ -2,15 +2,21 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 import numpy.typing as npt
 
-from rigd.beam import Beam, Damping, transfer
-from rigd.session.layout import Status
-from rigd.spectral import RunningEstimate, RunningResponse, segmentation_of
-from rigd.view.chart import Axis, Chart, CurveDecimation, LegendEntry, decades, steps
+from rigd.beam import Damping
+from rigd.spectral import PHASE_START_DEG, CurveDecimation, magnitude_db, phase_deg
+from rigd.sweep_response import (
+    FIRST_HZ,
+    LAST_HZ,
+    LOW_COHERENCE,
+    nominal_response,
+    response_decimation,
+)
+from rigd.view.chart import Axis, Chart, LegendEntry, decades, steps
 from rigd.view.plots import GREEN, GREY, ORANGE, PURPLE, SKY_BLUE, TIMELINE
 
 if TYPE_CHECKING:
@@ -26,79 +32,7 @@ Complex = npt.NDArray[np.complex128]
 """Array of complex numbers."""
 
 
-# Estimate
-
-_STALE_STATUS: Final = Status.ANGLE_STALE | Status.WRENCH_STALE
-"""Status bits of a sample whose angle or wrench repeats an earlier reading."""
-
-
-class SweepResponse:
-    """Running estimate of the frequency response torque over motor angle in a sweep.
-
-    It is computed by Welch's method.
-
-    The segments are the default ones of `analyze`.
-
-    Parameters
-    ----------
-    subject
-        The session.
-    last_hz
-        Highest frequency of the estimated response.
-    resolution_divisor
-        Divisor of the FFT length that `analyze` uses. The FFT is never shorter than a segment.
-    """
-
-    def __init__(self, subject: "Subject", last_hz: float, *, resolution_divisor: int = 1) -> None:
-        self._first, end_tick = subject.sweep
-        sweep_sample_count = end_tick - self._first
-        segmentation = segmentation_of(sweep_sample_count, subject.rate_hz)
-        segmentation = replace(
-            segmentation,
-            nfft=max(segmentation.nfft // resolution_divisor, segmentation.segment_length),
-        )
-        self._running = RunningResponse(
-            subject.rate_hz, sweep_sample_count, last_hz=last_hz, segmentation=segmentation
-        )
-        self._at_rest: list[npt.NDArray[np.float64]] = []
-        self._rest_rad: float | None = None
-
-    def feed(self, samples: npt.NDArray[Any]) -> None:
-        """Add samples (n,) of ``SAMPLE_DTYPE`` to the estimate.
-
-        The samples are in order. Gaps are allowed.
-        """
-        sweep_ticks = samples["tick"].astype(np.int64) - self._first
-        samples_before_sweep = int(np.searchsorted(sweep_ticks, 0))
-        if samples_before_sweep:
-            self._at_rest.append(samples["angle_rad"][:samples_before_sweep].copy())
-        if samples_before_sweep == len(samples):
-            return
-        # A constant angle causes no torque of the beam, but would leak into the lowest bins.
-        if self._rest_rad is None:
-            self._rest_rad = float(np.median(np.concatenate(self._at_rest or [np.zeros(1)])))
-            self._at_rest = []
-        sweep_samples = samples[samples_before_sweep:]
-        # A stale reading is not a measurement: its gap is filled like any other.
-        fresh_or_nan = np.where(sweep_samples["status"] & _STALE_STATUS, np.nan, 1.0)
-        self._running.feed(
-            sweep_ticks[samples_before_sweep:],
-            sweep_samples["angle_reference_rad"] - self._rest_rad,
-            (sweep_samples["angle_rad"] - self._rest_rad) * fresh_or_nan,
-            sweep_samples["coupling_torque_nm"],
-        )
-
-    def estimate(self) -> RunningEstimate | None:
-        """Return the response estimated so far; None while there are too few samples."""
-        return self._running.estimate()
-
-
 # Frequency response
-
-FIRST_HZ: Final = 0.5
-"""Lowest frequency shown. Below it the torque is lower than the sensor's noise."""
-LAST_HZ: Final = 60.0
-"""Highest frequency shown: above the third mode and the band of the reference paper's chirp."""
 
 OVERVIEW_MAGNITUDE_ENTITY: Final = "/overview/magnitude"
 """Entity path in Rerun of the magnitude's chart in the tab Overview."""
@@ -129,11 +63,6 @@ COHERENCE_ENTRY: Final = LegendEntry("coherence", GREEN)
 NOT_ESTIMATED_ENTRY: Final = LegendEntry("not estimated", GREY, is_area=True)
 """Legend entry of the frequency bands that the reference has not excited so far."""
 
-LOW_COHERENCE: Final = 0.8
-"""Coherence below which a response is drawn grey.
-
-The random error of its magnitude is then above 0.35/√n, with n averages (J. S. Bendat and A. G.
-Piersol, Random Data, 4th ed., Table 9.6)."""
 NO_COHERENCE_YET: Final = "Coherence begins with the second segment"
 """Text in the coherence chart before the second segment, which the coherence needs."""
 NO_COHERENCE: Final = "Of a single segment there is no coherence"
@@ -143,16 +72,10 @@ _MOST_WIDTH_FOR_FOUR_ENTRIES: Final = 700.0
 """Width in points above which a chart's legend has room for a fifth entry."""
 _SHADE_NAMES: Final = ("not_estimated_below", "not_estimated_above")
 """Names of the shaded areas over the bands that are not estimated."""
-_FREQUENCY_GROUPS: Final = 200
-"""Number of groups of points along the frequency axis, each drawn as two points.
-
-This is enough for the pixels of a view."""
-_PHASE_AXIS_START_DEG: Final = -90.0
-"""Start of the phase axis in degrees, such that phases near 0 and 180 degrees do not wrap."""
 PHASE_AXIS: Final = Axis(
     "Phase (degrees)",
-    _PHASE_AXIS_START_DEG,
-    _PHASE_AXIS_START_DEG + 360.0,
+    PHASE_START_DEG,
+    PHASE_START_DEG + 360.0,
     (-90.0, 0.0, 90.0, 180.0, 270.0),
 )
 """Vertical axis of the phase."""
@@ -160,8 +83,6 @@ COHERENCE_AXIS: Final = Axis("Coherence (1)", 0.0, 1.0, (0.0, 0.2, 0.4, 0.6, 0.8
 """Vertical axis of the coherence."""
 _MAGNITUDE_TICK_STEP_DB: Final = 20.0
 """Distance between ticks of a magnitude axis, in dB."""
-_MODEL_STEP_HZ: Final = 0.01
-"""Distance between the frequencies of the nominal model's response."""
 _ASSUMED_DAMPING: Final = Damping(zeta=3e-4)
 """Damping from which the magnitude axis is computed if the beam's damping is unknown."""
 _MOST_MAGNITUDE_RANGE_DB: Final = 140.0
@@ -402,27 +323,6 @@ def _last_response_curves(
     }
 
 
-def magnitude_db(response: Complex) -> Real:
-    """Return the magnitude of complex responses, in dB re 1 N·m/rad."""
-    with np.errstate(divide="ignore"):
-        level_db: Real = 20.0 * np.log10(np.abs(response))
-    return level_db
-
-
-def phase_deg(response: Complex) -> Real:
-    """Return the phase of complex responses in degrees, from −90 to below 270.
-
-    Examples
-    --------
-    >>> import numpy as np
-    >>> from rigd.view.frequency_charts import phase_deg
-    >>> print(phase_deg(np.array([1.0, 1j, -1.0, -1j])))
-    [  0.  90. 180. -90.]
-    """
-    phase_from_start: Real = np.mod(np.degrees(np.angle(response)) - _PHASE_AXIS_START_DEG, 360.0)
-    return phase_from_start + _PHASE_AXIS_START_DEG
-
-
 def _magnitude_db(response: "FrequencyResponse") -> Real:
     """Return the magnitude of an estimated response, in dB re 1 N·m/rad."""
     return magnitude_db(response.response)
@@ -438,40 +338,6 @@ def _coherence(response: "FrequencyResponse") -> Real:
     if response.coherence is None:
         return np.full(response.frequency_hz.shape, np.nan)
     return response.coherence
-
-
-def nominal_response(
-    beam: Beam, damping: Damping, tool_inertia_kg_m2: float
-) -> tuple[Real, Complex]:
-    """Return the nominal response torque over angle at the sensor, in the band that is shown.
-
-    Parameters
-    ----------
-    beam, damping
-        Model of the specimen and its damping.
-    tool_inertia_kg_m2
-        Inertia between the sensor and the beam, about the motor's axis.
-
-    Returns
-    -------
-    tuple of two arrays (n,)
-        Frequencies in Hz; torque over angle in N·m/rad, complex.
-    """
-    frequency_hz = np.arange(FIRST_HZ, LAST_HZ, _MODEL_STEP_HZ)
-    s = 2j * np.pi * frequency_hz
-    return frequency_hz, transfer(s, beam, damping) + tool_inertia_kg_m2 * s * s
-
-
-def response_decimation(frequency_hz: Real) -> CurveDecimation:
-    """Return the decimation of curves over frequency for the charts.
-
-    Parameters
-    ----------
-    frequency_hz
-        Increasing frequencies of the curves' points, shape (n,). Points outside the band of the
-        charts are dropped.
-    """
-    return CurveDecimation.logarithmic(frequency_hz, FIRST_HZ, LAST_HZ, _FREQUENCY_GROUPS)
 
 
 def magnitude_axis(lowest_db: float, highest_db: float) -> Axis:

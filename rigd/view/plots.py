@@ -32,6 +32,10 @@ GREY: Color = (130, 130, 130)
 """Colour of frames, grids, tick labels, and curves of minor interest."""
 
 
+Drawing = Callable[["RecordingStream"], None]
+"""Function that sends one item to a Rerun recording."""
+
+
 # Plots over time
 
 Records = npt.NDArray[Any]

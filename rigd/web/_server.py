@@ -22,8 +22,8 @@ from rigd.excitation import KINDS, RIG_ARGUMENTS
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
+from rigd.sweep_response import sweep_ticks
 from rigd.units import UNITS, unit_of
-from rigd.view import Subject, sweep_ticks
 from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_object, refusal_response
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
@@ -244,24 +244,16 @@ class OperatorPageServer:
 
     def _prepare_session(self, session_path: str, session_series: Document) -> None:
         """Prepare the frequency responses that the pages show during a new session."""
-        session_plan, rate_hz = session_series["plan"], self._job["rate_hz"]
+        session_plan = session_series["plan"]
         self._nominal_response = self._nominal_message(session_plan)
-        sweep_begin, sweep_end = sweep_ticks(session_plan["segments"])
         self._shown = self._last_response = None
         self._response = None
         if session_series["excitation"] != "hold":
             self._response = SessionResponse(
-                Subject(
-                    Path(session_path).stem,
-                    rate_hz,
-                    round(session_plan["record_s"] * rate_hz),
-                    (sweep_begin, sweep_end),
-                    Beam(**session_plan["beam"]),
-                    Damping(**session_plan["damping"]),
-                    self._job["tool_inertia_kg_m2"],
-                    self._job["angle_delay_s"],
-                    self._job["torque_delay_s"],
-                )
+                sweep_ticks(session_plan["segments"]),
+                self._job["rate_hz"],
+                angle_delay_s=self._job["angle_delay_s"],
+                torque_delay_s=self._job["torque_delay_s"],
             )
         self.pages.send(self._nominal_response)  # the pages then clear the other responses
         specimen_name = str(session_series["notes"].get("specimen", ""))

@@ -13,9 +13,8 @@ import numpy as np
 import numpy.typing as npt
 
 from rigd.beam import Beam, Damping
-from rigd.view import Subject
-from rigd.view.chart import CurveDecimation
-from rigd.view.frequency_charts import LAST_HZ, SweepResponse, nominal_response, response_decimation
+from rigd.spectral import CurveDecimation
+from rigd.sweep_response import LAST_HZ, SweepResponse, nominal_response, response_decimation
 
 Document = dict[str, Any]
 Real = npt.NDArray[np.float64]
@@ -161,13 +160,24 @@ class SessionResponse:
 
     Parameters
     ----------
-    subject
-        Data of the session.
+    sweep
+        First tick and end (exclusive) of the sweep.
+    rate_hz
+        Scheduled ticks per second.
+    angle_delay_s, torque_delay_s
+        Age of the angle or torque at its time stamp.
     """
 
-    def __init__(self, subject: Subject) -> None:
-        self._subject = subject
-        self._sweep = SweepResponse(subject, LAST_HZ, resolution_divisor=_BIN_STEP)
+    def __init__(
+        self,
+        sweep: tuple[int, int],
+        rate_hz: float,
+        *,
+        angle_delay_s: float = 0.0,
+        torque_delay_s: float = 0.0,
+    ) -> None:
+        self._delays_s = {"input_delay_s": angle_delay_s, "output_delay_s": torque_delay_s}
+        self._sweep = SweepResponse(sweep, rate_hz, LAST_HZ, resolution_divisor=_BIN_STEP)
         self._thinning: CurveDecimation | None = None
         self._queued_blocks: list[PageSignalBlock] = []
         self._has_new_data = False
@@ -213,9 +223,7 @@ class SessionResponse:
         if sweep_estimate.final and reached_hz < self._reached_hz:
             return None  # the last complete segment ends before the sweep
         self._reached_hz = reached_hz
-        response = sweep_estimate.response.without_delays(
-            input_delay_s=self._subject.angle_delay_s, output_delay_s=self._subject.torque_delay_s
-        )
+        response = sweep_estimate.response.without_delays(**self._delays_s)
         grid_hz = response.frequency_hz
         if self._thinning is None:
             self._thinning = response_decimation(grid_hz)

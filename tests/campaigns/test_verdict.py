@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import Heterogeneity, Homogeneity, sentences
-from analysis.campaigns._orders import freest_estimate, pooled_order
-from analysis.campaigns.pooling import pool_estimates
+from analysis.campaigns._orders import pooled_order
+from analysis.campaigns.pooling import freest_estimate, pool_estimates
 from analysis.identify import Finding
 from analysis.statistics import student_t_quantile
 

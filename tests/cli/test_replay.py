@@ -26,7 +26,7 @@ from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.session import SessionError, SessionWriter, read_session, read_timings
 from rigd.session.layout import SAMPLE_SIZE, TIMING_SIZE, Status, pack_sample_into, pack_timing_into
-from rigd.view import draw_session, nominal_damping
+from rigd.view import draw_session
 from rigd.view._recorded import subject_of_session
 from rigd.view.frequency_charts import MAGNITUDE_ENTITY, ResponseCharts
 from rigd.view.plots import GREEN, GREY, ORANGE, SKY_BLUE
@@ -342,41 +342,6 @@ def test_a_session_that_was_stopped_ends_with_the_reason(write, saved):
     # As it was live: of what was planned, this much had come.
     *_, (_, (state,)) = rows(found["/summary"], "TextDocument:text")
     assert "1 of 20 s" in state
-
-
-@pytest.mark.parametrize(
-    ("profile", "known"),
-    [
-        (b"[beam.damping]\n" + b"".join(
-            b"%s = { value = %s, source = 'paper' }\n" % pair for pair in
-            ((b"zeta", b"7.1e-5"), (b"alpha", b"0.996"), (b"gamma", b"5.5e-2"), (b"lambda", b"0.6"))
-        ), True),
-        (b"", False),
-        (b"[beam.damping]\nzeta = { value = 1e-5, source = 'paper' }\n", False),
-        (b"[beam.damping]\nzeta = 3\nalpha = 1\ngamma = 0\nlambda = 1\n", False),
-        (b"\xff\xfe", False),
-        (b"beam = 3", False),
-        (b"= no toml", False),
-        (b"[beam.damping]\n" + b"".join(
-            b"%s = { value = %s }\n" % pair for pair in
-            ((b"zeta", b"nan"), (b"alpha", b"1"), (b"gamma", b"0"), (b"lambda", b"1"))
-        ), False),
-        (b"[beam.damping]\n" + b"".join(
-            b"%s = { value = %s }\n" % pair for pair in
-            ((b"zeta", b"1e-5"), (b"alpha", b"1"), (b"gamma", b"inf"), (b"lambda", b"1"))
-        ), False),
-        (b"[beam.damping]\n" + b"".join(
-            b"%s = { value = %s }\n" % pair for pair in
-            ((b"zeta", b"1e-5"), (b"alpha", b"1"), (b"gamma", b"0"), (b"lambda", b"2"))
-        ), False),
-    ],
-)  # fmt: skip
-def test_the_nominal_damping_is_the_profile_s_if_it_states_one_that_can_be(profile, known):
-    damping = nominal_damping(profile)
-    assert (damping is not None) == known
-    if known:
-        assert (damping.zeta, damping.alpha) == (7.1e-5, 0.996)
-        assert (damping.gamma, damping.lambda_) == (5.5e-2, 0.6)
 
 
 def test_wrong_use_is_told(rigd_here, short, tmp_path):

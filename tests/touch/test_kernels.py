@@ -10,7 +10,6 @@ from rigd.beam import Damping, PointForceGrid, clamped_free_eigenvalues, mode_sh
 from rigd.touch import SensorFilter
 from rigd.touch._kernels import (
     ForcePulse,
-    LaplaceLine,
     chebyshev_nodes,
     contact_kernels,
     cross_kernels,
@@ -62,7 +61,7 @@ def test_kernels_between_places_are_those_of_the_exact_model():
     crossing = cross_kernels(LINK, DAMPED, positions(LINK.length_m, 0.007), 2 * STEP_S, 400)
     told = crossing.between_positions(x, other, 300)
     hat = ForcePulse(2 * STEP_S, 400)
-    exact = hat.kernels(PointForceGrid(hat.line.s, LINK, DAMPED).per_force(x, other).T)
+    exact = hat.kernels(PointForceGrid(hat.transform.s, LINK, DAMPED).per_force(x, other).T)
     assert told == pytest.approx(exact[:, :300], abs=1e-3 * np.abs(exact).max())
     assert crossing.between_positions(other, x, 300) == pytest.approx(told)
 
@@ -90,13 +89,6 @@ def test_wider_hats_are_sums_of_narrow_ones(at_point):
     for name in ("displacement", "torque", "shear"):
         exact = getattr(wide, name)
         assert np.abs(getattr(summed, name) - exact).max() < 2e-4 * np.abs(exact).max()
-
-
-def test_a_line_gives_back_what_it_was_given():
-    line = LaplaceLine(4096, 1e-3)
-    t = np.arange(1000) * 1e-3
-    wave = np.exp(-((t - 0.5) ** 2) / 2e-3)
-    assert line.to_time(line.to_laplace(wave), 1000) == pytest.approx(wave, abs=1e-6)
 
 
 def test_cubic_interpolation_is_exact_for_cubics():

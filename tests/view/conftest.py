@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping
-from rigd.session.layout import SAMPLE_DTYPE, TIMING_SIZE, decode_timings, pack_timing_into
+from rigd.session.layout import TIMING_SIZE, decode_timings, pack_timing_into
 from rigd.view import Scene, Subject
 from rigd.view.plots import TIMELINE
 
@@ -144,18 +144,3 @@ def subject():
         beam=Beam(0.98, 4.7e-3, 0.090275),
         damping=Damping(7.1e-5, 0.996, 5.5e-2, 0.594),
     )
-
-
-@pytest.fixture
-def make_samples():
-    """Make samples (n,) at 1 kHz from a tick on, at rest but for the fields given."""
-
-    def make(n: int, first_tick: int = 0, **fields) -> np.ndarray:
-        samples = np.zeros(n, SAMPLE_DTYPE)
-        samples["tick"] = np.arange(first_tick, first_tick + n)
-        samples["t_ns"] = samples["tick"].astype(np.int64) * 1_000_000
-        for name, values in fields.items():
-            samples[name] = values
-        return samples
-
-    return make

@@ -4,7 +4,9 @@ from dataclasses import replace
 
 import pytest
 
-from rigd.view import Gauge, Health, Note, Scene, sweep_ticks
+from rigd.gauges import Gauge
+from rigd.sweep_response import sweep_ticks
+from rigd.view import Health, Note, Scene
 from rigd.view.banner import (
     GAUGES_ENTITY,
     RUNNING,

@@ -9,14 +9,13 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.models import PAPER_BAND_HZ, WelchSettings
+from analysis.models import WelchSettings
 from analysis.paper import estimate
 from analysis.record import load_record
 from rigd.beam import Damping
 from rigd.session import read_session
-from rigd.session.layout import Status
 from rigd.view import Health, Note, Scene, Subject, draw_session
-from rigd.view.frequency_charts import MAGNITUDE_ENTITY, SweepResponse
+from rigd.view.frequency_charts import MAGNITUDE_ENTITY
 
 pytestmark = pytest.mark.process
 
@@ -49,44 +48,6 @@ def subject_of(record) -> Subject:
 
 def blocks(samples, size=50):
     return (samples[i : i + size] for i in range(0, len(samples), size))
-
-
-def final_response(record, samples):
-    response = SweepResponse(subject_of(record), last_hz=60.0)
-    for block in blocks(samples):
-        response.feed(block)
-    found = response.estimate()
-    assert found.final
-    return found.response.band(*PAPER_BAND_HZ)
-
-
-def test_final_response_is_that_of_the_analyser(path, record):
-    found = final_response(record, read_session(path).samples)
-    expected, _ = estimate(record, WelchSettings())
-    assert found.frequency_hz == pytest.approx(expected.frequency_hz)
-    assert np.all(abs(found.response - expected.response) < 1e-6 * abs(expected.response))
-    assert found.coherence == pytest.approx(expected.coherence, abs=1e-6)
-
-
-def test_missing_and_held_values_are_made_up_for_as_the_analyser_does(path, record):
-    samples = read_session(path).samples.copy()
-    faulty = np.random.default_rng(1).choice(np.arange(2000, 120_000), 300, replace=False)
-    held, missing = faulty[:200], faulty[200:]
-    samples["status"][held] |= np.uint32(Status.WRENCH_STALE)
-    samples["coupling_torque_nm"][held] = 0.3
-    every = np.arange(len(samples))
-    known = np.setdiff1d(every, faulty)
-    present = np.setdiff1d(every, missing)
-    record = replace(
-        record,
-        torque_nm=np.interp(every, known, samples["coupling_torque_nm"][known]),
-        angle_rad=np.interp(every, present, samples["angle_rad"][present]),
-    )
-    found = final_response(record, samples[present])
-    expected, _ = estimate(record, WelchSettings())
-    error = abs(found.response - expected.response)
-    # The angle of a tick whose torque was held is not used either: that is all the difference.
-    assert np.quantile(error / abs(expected.response), 0.99) < 0.01
 
 
 @pytest.mark.further  # charts: test_response_charts.py

@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from rigd.beam import Beam, Damping, transfer
-from rigd.view import Subject
 from rigd.web._signals import PageSignalBlock, SessionResponse, SignalEnvelopes, nominal_document
 
 RATE_HZ = 1000.0
@@ -83,13 +82,13 @@ def sweep():
     return angle, torque, known
 
 
-def subject(ticks):
-    return Subject("s", RATE_HZ, ticks + 1000, (1000, 1000 + ticks), BEAM, Damping(zeta=2e-3))
+def of_sweep(ticks):
+    return SessionResponse((1000, 1000 + ticks), RATE_HZ)
 
 
 def test_the_response_is_that_of_the_record(sweep):
     angle, torque, known = sweep
-    growing = SessionResponse(subject(angle.size))
+    growing = of_sweep(angle.size)
     assert growing.document() is None
     growing.feed(block(0, np.zeros(1000)))
     reached = []
@@ -119,7 +118,7 @@ def test_no_line_is_drawn_across_what_was_not_excited():
             for first, last in ((2.0, 4.0), (12.0, 16.0))
         ]
     )
-    growing = SessionResponse(subject(angle.size))
+    growing = of_sweep(angle.size)
     growing.feed(block(0, np.zeros(1000)))
     growing.feed(block(1000, angle, torque=3 * angle))
     told = growing.document()

@@ -1,6 +1,6 @@
 """CAN bus for the drivers: frames, ports to send and receive frames, and the cyclic exchange.
 
-A port (`port.open_port`) sends and receives frames in the layout of the kernel's ``struct
+A port (`adapters.open_port`) sends and receives frames in the layout of the kernel's ``struct
 can_frame`` without blocking. It is a CAN socket if the kernel has CAN sockets, a Unix socket with
 the same 16 bytes for the bus of ``rigd simulate``, and python-can for every other adapter. The
 drivers see no difference: `CanExchange` routes frames to them, `ReplyPairing` assigns replies to

@@ -16,13 +16,13 @@ from contextlib import contextmanager
 from typing import Protocol
 
 from rigd.devices.canbus._budget import FRAME_BITS
+from rigd.devices.canbus.adapters import open_port
 from rigd.devices.canbus.port import (
     BUS_OFF,
     ERROR_FLAG,
     ERROR_MASK,
     LENGTH_OFFSET,
     CanPort,
-    open_port,
     unpack_header,
 )
 from rigd.devices.contracts import DeviceError

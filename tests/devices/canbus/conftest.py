@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import pytest
 
-from rigd.devices.canbus.port import SocketPort
+from rigd.devices.canbus.adapters import SocketPort
 
 
 @dataclass

@@ -11,7 +11,8 @@ import can
 import pytest
 
 from rigd.devices.canbus import CanExchange
-from rigd.devices.canbus.port import SocketPort, open_port, pack_frame, unpack_frame
+from rigd.devices.canbus.adapters import SocketPort, open_port
+from rigd.devices.canbus.port import pack_frame, unpack_frame
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.running_simulator import SimulatorAddress

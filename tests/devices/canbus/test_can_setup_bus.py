@@ -7,7 +7,8 @@ import canopen
 import pytest
 from canopen.objectdictionary import ODVariable, datatypes
 
-from rigd.devices.canbus.port import SocketPort, pack_frame, unpack_frame
+from rigd.devices.canbus.adapters import SocketPort
+from rigd.devices.canbus.port import pack_frame, unpack_frame
 
 NODE = 5
 

@@ -11,7 +11,7 @@ import canopen
 import pytest
 
 import rigd.devices.cia402 as package
-from rigd.devices.canbus.port import SocketPort
+from rigd.devices.canbus.adapters import SocketPort
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError
 

@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
+from rigd.gauges import Gauge, Gauges
 from rigd.session.layout import Status
-from rigd.view import Gauge, Gauges
 
 
 def test_peaks_stand_beside_their_limits_with_units(make_samples):

@@ -1,11 +1,11 @@
-"""A thinned curve keeps every peak, each where it is."""
+"""Curves of a response: a decimated curve keeps every peak, each where it is; phases."""
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.view.chart import CurveDecimation
+from rigd.spectral import CurveDecimation, phase_deg
 
 GRID = np.arange(9601) / 160.0
 
@@ -67,3 +67,9 @@ def test_of_a_curve_outside_the_band_nothing_is_left(grid):
     thinning = CurveDecimation.logarithmic(grid, 0.5, 60.0, 200)
     assert thinning.extremes(np.ones(grid.size)).size == 0
     assert thinning.strips(np.ones(grid.size)) == []
+
+
+def test_phases_about_zero_and_half_a_turn_do_not_jump():
+    noise = np.exp(1j * np.radians([-10.0, 0.0, 10.0]))
+    assert phase_deg(noise) == pytest.approx([-10.0, 0.0, 10.0])
+    assert phase_deg(-noise) == pytest.approx([170.0, 180.0, 190.0])
