@@ -119,7 +119,7 @@ class OnlineEstimate:
         identifiable (so that it may be a stiffness or an inertia), has order 1.
         """
         from analysis.identify import ORDER_ONE_STRUCTURE
-        from analysis.models import COEFFICIENT_OF
+        from rigd.beam import COEFFICIENT_OF
 
         headline, analysis = self.headline, self.analysis
         if headline is None or analysis is None:

@@ -194,7 +194,7 @@ class WholeRecord:
 
         The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
         """
-        from analysis.identify import LOGARITHMIC_PARAMETERS
+        from rigd.beam import LOGARITHMIC_PARAMETERS
 
         return {
             "names": [

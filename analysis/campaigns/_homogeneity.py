@@ -19,8 +19,8 @@ import numpy as np
 
 from analysis.campaigns._orders import common_structure, freest_estimate
 from analysis.campaigns.pooling import random_effects
-from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.statistics import chi_square_p_value
+from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

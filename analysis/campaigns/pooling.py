@@ -20,11 +20,11 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC_PARAMETERS, SETTINGS, Plant, damping_size
+from analysis.identify import SETTINGS, Plant, damping_size
 from analysis.identify.headline import ReportedLossFactor, ReportedValue
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
-from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam import LOGARITHMIC_PARAMETERS, Beam, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

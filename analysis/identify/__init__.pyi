@@ -32,7 +32,6 @@ from ._modal_model import BACKGROUND_COEFFICIENTS as BACKGROUND_COEFFICIENTS
 from ._modal_model import MODE_CONSTANT_NAMES as MODE_CONSTANT_NAMES
 from ._modal_model import ModalEstimate as ModalEstimate
 from ._modal_model import ModalModel as ModalModel
-from ._plant import LOGARITHMIC_PARAMETERS as LOGARITHMIC_PARAMETERS
 from ._plant import SETTINGS as SETTINGS
 from ._plant import Plant as Plant
 from ._plant import Setting as Setting

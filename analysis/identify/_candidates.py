@@ -23,7 +23,8 @@ from analysis.identify._refit import (
 from analysis.identify._search import MAX_ANGLE_REESTIMATES
 from analysis.identify.parametrization import Unknowns
 from analysis.identify.residual_tests import whiteness
-from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+from analysis.models import STRUCTURES
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -465,7 +466,9 @@ class CandidateSet:
         }
         fixed_values[order] = 1.0  # type: ignore[index]
         free_names = tuple(
-            parameter_name for parameter_name in PARAMETERS if parameter_name not in fixed_values
+            parameter_name
+            for parameter_name in DAMPING_PARAMETERS
+            if parameter_name not in fixed_values
         )
         both_dampings = replace(structure, free=free_names, fixed=fixed_values)
         unknowns = self.unknowns(both_dampings)

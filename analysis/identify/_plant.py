@@ -45,12 +45,6 @@ OPTIONAL_PARAMETERS: Final = (
 """Parameters of a rig with a compliant clamp, a mass at the tip or filters in the torque channel; 0
 if it has none."""
 
-BEAM_PARAMETERS: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-"""Parameters of the beam other than its damping."""
-
-LOGARITHMIC_PARAMETERS: Final = frozenset({"zeta", "gamma", *BEAM_PARAMETERS})
-"""Parameters that are positive and uncertain by a factor, so their logarithm is estimated."""
-
 
 @dataclass(frozen=True, slots=True)
 class Plant:

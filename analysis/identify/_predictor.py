@@ -25,7 +25,12 @@ import numpy as np
 from analysis.identify._data import fast_length
 from analysis.identify._modal_model import ModalModel
 from analysis.identify._plant import Plant
-from rigd.beam import PARAMETERS, TransferGrid, clamped_free_eigenvalues, differentiated_response
+from rigd.beam import (
+    GRADIENT_NAMES,
+    TransferGrid,
+    clamped_free_eigenvalues,
+    differentiated_response,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -127,7 +132,7 @@ class ResponseGrid:
         plant : Plant
             Plant whose torque is computed.
         wrt : sequence of str
-            Names of k parameters from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2".
+            Names of k parameters: `rigd.beam.GRADIENT_NAMES`, "delay_s", "tool_inertia_kg_m2".
             The torque is differentiated with respect to each while all others are constant.
         angle_transform : ndarray of complex, shape (n,), or float
             Transform of the angle.
@@ -165,7 +170,7 @@ class ResponseGrid:
         G is the torque over the motor angle, in N·m/rad. The derivatives are those by the
         parameters in `wrt` on which G depends.
         """
-        beam_names = [parameter_name for parameter_name in wrt if parameter_name in PARAMETERS]
+        beam_names = [parameter_name for parameter_name in wrt if parameter_name in GRADIENT_NAMES]
         if plant.tip_mass_kg or plant.stiffness_offsets:
             loaded_response, derivatives = differentiated_response(
                 self._log_s,

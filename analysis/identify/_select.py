@@ -65,9 +65,9 @@ from analysis.identify.verdict import (
     order_verdict,
     rivals,
 )
-from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
+from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
-from rigd.beam import clamped_free_eigenvalues
+from rigd.beam import COEFFICIENT_OF, clamped_free_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping

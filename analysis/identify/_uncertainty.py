@@ -13,10 +13,10 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.identify._result import DampingSize, ModeEstimate, Ringing
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.statistics import NORMAL_95
+from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -49,10 +49,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import fast_length
-from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify._predictor import eigenvalues, torque_channel_response
 from analysis.identify.free_decay import mode_poles
-from rigd.beam import AIR_DENSITY_KG_PER_M3, DragGrid, poles_for_eigenvalues
+from rigd.beam import AIR_DENSITY_KG_PER_M3, BEAM_PARAMETERS, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

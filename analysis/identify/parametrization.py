@@ -34,7 +34,7 @@ import numpy as np
 
 from analysis.identify._plant import SETTINGS, Plant
 from analysis.models import ORDER_RANGE, SIZE_RANGE
-from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam import Beam, gradient_name, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -55,12 +55,6 @@ _DELAY_UNIT_S: Final = 1e-3
 
 _DELAY_RANGE_S: Final = 0.02
 """Largest magnitude of the delay in seconds."""
-
-_GRADIENT_NAMES: Final[Mapping[str, str]] = {
-    "density_over_stiffness": "ln_density_over_stiffness",
-    "bending_stiffness_n_m2": "ln_stiffness",
-}
-"""Names of parameters whose derivatives the prediction has by their logarithms."""
 
 _QUARTER_TURN_RAD: Final = math.pi / 2
 """Phase of ``s^1`` on the imaginary axis, in radians."""
@@ -124,9 +118,7 @@ class Unknowns:
 
         Beam parameters are logarithms there.
         """
-        return tuple(
-            _GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in self.names
-        )
+        return tuple(map(gradient_name, self.names))
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -18,11 +18,10 @@ import numpy as np
 
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
-from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.identify._predictor import torque_channel_response
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
-from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.beam import LOGARITHMIC_PARAMETERS, Beam, Damping, clamped_free_eigenvalues
 from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:

@@ -17,7 +17,7 @@ from analysis.linear_model._dynamics import (
     modal_dynamics,
 )
 from analysis.linear_model._modal_constants import constant_value, with_changed_constants
-from rigd.beam import Beam, Damping
+from rigd.beam import OFFSET_PREFIX, Beam, Damping, parameter_named
 from rigd.identified_beam import (
     findings_without_parameter,
     parameter_values,
@@ -37,9 +37,6 @@ _ANALYZE_AGAIN_ADVICE: Final = "analyze the session again"
 _LOGARITHM_PREFIX: Final = "ln_"
 """Prefix of the name of a parameter whose logarithm has the covariance."""
 
-_STIFFNESS_OFFSET_PREFIX: Final = "stiffness_offset_"
-"""Prefix of the name of the stiffness offset of one mode; its number follows."""
-
 _MAX_OFFSET_MODE: Final = 50
 """Largest mode number that a stiffness offset may have."""
 
@@ -53,12 +50,6 @@ _REASONS_TO_LEAVE_OUT: Final = {
 """Parameters that a linear model from motion to torque leaves out, and why. A clock rate difference
 is a parameter in documents of older versions only, as offsets of modes and the compliance of the
 clamp are."""
-_SIGNED_PREFIXES: Final = ("delay_s", _STIFFNESS_OFFSET_PREFIX)
-"""Prefixes of parameters that may be negative."""
-
-_ORDER_NAMES: Final = ("alpha", "lambda")
-"""Names of the damping orders."""
-
 _DEFAULT_BAND_HZ: Final = (0.05, 50.0)
 """Band of a document that does not state its band."""
 
@@ -455,18 +446,11 @@ def _is_finite(complex_number: complex) -> bool:
 
 def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
     """Return whether sampled parameters describe a physically possible beam."""
-    has_valid_orders = all(
-        0 <= sampled_values[parameter_name] < 2
-        for parameter_name in _ORDER_NAMES
-        if parameter_name in sampled_values
-    )
-    has_valid_signs = all(
-        parameter_value >= 0
-        or parameter_name in _REASONS_TO_LEAVE_OUT
-        or parameter_name.startswith(_SIGNED_PREFIXES)
+    return all(
+        parameter_name in _REASONS_TO_LEAVE_OUT
+        or parameter_named(parameter_name).is_valid(parameter_value)
         for parameter_name, parameter_value in sampled_values.items()
     )
-    return has_valid_orders and has_valid_signs
 
 
 def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
@@ -477,15 +461,15 @@ def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> P
     )
     last_offset_mode = max(
         (
-            int(key_name.removeprefix(_STIFFNESS_OFFSET_PREFIX))
+            int(key_name.removeprefix(OFFSET_PREFIX))
             for key_name in beam_values
-            if key_name.startswith(_STIFFNESS_OFFSET_PREFIX)
+            if key_name.startswith(OFFSET_PREFIX)
         ),
         default=1,
     )
     if last_offset_mode > _MAX_OFFSET_MODE:
         raise LinearModelError(
-            f"{_STIFFNESS_OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
+            f"{OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
             f"{_ANALYZE_AGAIN_ADVICE}."
         )
     return Plant(
@@ -497,7 +481,7 @@ def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> P
             lambda_=beam_values.get("lambda", 1.0),
         ),
         stiffness_offsets=tuple(
-            beam_values.get(f"{_STIFFNESS_OFFSET_PREFIX}{mode_number}", 0.0)
+            beam_values.get(f"{OFFSET_PREFIX}{mode_number}", 0.0)
             for mode_number in range(2, last_offset_mode + 1)
         ),
         **{

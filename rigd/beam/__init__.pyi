@@ -5,7 +5,7 @@ from ._air_drag import DragGrid as DragGrid
 from ._deflection import DeflectionFilter as DeflectionFilter
 from ._force_realisation import check_force_damping_order as check_force_damping_order
 from ._force_realisation import realise_force as realise_force
-from ._model import PARAMETERS as PARAMETERS
+from ._model import GRADIENT_NAMES as GRADIENT_NAMES
 from ._model import Beam as Beam
 from ._model import Damping as Damping
 from ._model import TransferGrid as TransferGrid
@@ -22,6 +22,18 @@ from ._modes import poles as poles
 from ._modes import poles_for_eigenvalues as poles_for_eigenvalues
 from ._modes import root_shear_ratio as root_shear_ratio
 from ._modes import undamped_frequencies_rad_s as undamped_frequencies_rad_s
+from ._parameters import BEAM_PARAMETERS as BEAM_PARAMETERS
+from ._parameters import COEFFICIENT_OF as COEFFICIENT_OF
+from ._parameters import DAMPING_PARAMETERS as DAMPING_PARAMETERS
+from ._parameters import END_PARAMETERS as END_PARAMETERS
+from ._parameters import FILTER_PARAMETERS as FILTER_PARAMETERS
+from ._parameters import LOGARITHMIC_PARAMETERS as LOGARITHMIC_PARAMETERS
+from ._parameters import OFFSET_PREFIX as OFFSET_PREFIX
+from ._parameters import PARAMETERS as PARAMETERS
+from ._parameters import DampingParameter as DampingParameter
+from ._parameters import Parameter as Parameter
+from ._parameters import gradient_name as gradient_name
+from ._parameters import parameter_named as parameter_named
 from ._point_force import PointForceGrid as PointForceGrid
 from ._tip_mass import LoadedBeam as LoadedBeam
 from ._tip_mass import differentiated_response as differentiated_response

@@ -210,7 +210,7 @@ def differentiated_response(
         Coupling torque per motor angle.
     slopes : dict of str to callable
         Functions that compute the derivative with respect to a parameter, by its name in
-        `rigd.beam.PARAMETERS` or ``tip_mass_kg``.
+        `rigd.beam.GRADIENT_NAMES` or ``tip_mass_kg``.
     """
     s_alpha = np.exp(damping.alpha * log_s).astype(np.complex128)
     s_lambda = np.exp(damping.lambda_ * log_s).astype(np.complex128)
@@ -317,7 +317,7 @@ class LoadedBeam:
         s
             Laplace variable in rad/s, not 0.
         wrt
-            Names of `rigd.beam.PARAMETERS`, ``tip_mass_kg`` and ``root_compliance_rad_per_nm``.
+            Names of `rigd.beam.GRADIENT_NAMES`, ``tip_mass_kg`` and ``root_compliance_rad_per_nm``.
 
         Returns
         -------

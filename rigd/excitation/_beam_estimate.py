@@ -9,10 +9,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import (
+    BEAM_PARAMETERS,
+    DAMPING_PARAMETERS,
+    END_PARAMETERS,
     Beam,
     Damping,
     LoadedBeam,
     clamped_free_eigenvalues,
+    gradient_name,
     pole_gradient,
     poles_for_eigenvalues,
 )
@@ -25,35 +29,17 @@ BAND_HZ: Final = 50.0
 """Upper end in Hz of the band that the whole-record fit uses."""
 
 UNIFORM_BEAM_PARAMETERS: Final = (
-    "zeta",
-    "alpha",
-    "gamma",
-    "lambda",
-    "density_over_stiffness",
-    "bending_stiffness_n_m2",
+    *DAMPING_PARAMETERS,
+    *BEAM_PARAMETERS,
     "delay_s",
     "tool_inertia_kg_m2",
 )
 """Names of the parameters in the fit of a uniform beam on a rigid clamp."""
 
-_END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
-"""Names of the parameters that describe the two ends of the beam."""
-
-PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *_END_PARAMETERS)
+PARAMETERS: Final = (*UNIFORM_BEAM_PARAMETERS, *END_PARAMETERS)
 """Names of all parameters of the fit; `LOGARITHMIC_PARAMETERS` are fitted as logarithms."""
 
-LOGARITHMIC_PARAMETERS: Final = frozenset(
-    {"zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"}
-)
-"""Names of the parameters that are fitted as logarithms."""
-
-DERIVATIVE_NAMES: Final = {
-    "density_over_stiffness": "ln_density_over_stiffness",
-    "bending_stiffness_n_m2": "ln_stiffness",
-}
-"""Name of each parameter in the derivatives of the exact model, if it differs there."""
-
-_ADDITIONAL_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2", *_END_PARAMETERS)
+_ADDITIONAL_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2", *END_PARAMETERS)
 """Names of the parameters in addition to those of beam and damping; their default value is 0."""
 
 TOLERATED_DEVIATIONS: Final = {"ln_frequency": 1.0, "ln_residue": 3.0}
@@ -291,7 +277,7 @@ class BeamEstimate:
         differs_from_uniform = (
             self.tip_mass_kg or self.root_compliance_rad_per_nm or any(self.stiffness_offsets)
         )
-        if not differs_from_uniform and set(_END_PARAMETERS).isdisjoint(self.names):
+        if not differs_from_uniform and set(END_PARAMETERS).isdisjoint(self.names):
             return None
         return self.loaded_beam
 
@@ -332,10 +318,7 @@ class BeamEstimate:
         parameter_names = [
             parameter_name for parameter_name in self.names if parameter_name in PARAMETERS
         ]
-        derivative_names = [
-            DERIVATIVE_NAMES.get(parameter_name, parameter_name)
-            for parameter_name in parameter_names
-        ]
+        derivative_names = [gradient_name(parameter_name) for parameter_name in parameter_names]
         poles_in_band = {
             mode_number: mode_pole
             for mode_number, mode_pole in enumerate(pole_pairs[:, 0].tolist(), start=1)

@@ -23,11 +23,10 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import transfer, transfer_and_gradient
+from rigd.beam import gradient_name, transfer, transfer_and_gradient
 from rigd.beam.tip import tip_response
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    DERIVATIVE_NAMES,
     MODAL_CONSTANTS,
     PARAMETERS,
     POLE_AND_RESIDUE_DERIVATIVES,
@@ -206,9 +205,7 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
     ]
     derivative_names = [
-        DERIVATIVE_NAMES.get(n, n)
-        for n in parameter_names
-        if n not in ("delay_s", "tool_inertia_kg_m2")
+        gradient_name(n) for n in parameter_names if n not in ("delay_s", "tool_inertia_kg_m2")
     ]
     loaded_beam = estimate.loaded
     g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)

@@ -8,9 +8,9 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS, LOGARITHMIC_PARAMETERS
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    LOGARITHMIC_PARAMETERS,
     BeamEstimate,
     EstimatedMode,
 )
@@ -20,7 +20,7 @@ Real = NDArray[np.float64]
 
 MODE_QUANTITIES: Final = ("damping", "frequency")
 """Names of the target quantities that belong to a mode."""
-QUANTITIES: Final = (*MODE_QUANTITIES, "zeta", "alpha", "gamma", "lambda")
+QUANTITIES: Final = (*MODE_QUANTITIES, *DAMPING_PARAMETERS)
 """Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
 and the parameters of the damping."""
 
@@ -31,8 +31,6 @@ _USELESS_STD: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5,
 sign was probably forgotten."""
 _MAX_MODE_NUMBER: Final = 20
 """Largest number of a mode in a target."""
-_COEFFICIENT_OF_ORDER: Final = {"alpha": "zeta", "lambda": "gamma"}
-"""Coefficient of the damping to which each order belongs."""
 _DAMPING_KIND: Final = {
     "zeta": "internal",
     "alpha": "internal",
@@ -277,7 +275,7 @@ def _linearise(
             return target_mode.damping_ratio, target_mode.damping_gradient, ""
         return target_mode.frequency_hz, target_mode.frequency_gradient_hz, ""
     quantity_value = estimate.values[quantity_name]
-    coefficient_name = _COEFFICIENT_OF_ORDER.get(quantity_name, quantity_name)
+    coefficient_name = COEFFICIENT_OF.get(quantity_name, quantity_name)
     if estimate.values[coefficient_name] == 0.0 or quantity_name not in estimate.names:
         impossible_reason = (
             "is absent"

@@ -9,7 +9,7 @@ from analysis.identify import SETTINGS, Plant, TorquePredictor
 from analysis.identify.free_decay import mode_poles
 from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
-from rigd.beam import PARAMETERS, Beam, Damping
+from rigd.beam import GRADIENT_NAMES, Beam, Damping
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 BARE = Plant(BEAM, Damping(7.1e-5, 0.996, 5.5e-2, 0.594), 3e-4, 1e-5)
@@ -20,7 +20,7 @@ ALL = replace(
     filter_time_constant_s=5e-4,
     second_order_filter_time_constant_s=3e-4,
 )
-WRT = (*PARAMETERS, "delay_s", "tool_inertia_kg_m2")
+WRT = (*GRADIENT_NAMES, "delay_s", "tool_inertia_kg_m2")
 STEPS = {
     "zeta": 1e-9,
     "tool_inertia_kg_m2": 1e-8,
