@@ -16,9 +16,7 @@ from rigd.beam import (
     END_PARAMETERS,
     FILTER_PARAMETERS,
     OFFSET_PREFIX,
-    Beam,
-    Damping,
-    LoadedBeam,
+    Plant,
     clamped_free_eigenvalues,
     parameter_named,
     participation,
@@ -117,37 +115,15 @@ They are located by the exact model of a uniform beam with a free tip on a rigid
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedBeam:
-    """Beam, damping and delays that an analysis has identified, with uncertainties."""
+    """Beam and torque channel that an analysis has identified, with uncertainties."""
 
-    beam: Beam
-    """Beam with the given length and the identified stiffness and density."""
-    damping: Damping
-    """Identified damping; a coefficient of 0 means that the structure has no such damping."""
-    tool_inertia_kg_m2: float | None
-    """Inertia between sensor and beam, or None if it was not identified."""
-    delay_s: float | None
-    """Delay of the torque minus that of the angle, or None if it was not identified."""
+    plant: Plant
+    """Plant with the given length and the identified parameters. A damping coefficient of 0 means
+    that the structure has no such damping."""
     std: Mapping[str, float]
     """Known standard deviations of parameters, by their names in the document."""
-    tip_mass_kg: float = 0.0
-    """Point mass at the tip of the beam."""
-    root_compliance_rad_per_nm: float = 0.0
-    """Rotational compliance of the clamp."""
-    stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
     mode_uncertainty: tuple[float, ...] = ()
     """Relative standard uncertainty of the pole of each mode in the document."""
-
-    @property
-    def loaded_beam(self) -> LoadedBeam:
-        """Identified beam with its damping, tip mass, clamp and modal stiffness offsets."""
-        return LoadedBeam(
-            self.beam,
-            self.damping,
-            self.tip_mass_kg,
-            self.root_compliance_rad_per_nm,
-            self.stiffness_offsets,
-        )
 
     def pole_uncertainty(self, mode_count: int) -> tuple[float, ...]:
         """Return the relative standard uncertainty of the poles of the first modes.
@@ -159,13 +135,13 @@ class IdentifiedBeam:
             largest uncertainty of the modes in the document.
         """
         density_uncertainty = (
-            0.5 * self.std.get(BEAM_PARAMETERS[0], 0.0) / self.beam.density_over_stiffness
+            0.5 * self.std.get(BEAM_PARAMETERS[0], 0.0) / self.plant.beam.density_over_stiffness
         )
         largest_uncertainty = max(self.mode_uncertainty, default=density_uncertainty)
         return (*self.mode_uncertainty, *(largest_uncertainty,) * mode_count)[:mode_count]
 
 
-def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
+def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
     It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
@@ -178,15 +154,16 @@ def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -
     document_path
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
-    length_m
-        Length of the beam, which is not observable in a session.
+    stated
+        Stated plant: its length, which is not observable in a session, its delay and tool inertia
+        apply if the document has none.
     use
         Purpose of the beam: `MOVE` or `TOUCH`.
 
     Returns
     -------
     IdentifiedBeam
-        Beam, damping and uncertainties.
+        Plant and uncertainties.
 
     Raises
     ------
@@ -230,24 +207,17 @@ def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -
         )
         if parameter_std is not None:
             std[parameter_name] = parameter_std
-    density_over_stiffness, stiffness_n_m2 = (
-        values_by_name[parameter_name] for parameter_name in BEAM_PARAMETERS
-    )
+    _check_offset_modes(headline_label, values_by_name)
+    plant_values = {
+        parameter_name: parameter_value
+        for parameter_name, parameter_value in values_by_name.items()
+        if (effect_key := _effect_key(parameter_name)) not in _EFFECTS or effect_key in use.effects
+    }
+    channel_values = {name: getattr(stated, name) for name in ("delay_s", "tool_inertia_kg_m2")}
     identified_beam = IdentifiedBeam(
-        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
-        damping=Damping(
-            zeta=values_by_name.get("zeta", 0.0),
-            alpha=values_by_name.get("alpha", 1.0),
-            gamma=values_by_name.get("gamma", 0.0),
-            lambda_=values_by_name.get("lambda", 1.0),
-        ),
-        tool_inertia_kg_m2=values_by_name.get("tool_inertia_kg_m2"),
-        delay_s=values_by_name.get("delay_s"),
-        std=std,
-        tip_mass_kg=values_by_name.get("tip_mass_kg", 0.0),
-        root_compliance_rad_per_nm=values_by_name.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_stiffness_offsets(headline_label, values_by_name),
-        mode_uncertainty=_mode_uncertainty(headline_label, parameter_object.get("modes")),
+        Plant.from_parameters(stated.beam.length_m, channel_values | plant_values),
+        std,
+        _mode_uncertainty(headline_label, parameter_object.get("modes")),
     )
     return (
         _with_observed_modes(headline_label, identified_beam, headline.get("modes"), refusal)
@@ -289,12 +259,10 @@ def _with_observed_modes(
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        offset_beam = identified_beam.loaded_beam.with_frequencies(
-            [hz for hz, _, _ in observed_modes]
-        )
+        plant = identified_beam.plant.with_frequencies([hz for hz, _, _ in observed_modes])
     except ValueError as error:
         raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
-    beam, mode_inertia = offset_beam.beam, observed_modes[0][2]
+    beam, mode_inertia = plant.beam, observed_modes[0][2]
     if mode_inertia and mode_inertia > 0:
         mass_scale = mode_inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
@@ -302,10 +270,8 @@ def _with_observed_modes(
             density_kg_per_m=mass_scale * beam.density_kg_per_m,
             bending_stiffness_n_m2=mass_scale * beam.bending_stiffness_n_m2,
         )
-    identified_beam = replace(
-        identified_beam, beam=beam, stiffness_offsets=offset_beam.stiffness_offsets
-    )
-    poles = identified_beam.loaded_beam.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
+        plant = replace(plant, beam=beam)
+    poles = plant.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     pole_uncertainties = (
         hypot(parameter_std, abs(damping_ratio + pole.real / abs(pole)))
@@ -313,7 +279,7 @@ def _with_observed_modes(
             identified_beam.mode_uncertainty, observed_modes, poles, strict=False
         )
     )
-    return replace(identified_beam, mode_uncertainty=tuple(pole_uncertainties))
+    return replace(identified_beam, plant=plant, mode_uncertainty=tuple(pole_uncertainties))
 
 
 def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
@@ -558,21 +524,17 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
     return std if std is not None and std > 0 else None
 
 
-def _stiffness_offsets(label: str, values_by_name: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
-    offset_by_mode = {
-        int(n[len(OFFSET_PREFIX) :]): offset_value
-        for n, offset_value in values_by_name.items()
-        if n.startswith(OFFSET_PREFIX)
-    }
-    mode_numbers = range(2, 2 + len(offset_by_mode))
-    if sorted(offset_by_mode) != list(mode_numbers):
-        given_modes = ", ".join(map(str, sorted(offset_by_mode)))
+def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None:
+    """Raise IdentifiedBeamError if the stiffness offsets are not those of modes 2, 3 etc."""
+    given_modes = sorted(
+        int(n.removeprefix(OFFSET_PREFIX)) for n in values_by_name if n.startswith(OFFSET_PREFIX)
+    )
+    if given_modes != list(range(2, 2 + len(given_modes))):
         raise IdentifiedBeamError(
-            f"{label}.parameters: {OFFSET_PREFIX}… are those of modes {given_modes}, but must be "
-            f"those of modes 2 to {mode_numbers[-1]}; {_ADVICE}."
+            f"{label}.parameters: {OFFSET_PREFIX}… are those of modes "
+            f"{', '.join(map(str, given_modes))}, but must be those of modes 2 to "
+            f"{1 + len(given_modes)}; {_ADVICE}."
         )
-    return tuple(offset_by_mode[mode_number] for mode_number in mode_numbers)
 
 
 def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:

@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Candidate, ModalEstimate, Plant, Setting
+    from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
     from analysis.paper import Peak
     from analysis.results import WholeRecord
-    from rigd.beam import Beam
+    from rigd.beam import Beam, Plant
 
 
 _INVALIDATING_FINDINGS: Final = ("sign", "unit")

@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._plant import Setting
     from analysis.identify._result import ModeEstimate
+    from analysis.identify._settings import Setting
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.headline import Headline
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness

@@ -24,11 +24,10 @@ import numpy as np
 
 from analysis.identify._modal_model import BACKGROUND_COEFFICIENTS, ModalEstimate, ModalModel
 from analysis.identify._result import Ringing
-from analysis.identify.free_decay import Pole, mode_poles
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
 from analysis.optimizer import Box, NormalEquations, RecentValues, descend
-from rigd.beam import LoadedBeam
+from rigd.beam import Pole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -36,9 +35,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
     from analysis.identify.noise import NoiseSpectrum
     from analysis.identify.residual_tests import InputRelation, Whiteness
+    from rigd.beam import Plant
 
 _RELATIVE_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
@@ -177,12 +176,9 @@ class ModalFit(ModalEstimate):
             poles_by_mode[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
         ]
         try:
-            loaded_beam = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
+            return plant.with_frequencies(frequency_hz)
         except ValueError:
             return plant
-        return replace(
-            plant, beam=loaded_beam.beam, stiffness_offsets=loaded_beam.stiffness_offsets
-        )
 
 
 def fit_modes(
@@ -549,7 +545,7 @@ class _ModalProblem:
             return change_and_derivatives
         reference_poles = {
             pole.mode: pole.at_rad_s
-            for pole in mode_poles(drag_expansion.plant, len(drag_expansion.by_pole), ())
+            for pole in drag_expansion.plant.mode_poles(len(drag_expansion.by_pole), ())
         }
         for pole in poles:
             if pole.mode in drag_expansion.by_pole and pole.mode in reference_poles:

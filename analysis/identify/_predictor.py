@@ -24,9 +24,9 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._modal_model import ModalModel
-from analysis.identify._plant import Plant
 from rigd.beam import (
     GRADIENT_NAMES,
+    Plant,
     TransferGrid,
     clamped_free_eigenvalues,
     differentiated_response,

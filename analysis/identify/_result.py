@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._modal_fit import ModalFit
-    from analysis.identify._plant import Plant
     from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 _RINGING_P_VALUE: Final = 1e-4
 """p-value of the free decay below which the beam rang when the record began."""

@@ -31,9 +31,9 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._hum import Hum
-    from analysis.identify._plant import Plant
     from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import Minimum
+    from rigd.beam import Plant
 
 
 # Resonances

@@ -79,8 +79,8 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._plant import Setting
     from analysis.identify._result import ModeEstimate, RecordFit
+    from analysis.identify._settings import Setting
     from analysis.identify._small_effects import SmallEffect
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify._time_varying import TemporalChange

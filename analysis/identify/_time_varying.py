@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
     from analysis.identify._finding import Kind
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 
 # Search for changes along the record

@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._problem import Projected
-    from analysis.identify.free_decay import Pole
     from analysis.identify.parametrization import Unknowns
+    from rigd.beam import Pole
 
 _MAX_CONDITION_NUMBER: Final = 1e13
 """Condition number of the scaled curvature from which the unknowns count as not determined."""

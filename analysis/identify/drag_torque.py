@@ -50,7 +50,6 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._predictor import eigenvalues, torque_channel_response
-from analysis.identify.free_decay import mode_poles
 from rigd.beam import AIR_DENSITY_KG_PER_M3, BEAM_PARAMETERS, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -58,13 +57,13 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
     from collections.abc import Callable
 
-    from analysis.identify.free_decay import Pole
+    from rigd.beam import Pole
 
 DRAG_MODES: Final = 5
 """Number of beam modes that the drag force can excite in the computation."""
@@ -697,7 +696,7 @@ class DragExpansion:
         """
         derivative_spectra, parameter_steps, step_slopes = [], [], []
         own_poles = {
-            pole.mode: pole.at_rad_s for pole in mode_poles(self.plant, len(self.by_pole), ())
+            pole.mode: pole.at_rad_s for pole in self.plant.mode_poles(len(self.by_pole), ())
         }
         for pole in poles:
             if pole.mode in self.by_pole and pole.oscillates and pole.mode in own_poles:

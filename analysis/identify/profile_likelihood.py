@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 
 # Profile

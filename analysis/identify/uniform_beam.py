@@ -31,8 +31,8 @@ if TYPE_CHECKING:
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._plant import Plant
     from analysis.optimizer import Minimum
+    from rigd.beam import Plant
 
 PARAMETERS: Final = (
     "zeta",

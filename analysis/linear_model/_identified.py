@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify import BACKGROUND_COEFFICIENTS, ModalModel, Plant
+from analysis.identify import BACKGROUND_COEFFICIENTS, ModalModel
 from analysis.linear_model._dynamics import (
     LinearModelError,
     UncertainDynamics,
@@ -17,7 +17,7 @@ from analysis.linear_model._dynamics import (
     modal_dynamics,
 )
 from analysis.linear_model._modal_constants import constant_value, with_changed_constants
-from rigd.beam import OFFSET_PREFIX, Beam, Damping, parameter_named
+from rigd.beam import OFFSET_PREFIX, Plant, parameter_named
 from rigd.identified_beam import (
     findings_without_parameter,
     parameter_values,
@@ -455,10 +455,6 @@ def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
 
 def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
     """Return the rig with a beam of given parameters, by name, and length in metres."""
-    density_over_stiffness, stiffness_n_m2 = (
-        beam_values["density_over_stiffness"],
-        beam_values["bending_stiffness_n_m2"],
-    )
     last_offset_mode = max(
         (
             int(key_name.removeprefix(OFFSET_PREFIX))
@@ -472,27 +468,15 @@ def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> P
             f"{OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
             f"{_ANALYZE_AGAIN_ADVICE}."
         )
-    return Plant(
-        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
-        damping=Damping(
-            zeta=beam_values.get("zeta", 0.0),
-            alpha=beam_values.get("alpha", 1.0),
-            gamma=beam_values.get("gamma", 0.0),
-            lambda_=beam_values.get("lambda", 1.0),
-        ),
-        stiffness_offsets=tuple(
-            beam_values.get(f"{OFFSET_PREFIX}{mode_number}", 0.0)
-            for mode_number in range(2, last_offset_mode + 1)
-        ),
-        **{
-            parameter_name: beam_values.get(parameter_name, 0.0)
-            for parameter_name in (
-                "delay_s",
-                "tool_inertia_kg_m2",
-                "root_compliance_rad_per_nm",
-                "tip_mass_kg",
-                "filter_time_constant_s",
-                "second_order_filter_time_constant_s",
-            )
-        },
-    )
+    plant_values = {
+        parameter_name: parameter_value
+        for parameter_name, parameter_value in beam_values.items()
+        if parameter_name not in _REASONS_TO_LEAVE_OUT
+    }
+    try:
+        return Plant.from_parameters(length_m, plant_values)
+    except ValueError:
+        raise LinearModelError(
+            "The model has a tip mass and modes of their own stiffness, which together are not "
+            "defined; export the modal model, without --beam."
+        ) from None

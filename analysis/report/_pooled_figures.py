@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import CampaignResult
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
-    from analysis.identify import ModeEstimate, Plant
+    from analysis.identify import ModeEstimate
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 _FREEST_TYPE: Final = "VI"
 """Damping structure with internal and external damping, both of free order."""

@@ -18,11 +18,12 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import ModalFit, Plant, RecordAnalysis
+    from analysis.identify import ModalFit, RecordAnalysis
     from analysis.identify.uniform_beam import TolerantEstimate
     from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord
+    from rigd.beam import Plant
 
     # Lowest and highest frequency of a band, in hertz.
     Band = tuple[float, float]

@@ -2,9 +2,10 @@
 
 Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
 modes and their poles (`modes`, `poles`), the deflection (`DeflectionFilter`), a force at a point of
-the beam (`PointForceGrid`, `realise_force`), a beam with a tip mass (`LoadedBeam`) and the air's
-drag (`DragGrid`). Its public module `realisation` has the state space that runs in real time, and
-`tip` the motion of the free end. It knows of no rig and no file.
+the beam (`PointForceGrid`, `realise_force`), the whole of beam, ends and torque channel (`Plant`)
+with the table of its parameters (`PARAMETERS`), and the air's drag (`DragGrid`). Its public module
+`realisation` has the state space that runs in real time, and `tip` the motion of the free end. It
+knows of no rig and no file.
 """
 
 import lazy_loader as lazy

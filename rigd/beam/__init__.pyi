@@ -34,6 +34,7 @@ from ._parameters import DampingParameter as DampingParameter
 from ._parameters import Parameter as Parameter
 from ._parameters import gradient_name as gradient_name
 from ._parameters import parameter_named as parameter_named
+from ._plant import Plant as Plant
+from ._plant_roots import Pole as Pole
 from ._point_force import PointForceGrid as PointForceGrid
-from ._tip_mass import LoadedBeam as LoadedBeam
 from ._tip_mass import differentiated_response as differentiated_response
