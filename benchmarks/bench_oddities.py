@@ -20,10 +20,10 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.identify import RecordFit, ResponseGrid, Selection, fit_record, select
+from analysis.identify import RecordFit, Selection, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
-from rigd.beam import Beam, Damping, Plant, modes
+from rigd.beam import Beam, Damping, Plant, ResponseGrid, modes
 from rigd.spectral import FrequencyResponse, Segmentation, segment_count
 
 DAMPING = Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=0.594)

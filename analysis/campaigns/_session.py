@@ -298,8 +298,8 @@ def _record_estimates(
     delay_s: float,
 ) -> tuple[RecordEstimate, ...]:
     """Return the fits of the requested damping structures and of the selected one."""
-    from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
+    from rigd.beam import ResponseGrid
 
     omega = 2 * np.pi * measured_response.frequency_hz
     response_grid = ResponseGrid(1j * omega)

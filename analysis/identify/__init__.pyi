@@ -32,7 +32,6 @@ from ._modal_model import BACKGROUND_COEFFICIENTS as BACKGROUND_COEFFICIENTS
 from ._modal_model import MODE_CONSTANT_NAMES as MODE_CONSTANT_NAMES
 from ._modal_model import ModalEstimate as ModalEstimate
 from ._modal_model import ModalModel as ModalModel
-from ._predictor import ResponseGrid as ResponseGrid
 from ._predictor import TorquePredictor as TorquePredictor
 from ._problem import Objective as Objective
 from ._result import DampingSize as DampingSize

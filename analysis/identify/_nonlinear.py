@@ -28,7 +28,6 @@ import numpy as np
 
 from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
 from analysis.identify._data import fast_length
-from analysis.identify._predictor import torque_channel_response
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
@@ -174,7 +173,7 @@ class NonlinearForceSpectra:
             * self._inertia_and_external
             / dynamic_stiffness
             * force_transform
-            * torque_channel_response(self._plant, self._s)
+            * self._plant.channel_response(self._s)
         )
         torque_nm = np.fft.irfft(torque_transform, self._length)[: self._samples]
         torque_nm *= self._growth[::_OVERSAMPLING]

@@ -30,12 +30,13 @@ import numpy as np
 
 from analysis.identify._data import fast_length
 from analysis.identify._finding import Finding
-from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel_response
+from analysis.identify._predictor import eigenvalues
 from analysis.identify._refit import DESCENT_EVALUATIONS, Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -394,7 +395,7 @@ def memory_torque(
     changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
     angle_transform = np.fft.rfft(
         comparison.angle_rad / time_growth, padded_length
-    ) * torque_channel_response(plant, s)
+    ) * plant.channel_response(s)
     total_torque = np.zeros(n)
 
     def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -49,7 +49,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._data import fast_length
-from analysis.identify._predictor import eigenvalues, torque_channel_response
+from analysis.identify._predictor import eigenvalues
 from rigd.beam import AIR_DENSITY_KG_PER_M3, BEAM_PARAMETERS, DragGrid, poles_for_eigenvalues
 
 if TYPE_CHECKING:
@@ -213,7 +213,7 @@ class DragResponse:
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
-        self._torque_channel = torque_channel_response(plant, s)
+        self._torque_channel = plant.channel_response(s)
         angle_transform = np.fft.rfft(angle_rad / self._growth[::_OVERSAMPLING], self._length)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
             self._inertial_response * s * angle_transform

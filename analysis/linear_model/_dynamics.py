@@ -14,8 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import ResponseGrid
-from rigd.beam import clamped_free_eigenvalues
+from rigd.beam import ResponseGrid, clamped_free_eigenvalues
 from rigd.errors import UserError
 
 if TYPE_CHECKING:

@@ -349,7 +349,7 @@ def _draw_sessions(
     grid_hz: NDArray[np.float64],
 ) -> float:
     """Draw the response of each session; return the lower limit of their magnitudes in dB."""
-    from analysis.identify import ResponseGrid
+    from rigd.beam import ResponseGrid
 
     lowest_db = np.inf
     for session in shown_sessions(campaign):

@@ -7,11 +7,10 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from analysis.identify import ResponseGrid
 from analysis.identify.uniform_beam import PARAMETERS
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
-from rigd.beam import LOGARITHMIC_PARAMETERS, gradient_name
+from rigd.beam import LOGARITHMIC_PARAMETERS, ResponseGrid, gradient_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

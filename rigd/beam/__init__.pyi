@@ -37,4 +37,4 @@ from ._parameters import parameter_named as parameter_named
 from ._plant import Plant as Plant
 from ._plant_roots import Pole as Pole
 from ._point_force import PointForceGrid as PointForceGrid
-from ._tip_mass import differentiated_response as differentiated_response
+from ._response import ResponseGrid as ResponseGrid

@@ -39,6 +39,8 @@ Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
 
 
+_BUTTERWORTH_LOSS: Final = 2**0.5
+"""Reciprocal quality factor of a second-order Butterworth filter."""
 _OWN_PARAMETERS: Final = (
     "delay_s",
     "tool_inertia_kg_m2",
@@ -301,6 +303,22 @@ class Plant:
         clamp_factor = 1 / (1 + self.root_compliance_rad_per_nm * at.response)
         gradient = np.array([by[parameter_name]() for parameter_name in wrt], dtype=np.complex128)
         return at.response * clamp_factor, gradient * clamp_factor * clamp_factor
+
+    def channel_response(self, s: ArrayLike) -> Complex:
+        """Return the dimensionless transfer function of the torque channel's delay and filters.
+
+        Parameters
+        ----------
+        s
+            Laplace variable in rad/s.
+        """
+        s = np.asarray(s, dtype=np.complex128)
+        response: Complex = np.exp(-self.delay_s * s)
+        if time_constant_s := self.filter_time_constant_s:
+            response /= 1 + time_constant_s * s
+        if time_constant_s := self.second_order_filter_time_constant_s:
+            response /= 1 + time_constant_s * (_BUTTERWORTH_LOSS * s + time_constant_s * s * s)
+        return response
 
     def pole_gradients(self, poles_rad_s: Complex, wrt: Sequence[str]) -> Complex:
         """Return the derivatives of poles with respect to parameters, shape (n, len(wrt)).

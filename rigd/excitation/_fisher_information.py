@@ -172,12 +172,12 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     Returns
     -------
     of_beam, measured, slope
-        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and delay;
+        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and channel;
         slope of the tip relative to the root, per angle.
     """
     plant = estimate.plant
     g, slope_response = plant.transfer(s), plant.tip_slope(s)
-    measured_response = (g + plant.tool_inertia_kg_m2 * s * s) * np.exp(-s * plant.delay_s)
+    measured_response = (g + plant.tool_inertia_kg_m2 * s * s) * plant.channel_response(s)
     return g, measured_response, slope_response
 
 
@@ -205,19 +205,19 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
     g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)
     if parameter_names:
         g, beam_gradient = plant.transfer_and_gradient(s, derivative_names)
-    delay_factor = np.exp(-s * plant.delay_s)
+    channel_response = plant.channel_response(s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * delay_factor
+    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
     for out, parameter_name, parameter_scale in zip(
         kernels[: len(parameter_names)], parameter_names, parameter_scales(estimate), strict=True
     ):
         if parameter_name == "delay_s":
-            out[:] = -s * (g + plant.tool_inertia_kg_m2 * s * s) * delay_factor
+            out[:] = -s * (g + plant.tool_inertia_kg_m2 * s * s) * channel_response
         elif parameter_name == "tool_inertia_kg_m2":
-            out[:] = s * s * delay_factor
+            out[:] = s * s * channel_response
         else:
-            out[:] = parameter_scale * next(gradient_rows) * delay_factor
+            out[:] = parameter_scale * next(gradient_rows) * channel_response
     kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
 

@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import MODE_CONSTANT_NAMES, ResponseGrid
-from rigd.beam import Plant
+from analysis.identify import MODE_CONSTANT_NAMES
+from rigd.beam import Plant, ResponseGrid
 
 _CIRCLE = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS = 0.2
