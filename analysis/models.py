@@ -24,12 +24,20 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TYPE_CHECKING, Final, Literal
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping, TransferGrid, undamped_frequencies_rad_s
+from rigd.beam import (
+    COEFFICIENT_OF,
+    DAMPING_PARAMETERS,
+    Beam,
+    Damping,
+    DampingParameter,
+    TransferGrid,
+    undamped_frequencies_rad_s,
+)
 from rigd.spectral import (
     PAPER_OVERLAP_FRACTION,
     PAPER_RATE_HZ,
@@ -42,36 +50,6 @@ if TYPE_CHECKING:
 
 # Structures
 
-Parameter = Literal["zeta", "alpha", "gamma", "lambda"]
-"""Name of a damping parameter."""
-PARAMETERS: Final[tuple[Parameter, ...]] = ("zeta", "alpha", "gamma", "lambda")
-"""Names of the damping parameters: coefficient and order of internal and of external damping."""
-COEFFICIENT_OF: Final[Mapping[str, Parameter]] = MappingProxyType(
-    {"alpha": "zeta", "lambda": "gamma"}
-)
-"""Coefficient of the damping whose order each parameter is."""
-
-QUANTITIES: Final[Mapping[str, tuple[str, str, str, float]]] = MappingProxyType(
-    {
-        "zeta": ("ζ", "internal damping", "1e-5 s^α", 1e5),
-        "alpha": ("α", "its order", "1", 1.0),
-        "gamma": ("γ", "external damping", "1e-2 s^λ/m⁴", 1e2),
-        "lambda": ("λ", "its order", "1", 1.0),
-        "density_over_stiffness": ("ρ/EI", "density over stiffness", "1e-3 s²/m⁴", 1e3),
-        "bending_stiffness_n_m2": ("EI", "bending stiffness", "N·m²", 1.0),
-        "delay_s": ("τ", "torque-channel delay", "µs", 1e6),
-        "tool_inertia_kg_m2": ("J", "tool inertia", "1e-6 kg·m²", 1e6),
-        "tip_mass_kg": ("m", "mass at the tip", "g", 1e3),
-        "filter_time_constant_s": ("T", "first-order filter of the torque", "ms", 1e3),
-        "second_order_filter_time_constant_s": (
-            "T", "second-order filter of the torque", "ms", 1e3,
-        ),
-        "drag": ("C_D d", "drag of the air", "mm", 1e3),
-    }
-)  # fmt: skip
-"""Symbol, meaning, display unit and display factor of each parameter of damping, beam and rig. A
-value in SI units times the factor is in the display unit."""
-
 
 @dataclass(frozen=True, slots=True)
 class Structure:
@@ -82,7 +60,7 @@ class Structure:
     name : str
         "I" to "VII".
     free : tuple of str
-        Parameters to be fitted, in the order of `PARAMETERS`.
+        Parameters to be fitted, in the order of `rigd.beam.DAMPING_PARAMETERS`.
     fixed : mapping of str to float
         Values of the other parameters. A damping that the structure lacks has coefficient and order
         0.
@@ -97,8 +75,8 @@ class Structure:
     """
 
     name: str
-    free: tuple[Parameter, ...]
-    fixed: Mapping[Parameter, float]
+    free: tuple[DampingParameter, ...]
+    fixed: Mapping[DampingParameter, float]
 
     @property
     def internal(self) -> bool:
@@ -119,7 +97,7 @@ class Structure:
         Parameters
         ----------
         parameter_name : str
-            Name of a damping parameter (`PARAMETERS`), or of a parameter of beam or rig.
+            Name of a parameter of damping, beam or rig.
         """
         if parameter_name in ("zeta", "alpha"):
             return self.internal
@@ -127,7 +105,7 @@ class Structure:
             return self.external
         return True
 
-    def damping(self, free_values: Mapping[Parameter, float]) -> Damping:
+    def damping(self, free_values: Mapping[DampingParameter, float]) -> Damping:
         """Return the damping with given free parameters, and the structure's fixed ones."""
         values_by_name = {
             **self.fixed,
@@ -141,9 +119,9 @@ class Structure:
         )
 
 
-def _structure(name: str, fixed_values: dict[Parameter, float]) -> Structure:
+def _structure(name: str, fixed_values: dict[DampingParameter, float]) -> Structure:
     """Return a damping structure with given fixed parameters; the other ones are free."""
-    free_names = tuple(p for p in PARAMETERS if p not in fixed_values)
+    free_names = tuple(p for p in DAMPING_PARAMETERS if p not in fixed_values)
     return Structure(name, free_names, MappingProxyType(fixed_values))
 
 
@@ -217,7 +195,7 @@ class FrequencyResponseModel:
         damping : Damping
             Damping at which response and derivatives are evaluated.
         wrt : sequence of str
-            Names of the k parameters, from `rigd.beam.PARAMETERS`.
+            Names of the k parameters, from `rigd.beam.GRADIENT_NAMES`.
         """
         response, gradient = self._grid.evaluate_with_gradient(self.beam, damping, wrt)
         return response + self._tool_response, gradient
@@ -497,9 +475,9 @@ class DampingUnknowns:
             [upper_bound for _, upper_bound in unknown_ranges]
         )
 
-    def parameters(self, x: NDArray[np.float64]) -> dict[Parameter, float]:
+    def parameters(self, x: NDArray[np.float64]) -> dict[DampingParameter, float]:
         """Return the four damping parameters for unknowns `x`, shape (k,)."""
-        free_unknowns: dict[Parameter, float] = dict(
+        free_unknowns: dict[DampingParameter, float] = dict(
             zip(self.structure.free, map(float, x), strict=True)
         )
         parameters = {**self.structure.fixed, **free_unknowns}

@@ -16,7 +16,7 @@ import sys
 import threading
 import time
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -30,10 +30,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import Finding, Plant, RecordAnalysis, RecordFit, Selection
+    from analysis.identify import Finding, RecordAnalysis, RecordFit, Selection
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict
     from analysis.record import Record
+    from rigd.beam import Plant
     from rigd.session.online_fit import StreamStart
 
 _NOISE_POINTS: Final = 40
@@ -119,7 +120,7 @@ class OnlineEstimate:
         identifiable (so that it may be a stiffness or an inertia), has order 1.
         """
         from analysis.identify import ORDER_ONE_STRUCTURE
-        from analysis.models import COEFFICIENT_OF
+        from rigd.beam import COEFFICIENT_OF
 
         headline, analysis = self.headline, self.analysis
         if headline is None or analysis is None:
@@ -175,7 +176,7 @@ class OnlineEstimate:
             json_content |= headline_json(None, headline, self.orders, self.findings, self.validity)
             json_content |= {
                 "predicting": fit.structure.name,
-                "plant": asdict(plant),
+                "plant": plant.as_dict(),
                 "covariance": {"names": fit.determined, "matrix": fit.covariance.tolist()},
                 "noise": _noise_spectrum(self.analysis),
             }
@@ -358,9 +359,7 @@ class OnlineEstimator:
             analysis=analysis if has_modes else None,
             warnings=record.warnings,
             problem="" if has_modes else "No mode has been excited enough yet.",
-            validity=record_validity(
-                record.metadata, record.angle_rad, record.rate_hz, (plant.beam, plant.damping)
-            ),
+            validity=record_validity(record.metadata, record.angle_rad, record.rate_hz, plant),
         )
 
 

@@ -177,8 +177,9 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             headline, findings, _ = fit_freest_alone(
                 Measurement.of_record(record), record_band_hz(record)
             )
-            model = headline.fit.plant.beam, headline.fit.plant.damping
-            validity = record_validity(record.metadata, record.angle_rad, record.rate_hz, model)
+            validity = record_validity(
+                record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
+            )
             sentences.append(
                 f"The record is long ({duration_s:.0f} s): type {headline.name} alone was fitted; "
                 "non-uniform beams, air drag, nonlinear forces and changes along the record were "

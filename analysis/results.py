@@ -11,6 +11,8 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
+from rigd.beam import Plant
+
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
@@ -21,7 +23,6 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
-    from rigd.beam import Beam, Damping
     from rigd.session import Validity
 
 _ORDER_NAMES: Final = frozenset({"alpha", "lambda"})
@@ -92,7 +93,7 @@ class WholeRecord:
 
     def __post_init__(self) -> None:
         plant = self.fit.plant
-        validity = _record_validity(self.record, (plant.beam, plant.damping))
+        validity = _record_validity(self.record, plant)
         if (beam_test := self.headline.uniform_beam) is not None:
             validity = replace(validity, uniform_beam=beam_test.summary)
         object.__setattr__(self, "validity", validity)
@@ -194,7 +195,7 @@ class WholeRecord:
 
         The prefix ``ln_`` of a name states that the covariance is that of the logarithm.
         """
-        from analysis.identify import LOGARITHMIC_PARAMETERS
+        from rigd.beam import LOGARITHMIC_PARAMETERS
 
         return {
             "names": [
@@ -251,7 +252,7 @@ class RecordResult:
             fitted_models = () if self.welch is None else self.welch.models
             fitted_dampings = [model.fit.damping for model in fitted_models]
             validity = _record_validity(
-                self.record, *((self.record.beam, damping) for damping in fitted_dampings)
+                self.record, *(Plant(self.record.beam, damping) for damping in fitted_dampings)
             )
         object.__setattr__(self, "validity", validity)
 
@@ -271,11 +272,11 @@ class RecordResult:
         return self.record.warnings if self.welch is None else self.welch.warnings
 
 
-def _record_validity(record: Record, *models: tuple[Beam, Damping]) -> Validity:
-    """Return the validity of the linear model for a record and models estimated from it."""
+def _record_validity(record: Record, *plants: Plant) -> Validity:
+    """Return the validity of the linear model for a record and plants estimated from it."""
     from analysis.validity import record_validity
 
-    return record_validity(record.metadata, record.angle_rad, record.rate_hz, *models)
+    return record_validity(record.metadata, record.angle_rad, record.rate_hz, *plants)
 
 
 def whole_record(

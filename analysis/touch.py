@@ -7,7 +7,7 @@ estimated as during a session (`rigd.touch`).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from math import inf, pi, sqrt
 from operator import itemgetter
 from typing import TYPE_CHECKING, Final
@@ -26,7 +26,7 @@ from analysis.record_checks import (
     stated_torque_filter_s,
 )
 from analysis.validity import record_validity
-from rigd.beam import Damping
+from rigd.beam import Damping, Plant
 from rigd.session import Session, SessionError, Validity, read_session, readable_texts
 from rigd.session.layout import Status
 from rigd.sweep_response import nominal_damping
@@ -251,7 +251,7 @@ class TouchAnalysis:
         warnings += _describe_doubts(touches)
         validity = record_validity(
             readable_texts(session.metadata, "keys of the metadata")[0],
-            samples["angle_rad"], rate_hz, (touch_model.beam, touch_model.damping),
+            samples["angle_rad"], rate_hz, touch_model.plant,
         )  # fmt: skip
         return TouchedSession(
             path, tuple(touches), detection_source, touch_model, rate_hz,
@@ -309,13 +309,9 @@ class TouchAnalysis:
 
     def _prepare_model(self, touch_model: TouchModel, rate_hz: float) -> _PreparedModel:
         """Return touch estimator and free motion of a beam model, computed at the first use."""
-        key = (
-            touch_model.beam, touch_model.damping, touch_model.tool_inertia_kg_m2,
-            touch_model.angle_delay_s, touch_model.torque_delay_s, touch_model.sensor_filter,
-            rate_hz,
-        )  # fmt: skip
+        key = (touch_model.plant, touch_model.angle_delay_s, touch_model.sensor_filter, rate_hz)
         if key not in self._prepared:
-            x_m = np.linspace(0.0, touch_model.beam.length_m, _ANTENNA_POINTS)
+            x_m = np.linspace(0.0, touch_model.plant.beam.length_m, _ANTENNA_POINTS)
             sample_count = round((HISTORY_S + FINAL_S) * rate_hz) + 1
             self._prepared[key] = _PreparedModel(
                 TouchEstimator(touch_model, rate_hz),
@@ -356,13 +352,16 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
     """
     ticks = session.samples["tick"]
     beam = stated_beam(session, rate_hz, int(ticks[-1]) - int(ticks[0]) + 1)
-    stated_values: dict[str, Any] = {
-        key: stated_delay_s(session, key) for key in ("angle_delay_s", "torque_delay_s")
-    }
-    stated_values["sensor_filter"] = _sensor_filter(session, rate_hz)
-    stated_values["tool_inertia_kg_m2"] = stated_tool_inertia_kg_m2(session)
+    angle_delay_s = stated_delay_s(session, "angle_delay_s")
+    stated = Plant(
+        beam,
+        Damping(),
+        delay_s=stated_delay_s(session, "torque_delay_s") - angle_delay_s,
+        tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
+    )
+    sensor_filter = _sensor_filter(session, rate_hz)
     if model_path is not None:
-        return TouchModel.from_analysis(model_path, length_m=beam.length_m, **stated_values)
+        return TouchModel.from_analysis(model_path, stated, angle_delay_s, sensor_filter)
     attached_files = (
         session.attachments.get(attachment_name, b"") for attachment_name in _DAMPING_ATTACHMENTS
     )
@@ -372,7 +371,7 @@ def _touch_model(session: Session, rate_hz: float, model_path: Path | None) -> T
             f"{session.path}: no profile.toml with [beam.damping] is attached, so the damping is "
             "not known. Identify the beam (analyze SESSION --json FILE), and give --model FILE."
         )
-    return TouchModel.assumed(beam, damping, **stated_values)
+    return TouchModel.assumed(replace(stated, damping=damping), angle_delay_s, sensor_filter)
 
 
 def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:

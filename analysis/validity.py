@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from rigd.beam import Beam, Damping
+    from rigd.beam import Plant
 
 _TIP_SLOPE_KEY: Final = "predicted_peak_tip_slope_rad"
 """Key of the predicted tip slope in the metadata."""
@@ -45,7 +45,7 @@ def record_validity(
     metadata: Mapping[str, str],
     angle_rad: NDArray[np.float64],
     rate_hz: float,
-    *models: tuple[Beam, Damping],
+    *plants: Plant,
 ) -> Validity:
     """Return the validity of the linear model for a record, as stated or from the measured angle.
 
@@ -57,8 +57,8 @@ def record_validity(
         Measured angle at consecutive ticks.
     rate_hz : float
         Ticks per second.
-    *models : tuple of Beam and Damping
-        Models estimated from the record; the largest slope among them is used. Without a model, the
+    *plants : Plant
+        Plants estimated from the record; the largest slope among them is used. Without a plant, the
         validity is unknown unless the file states it.
     """
     stated_result = stated_validity(metadata)
@@ -66,8 +66,7 @@ def record_validity(
         return stated_result
     with np.errstate(all="ignore"):  # a wrong model may overflow, and the validity is then unknown
         return combined_validity(
-            _validity_of_slope(tip_motion(beam, damping, angle_rad, rate_hz).slope_rad)
-            for beam, damping in models
+            _validity_of_slope(tip_motion(plant, angle_rad, rate_hz).slope_rad) for plant in plants
         )
 
 

@@ -12,7 +12,7 @@ from collections.abc import Callable
 import numpy as np
 from timing import least_s
 
-from rigd.beam import Beam, Damping, TransferGrid
+from rigd.beam import Beam, Damping, Plant, TransferGrid
 from rigd.beam.realisation import couple, propagator, realise
 from rigd.sim import SimulatedPlant
 
@@ -73,9 +73,9 @@ def main() -> None:
     error = np.max(np.abs(differences - exact) / np.abs(exact))
     print(f"  largest relative error of the differences {error:.0e}")
 
-    realisation = realise(BEAM, DAMPING)
+    realisation = realise(Plant(BEAM, DAMPING))
     model = couple(realisation, motor_inertia_kg_m2=2e-3, viscous_nm_s_per_rad=0.02)
-    build = best_of_ten(lambda: realise(BEAM, DAMPING))
+    build = best_of_ten(lambda: realise(Plant(BEAM, DAMPING)))
     step = best_of_ten(lambda: propagator(model, 1e-3))
     print(f"realisation, {realisation.b.size} states, error {realisation.relative_error:.1e}")
     print(f"  build                                {build:7.2f} ms")

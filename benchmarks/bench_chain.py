@@ -30,8 +30,8 @@ import numpy as np
 from bench_record_fit import LINK, NOISE_NM, PLANTS, wilson
 
 from analysis import fit, load, select
-from analysis.identify import Plant, RecordFit
-from rigd.beam import Damping
+from analysis.identify import RecordFit
+from rigd.beam import Damping, Plant
 
 SIM = Path(__file__).parent.parent / "hw_profiles" / "sim.toml"
 AT_ZERO = 1 / math.sqrt(2 * math.pi)

@@ -22,8 +22,9 @@ from bench_modes import response
 from bench_record_fit import LINK, PLANTS, RATE_HZ
 from numpy.typing import NDArray
 
-from analysis.identify import Measurement, Plant, fit_record
+from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES
+from rigd.beam import Plant
 from rigd.beam.tip import tip_motion
 from rigd.excitation import BeamEstimate, Segment, chirp, information, modes
 from rigd.excitation._beam_estimate import UNIFORM_BEAM_PARAMETERS
@@ -37,7 +38,10 @@ from rigd.runner.planning import RigPreview
 NOISE_NM = 5e-3
 DAMPING = PLANTS["VI"]
 ESTIMATE = BeamEstimate(
-    LINK, DAMPING, UNIFORM_BEAM_PARAMETERS, np.array([1.0]), np.array([2.0 * NOISE_NM**2 / RATE_HZ])
+    Plant(LINK, DAMPING),
+    UNIFORM_BEAM_PARAMETERS,
+    np.array([1.0]),
+    np.array([2.0 * NOISE_NM**2 / RATE_HZ]),
 )
 SCAN = chirp(rate_hz=RATE_HZ, start_hz=0.5, stop_hz=50.0, duration_s=5.0, rest_s=1.0, ring_down_s=0)
 
@@ -98,7 +102,7 @@ def table(rig: RigPreview, slopes_rad: list[float]) -> None:
     for name, targets in asked.items():
         for slope_rad in slopes_rad:
             reference, angle, pieces, slowest_s = designed(rig, targets, 120.0, slope_rad)
-            motion = tip_motion(LINK, DAMPING, angle, RATE_HZ)
+            motion = tip_motion(Plant(LINK, DAMPING), angle, RATE_HZ)
             done = all(each.reached for each in pieces[-1].expected)
             print(
                 f"{name:22} {motion.slope_rad:9.3f} {'' if done else '>'}"
@@ -122,7 +126,7 @@ def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
     found = {"paper's chirp, while it runs (slope 0.5 rad)": (ends_s, np.array(percent))}
     times_s = np.array([5.0, 10.0, 20.0, 40.0, 80.0, 120.0])
     swept = [swept_rad(rig, time_s) for time_s in times_s]
-    slope = tip_motion(LINK, DAMPING, swept[-1], RATE_HZ).slope_rad
+    slope = tip_motion(Plant(LINK, DAMPING), swept[-1], RATE_HZ).slope_rad
     found[f"scan and narrow sweeps, rigd run modes (slope {slope:.1f} rad)"] = (
         np.array([angle.size / RATE_HZ for angle in swept]),
         np.array([worst_percent(angle) for angle in swept]),
@@ -220,7 +224,7 @@ def check(rig: RigPreview, sessions: int, slope_rad: float) -> None:
         )
     truth = [DAMPING.zeta, DAMPING.alpha, DAMPING.gamma, DAMPING.lambda_]
     truth += [mode.damping_ratio for mode in ESTIMATE.modes()]
-    labels = [*names, *(f"damping {mode.number}" for mode in ESTIMATE.modes())]
+    labels = [*names, *(f"damping {mode.mode}" for mode in ESTIMATE.modes())]
     print(f"\n{sessions} sessions of {reference.size / RATE_HZ:g} s")
     print("quantity    predicted std   stated/predicted  scatter/stated  bias/stated")
     for i, label in enumerate(labels):

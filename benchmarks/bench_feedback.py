@@ -20,9 +20,9 @@ import numpy as np
 from exact_sessions import BAND_HZ, LINK, PLANTS, RATE_HZ, SWEEP
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, ResponseGrid
 from analysis.models import STRUCTURES
 from analysis.paper import fit_frf
+from rigd.beam import Plant, ResponseGrid
 from rigd.spectral import FrequencyResponse, instrumental_response, welch_response
 
 SAMPLES = 136_000

@@ -28,9 +28,9 @@ import numpy as np
 from bench_record_fit import LINK, PLANTS, RATE_HZ, Session
 from numpy.typing import NDArray
 
-from analysis.identify import Measurement, Plant, RecordFit, fit_record
+from analysis.identify import Measurement, RecordFit, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import transfer
+from rigd.beam import Plant, transfer
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import chirp, modes
 from rigd.profile import Profile, load_profile

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import LoadedBeam, clamped_free_eigenvalues, poles
+from rigd.beam import Plant, clamped_free_eigenvalues, poles
 from rigd.excitation.moves import quintic
 from rigd.profile import Profile, load_profile
 from rigd.runner.planning import excitation_for, plan_session
@@ -80,8 +80,12 @@ def own_poles(profile: Profile) -> NDArray[np.complex128]:
     """Poles of the first modes of the beam that is simulated."""
     rig = profile.rig
     assert rig.simulation is not None
-    ends = rig.simulation.tip_mass_kg, rig.simulation.clamp_compliance_rad_per_nm
-    own = LoadedBeam(rig.beam, rig.damping, *ends)
+    own = Plant(
+        rig.beam,
+        rig.damping,
+        tip_mass_kg=rig.simulation.tip_mass_kg,
+        root_compliance_rad_per_nm=rig.simulation.clamp_compliance_rad_per_nm,
+    )
     return own.poles(clamped_free_eigenvalues(_MODES))[:, 0]
 
 

@@ -20,11 +20,10 @@ import oddities_figures as draw
 from exact_sessions import LINK, Session, session
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, RecordFit, ResponseGrid, Selection, fit_record, select
-from analysis.identify.free_decay import mode_poles
+from analysis.identify import RecordFit, Selection, fit_record, select
 from analysis.models import STRUCTURES
 from analysis.paper import fit_many
-from rigd.beam import Beam, Damping, modes
+from rigd.beam import Beam, Damping, Plant, ResponseGrid, modes
 from rigd.spectral import FrequencyResponse, Segmentation, segment_count
 
 DAMPING = Damping(zeta=7.1e-5, alpha=1.0, gamma=5.5e-2, lambda_=0.594)
@@ -108,7 +107,7 @@ def record_method(count: int) -> list[Selection]:
     for order in ("alpha", "lambda_"):
         print(f"  {order}: {dict(Counter(getattr(e.verdict, order).status for e in found))}")
     print(f"  {'mode':26}{'truth':>10}  mean ± std of the sessions; typical std stated; flags")
-    for place, pole in enumerate(mode_poles(NOT_UNIFORM, 3, ())):
+    for place, pole in enumerate(NOT_UNIFORM.mode_poles(3, ())):
         at = pole.at_rad_s
         for name, unit, truth, size in (
             ("frequency_hz", "Hz", at.imag / (2 * np.pi), 1.0),

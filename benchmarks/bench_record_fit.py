@@ -29,16 +29,14 @@ from analysis.identify import (
     Comparison,
     Measurement,
     Objective,
-    Plant,
     RecordAnalysis,
     RecordFit,
     fit_record,
 )
-from analysis.identify.free_decay import mode_poles
 from analysis.identify.parametrization import Steps, Unknowns
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
-from rigd.beam import Beam, Damping, transfer
+from rigd.beam import Beam, Damping, Plant, transfer
 
 RATE_HZ = 1000.0
 NOISE_NM = 1e-2
@@ -109,7 +107,7 @@ class Peer:
         torque, _ = comparison.prediction.torque(plant)
         residual = comparison.spectrum(torque - comparison.torque_nm[comparison.retained])
         residual *= self.weight
-        poles = mode_poles(plant, comparison.visible_modes, ())
+        poles = plant.mode_poles(comparison.visible_modes, ())
         columns = comparison.decays.columns(poles) * self.weight
         gram = (columns.conj() @ columns.T).real
         projection = (columns.conj() @ residual).real

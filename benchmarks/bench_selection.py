@@ -32,8 +32,8 @@ import numpy as np
 from bench_record_fit import LINK, OFF, PLANTS, RATE_HZ, Session, session, wilson
 from numpy.typing import NDArray
 
-from analysis.identify import Plant, Selection, select
-from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation, transfer
+from analysis.identify import Selection, select
+from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, participation, transfer
 
 HALF_FRACTIONAL = Damping(zeta=2.49e-4, alpha=0.8, gamma=5.5e-2, lambda_=0.594)
 HUM_NM = 0.03

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 from touch_records import DAMPED, LINK, RATE_HZ, Obstacle, Slew, Struck, simulate
 
+from rigd.beam import Plant
 from rigd.touch import TouchEstimate, TouchEstimator, TouchModel, TouchRecord
 
 Case = tuple[str, Obstacle | tuple[Obstacle, ...], Slew]
@@ -115,7 +116,7 @@ def record_of(struck: Struck, after: int, noticed: int, *, shear: bool) -> Touch
 
 def model_near(rng: np.random.Generator, *, exact: bool) -> TouchModel:
     """Return the true beam, or one that is off by what it states."""
-    model = TouchModel(LINK, DAMPED, source="benchmark")
+    model = TouchModel(Plant(LINK, DAMPED), source="benchmark")
     if exact:
         return model
     values = {

@@ -74,7 +74,7 @@ def detector_of(profile: Profile) -> TouchDetector:
     rig, simulation = profile.rig, profile.rig.simulation
     assert simulation is not None
     noise = ChannelNoise(simulation.torque_noise_nm, simulation.force_noise_n, 2e-5)
-    beam = watched_beam(TouchModel(rig.beam, rig.damping), rig.rate_hz, noise)
+    beam = watched_beam(TouchModel(profile.plant), rig.rate_hz, noise)
     return TouchDetector(beam, rig.rate_hz, DetectorSettings())
 
 

@@ -26,9 +26,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import Plant
-from analysis.identify.free_decay import mode_poles
-from rigd.beam import Beam, Damping, LoadedBeam, modes
+from rigd.beam import Beam, Damping, Plant, modes
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
 from rigd.excitation import BeamEstimate, chirp
 from rigd.excitation.experiment_design import expected_precisions
@@ -90,7 +88,7 @@ class Rig:
             tip_mass_kg=self.tip_mass_kg,
         )
         found = {}
-        for pole in mode_poles(plant, 4, ()):
+        for pole in plant.mode_poles(4, ()):
             frequency_hz = pole.at_rad_s.imag / (2 * np.pi)
             if 0 < frequency_hz < BAND_HZ:
                 found[f"frequency {pole.mode}"] = frequency_hz
@@ -133,13 +131,13 @@ def asked(rig: Rig) -> float:
     paper's, lower where the tip's slope would leave the range that pieces keep to.
     """
     beam, damping = rig.beam(), rig.damping
-    loop = RigPreview(load_profile("sim")).plant_with(LoadedBeam(beam, damping))
+    loop = RigPreview(load_profile("sim")).plant_with(Plant(beam, damping))
     angle_rad = loop.respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
-    slope = tip_motion(beam, damping, angle_rad, RATE_HZ).slope_rad
+    slope = tip_motion(Plant(beam, damping), angle_rad, RATE_HZ).slope_rad
     angle_rad = angle_rad * min(1.0, 0.9 * SMALL_SLOPE_RAD / slope)
     present = replace(damping, zeta=rig.zeta or _ABSENT, gamma=rig.gamma or _ABSENT)
     noise = 2 * rig.noise_nm**2 / RATE_HZ
-    estimate = BeamEstimate.stated(beam, present, noise).modal()
+    estimate = BeamEstimate.stated(Plant(beam, present), noise).modal()
     told = expected_precisions(angle_rad, estimate, [parse_target("damping", "100%")], RATE_HZ)
     return max(each.std / each.value for each in told)
 

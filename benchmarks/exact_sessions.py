@@ -10,8 +10,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import Measurement, Plant, ResponseGrid
-from rigd.beam import Beam, Damping
+from analysis.identify import Measurement
+from rigd.beam import Beam, Damping, Plant, ResponseGrid
 from rigd.spectral import FrequencyResponse, Segmentation, welch_response
 
 RATE_HZ = 1000.0

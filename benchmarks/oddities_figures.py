@@ -9,9 +9,8 @@ import numpy as np
 from exact_sessions import LINK
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullLocator
 
-from analysis.identify import ResponseGrid
 from analysis.report import _style as style
-from rigd.beam import Damping, transfer
+from rigd.beam import Damping, ResponseGrid, transfer
 
 if TYPE_CHECKING:
     from bench_oddities import FirstPeak

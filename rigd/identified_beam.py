@@ -7,92 +7,56 @@ that names it; none is ignored.
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from math import hypot, inf, pi
+from math import hypot, pi
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, participation
+from rigd.beam import (
+    BEAM_PARAMETERS,
+    END_PARAMETERS,
+    FILTER_PARAMETERS,
+    OFFSET_PREFIX,
+    Plant,
+    clamped_free_eigenvalues,
+    parameter_named,
+    participation,
+)
 from rigd.documents import DocumentError, read_json
 from rigd.errors import UserError
 from rigd.units import finite_number, is_usable_size
 
-_REQUIRED_PARAMETERS: Final = ("density_over_stiffness", "bending_stiffness_n_m2")
-"""Names of the parameters that every document must have."""
 _HALF_WIDTH_95_STDS: Final = 1.959964
 """Half-width of the two-sided 95 % interval of a normal distribution, in standard deviations."""
 _ADVICE: Final = "write it with analyze session.mcap --json model.json"
 """Advice in messages about unusable documents."""
 
 
-@dataclass(frozen=True, slots=True)
-class _Parameter:
-    """Unit and valid range of a parameter in the document, and the effect that it describes."""
-
-    unit: str = ""
-    """Unit of the parameter, or "" for a dimensionless one."""
-    lower_limit: float = 0.0
-    """Smallest valid value."""
-    upper_limit: float = inf
-    """Upper limit, which valid values do not reach."""
-    effect: str = ""
-    """Description of the effect, or "" for parameters of a uniform beam with ideal channels."""
-    remedy: str = ""
-    """Advice how to obtain a document without the effect."""
-
-
-_OFFSET_PREFIX: Final = "stiffness_offset_"
-"""Beginning of the names of modal stiffness offsets, before the number of the mode."""
-_END_PARAMETERS: Final = ("tip_mass_kg", "root_compliance_rad_per_nm")
-"""Names of the parameters of the beam's ends."""
 _FILTER_ADVICE: Final = (  # Advice if the analysis found a low-pass filter
     "state it in the profile (sensor.filter_hz = {corner_hz:.4g}, sensor.filter_order = {order}), "
     "record again and analyze that session"
 )
-_PARAMETERS: Final[Mapping[str, _Parameter]] = {
-    "zeta": _Parameter("s^alpha", upper_limit=1.0),
-    "alpha": _Parameter(upper_limit=2.0),
-    "gamma": _Parameter("s^lambda/m⁴"),
-    "lambda": _Parameter(upper_limit=2.0),
-    "density_over_stiffness": _Parameter("s²/m⁴"),
-    "bending_stiffness_n_m2": _Parameter("N·m²"),
-    "tool_inertia_kg_m2": _Parameter("kg·m²"),
-    "delay_s": _Parameter("s", lower_limit=-inf),
-    "tip_mass_kg": _Parameter(
-        "kg", effect="a mass at the tip", remedy="take it off, and record and analyze again"
+_EFFECTS: Final[Mapping[str, tuple[str, str]]] = {
+    "tip_mass_kg": ("a mass at the tip", "take it off, and record and analyze again"),
+    "root_compliance_rad_per_nm": (
+        "an elastic clamp",
+        "tighten or stiffen the clamp, and record and analyze again",
     ),
-    "root_compliance_rad_per_nm": _Parameter(
-        "rad/(N·m)",
-        effect="an elastic clamp",
-        remedy="tighten or stiffen the clamp, and record and analyze again",
+    OFFSET_PREFIX: (
+        "a mode whose stiffness is not that of a uniform beam",
+        "look for an added mass or a section that varies, and record and analyze again",
     ),
-    _OFFSET_PREFIX: _Parameter(
-        lower_limit=-0.9,
-        upper_limit=10.0,
-        effect="a mode whose stiffness is not that of a uniform beam",
-        remedy="look for an added mass or a section that varies, and record and analyze again",
+    **dict.fromkeys(FILTER_PARAMETERS, ("a low-pass filter of the torque", _FILTER_ADVICE)),
+    "clock_rate_difference": (
+        "clocks of different rates",
+        "sample angle and torque by one clock, and record and analyze again",
     ),
-    "filter_time_constant_s": _Parameter(
-        "s", effect="a low-pass filter of the torque", remedy=_FILTER_ADVICE
-    ),
-    "second_order_filter_time_constant_s": _Parameter(
-        "s", effect="a low-pass filter of the torque", remedy=_FILTER_ADVICE
-    ),
-    "clock_rate_difference": _Parameter(
-        lower_limit=-1.0,
-        upper_limit=1.0,
-        effect="clocks of different rates",
-        remedy="sample angle and torque by one clock, and record and analyze again",
-    ),
-    "drag": _Parameter(
-        "m",
-        effect="drag of the air",
-        remedy="leave --model out, and expect more vibration than stated",
-    ),
+    "drag": ("drag of the air", "leave --model out, and expect more vibration than stated"),
 }
-"""All parameters of documents of this version or an older one, by name.
+"""Effects beyond a uniform beam with ideal channels, by the names of their parameters: description,
+and how to obtain a document without the effect.
 
-Offsets of modes, the compliance of the clamp and the difference of clocks are no longer estimated.
-A document with an unknown parameter is refused, because its effect is unknown."""
+Offsets of modes, the compliance of the clamp and the difference of clocks are no longer
+estimated."""
 
 _FINDINGS_IN_ESTIMATES: Final = frozenset(
     {"hum", "sensor drift", "ringing start", "knock", "clipping", "stop"}
@@ -131,8 +95,8 @@ class Use:
 
 MOVE: Final = Use(
     "a move",
-    frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET_PREFIX}),
-    frozenset({*_REQUIRED_PARAMETERS, "tip_mass_kg", "root_compliance_rad_per_nm", _OFFSET_PREFIX}),
+    frozenset({"tip_mass_kg", "root_compliance_rad_per_nm", OFFSET_PREFIX}),
+    frozenset({*BEAM_PARAMETERS, "tip_mass_kg", "root_compliance_rad_per_nm", OFFSET_PREFIX}),
     modes=True,
 )
 """Use of a beam for a vibration-free move.
@@ -142,7 +106,7 @@ The move depends on the modes and hardly on the composition of their damping."""
 TOUCH: Final = Use(
     "a search for touches",
     frozenset(),
-    frozenset(_REQUIRED_PARAMETERS),
+    frozenset(BEAM_PARAMETERS),
 )
 """Use of a beam to locate touches.
 
@@ -151,37 +115,15 @@ They are located by the exact model of a uniform beam with a free tip on a rigid
 
 @dataclass(frozen=True, slots=True)
 class IdentifiedBeam:
-    """Beam, damping and delays that an analysis has identified, with uncertainties."""
+    """Beam and torque channel that an analysis has identified, with uncertainties."""
 
-    beam: Beam
-    """Beam with the given length and the identified stiffness and density."""
-    damping: Damping
-    """Identified damping; a coefficient of 0 means that the structure has no such damping."""
-    tool_inertia_kg_m2: float | None
-    """Inertia between sensor and beam, or None if it was not identified."""
-    delay_s: float | None
-    """Delay of the torque minus that of the angle, or None if it was not identified."""
+    plant: Plant
+    """Plant with the given length and the identified parameters. A damping coefficient of 0 means
+    that the structure has no such damping."""
     std: Mapping[str, float]
     """Known standard deviations of parameters, by their names in the document."""
-    tip_mass_kg: float = 0.0
-    """Point mass at the tip of the beam."""
-    root_compliance_rad_per_nm: float = 0.0
-    """Rotational compliance of the clamp."""
-    stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from the uniform beam's."""
     mode_uncertainty: tuple[float, ...] = ()
     """Relative standard uncertainty of the pole of each mode in the document."""
-
-    @property
-    def loaded_beam(self) -> LoadedBeam:
-        """Identified beam with its damping, tip mass, clamp and modal stiffness offsets."""
-        return LoadedBeam(
-            self.beam,
-            self.damping,
-            self.tip_mass_kg,
-            self.root_compliance_rad_per_nm,
-            self.stiffness_offsets,
-        )
 
     def pole_uncertainty(self, mode_count: int) -> tuple[float, ...]:
         """Return the relative standard uncertainty of the poles of the first modes.
@@ -193,13 +135,13 @@ class IdentifiedBeam:
             largest uncertainty of the modes in the document.
         """
         density_uncertainty = (
-            0.5 * self.std.get(_REQUIRED_PARAMETERS[0], 0.0) / self.beam.density_over_stiffness
+            0.5 * self.std.get(BEAM_PARAMETERS[0], 0.0) / self.plant.beam.density_over_stiffness
         )
         largest_uncertainty = max(self.mode_uncertainty, default=density_uncertainty)
         return (*self.mode_uncertainty, *(largest_uncertainty,) * mode_count)[:mode_count]
 
 
-def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -> IdentifiedBeam:
+def read_identified_beam(document_path: str | Path, stated: Plant, use: Use) -> IdentifiedBeam:
     """Read the identified beam from the document of an analysis or a campaign.
 
     It is that of the first headline, for a campaign that of the pooled headline. If a uniform beam
@@ -212,15 +154,16 @@ def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -
     document_path
         Document of ``analyze session.mcap --json``: ``headlines[].parameters``, ``modes``,
         ``exact_geometry``, ``validity.uniform_beam`` and ``named``.
-    length_m
-        Length of the beam, which is not observable in a session.
+    stated
+        Stated plant: its length, which is not observable in a session, its delay and tool inertia
+        apply if the document has none.
     use
         Purpose of the beam: `MOVE` or `TOUCH`.
 
     Returns
     -------
     IdentifiedBeam
-        Beam, damping and uncertainties.
+        Plant and uncertainties.
 
     Raises
     ------
@@ -250,7 +193,7 @@ def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -
         values_by_name = {
             n: v
             for n, v in values_by_name.items()
-            if _parameter_key(n) not in (_OFFSET_PREFIX, *_END_PARAMETERS)
+            if _effect_key(n) not in (OFFSET_PREFIX, *END_PARAMETERS)
         }
     _require_known_effects(headline_label, values_by_name, use)
     std = {}
@@ -264,24 +207,17 @@ def read_identified_beam(document_path: str | Path, length_m: float, use: Use) -
         )
         if parameter_std is not None:
             std[parameter_name] = parameter_std
-    density_over_stiffness, stiffness_n_m2 = (
-        values_by_name[parameter_name] for parameter_name in _REQUIRED_PARAMETERS
-    )
+    _check_offset_modes(headline_label, values_by_name)
+    plant_values = {
+        parameter_name: parameter_value
+        for parameter_name, parameter_value in values_by_name.items()
+        if (effect_key := _effect_key(parameter_name)) not in _EFFECTS or effect_key in use.effects
+    }
+    channel_values = {name: getattr(stated, name) for name in ("delay_s", "tool_inertia_kg_m2")}
     identified_beam = IdentifiedBeam(
-        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
-        damping=Damping(
-            zeta=values_by_name.get("zeta", 0.0),
-            alpha=values_by_name.get("alpha", 1.0),
-            gamma=values_by_name.get("gamma", 0.0),
-            lambda_=values_by_name.get("lambda", 1.0),
-        ),
-        tool_inertia_kg_m2=values_by_name.get("tool_inertia_kg_m2"),
-        delay_s=values_by_name.get("delay_s"),
-        std=std,
-        tip_mass_kg=values_by_name.get("tip_mass_kg", 0.0),
-        root_compliance_rad_per_nm=values_by_name.get("root_compliance_rad_per_nm", 0.0),
-        stiffness_offsets=_stiffness_offsets(headline_label, values_by_name),
-        mode_uncertainty=_mode_uncertainty(headline_label, parameter_object.get("modes")),
+        Plant.from_parameters(stated.beam.length_m, channel_values | plant_values),
+        std,
+        _mode_uncertainty(headline_label, parameter_object.get("modes")),
     )
     return (
         _with_observed_modes(headline_label, identified_beam, headline.get("modes"), refusal)
@@ -323,12 +259,10 @@ def _with_observed_modes(
             "place; record a session that shows more modes and analyze it, or leave out --model."
         )
     try:
-        offset_beam = identified_beam.loaded_beam.with_frequencies(
-            [hz for hz, _, _ in observed_modes]
-        )
+        plant = identified_beam.plant.with_frequencies([hz for hz, _, _ in observed_modes])
     except ValueError as error:
         raise IdentifiedBeamError(f"{label}.parameters: {error} Leave out --model.") from None
-    beam, mode_inertia = offset_beam.beam, observed_modes[0][2]
+    beam, mode_inertia = plant.beam, observed_modes[0][2]
     if mode_inertia and mode_inertia > 0:
         mass_scale = mode_inertia / (beam.density_kg_per_m * float(participation(beam, 1)[0]))
         beam = replace(
@@ -336,10 +270,8 @@ def _with_observed_modes(
             density_kg_per_m=mass_scale * beam.density_kg_per_m,
             bending_stiffness_n_m2=mass_scale * beam.bending_stiffness_n_m2,
         )
-    identified_beam = replace(
-        identified_beam, beam=beam, stiffness_offsets=offset_beam.stiffness_offsets
-    )
-    poles = identified_beam.loaded_beam.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
+        plant = replace(plant, beam=beam)
+    poles = plant.poles(clamped_free_eigenvalues(len(observed_modes)))[:, 0]
     # The difference between the damping of the beam and of the modes counts as uncertainty.
     pole_uncertainties = (
         hypot(parameter_std, abs(damping_ratio + pole.real / abs(pole)))
@@ -347,7 +279,7 @@ def _with_observed_modes(
             identified_beam.mode_uncertainty, observed_modes, poles, strict=False
         )
     )
-    return replace(identified_beam, mode_uncertainty=tuple(pole_uncertainties))
+    return replace(identified_beam, plant=plant, mode_uncertainty=tuple(pole_uncertainties))
 
 
 def _read_headline(path: Path) -> tuple[str, Mapping[str, Any], str]:
@@ -455,7 +387,7 @@ def parameter_values(label: str, parameter_entries: Mapping[str, Any]) -> dict[s
         parameter_name: _parameter_value(label, parameter_name, parameter_entry)
         for parameter_name, parameter_entry in parameter_entries.items()
     }
-    for parameter_name in _REQUIRED_PARAMETERS:
+    for parameter_name in BEAM_PARAMETERS:
         if parameter_name not in values_by_name:
             raise IdentifiedBeamError(
                 f"{label}.parameters.{parameter_name} is missing; take the document of an "
@@ -490,76 +422,57 @@ def findings_without_parameter(named: object) -> list[tuple[int, str, str]]:
     return unmodelled_findings
 
 
-def _parameter_key(parameter_name: str) -> str:
-    """Return the key of a parameter in `_PARAMETERS`; that of an offset lacks the mode's number."""
-    return (
-        _OFFSET_PREFIX
-        if parameter_name.startswith(_OFFSET_PREFIX)
-        and parameter_name[len(_OFFSET_PREFIX) :].isdecimal()
-        else parameter_name
-    )
+def _effect_key(parameter_name: str) -> str:
+    """Return the key of a parameter in `_EFFECTS`; that of an offset lacks the mode's number."""
+    return OFFSET_PREFIX if parameter_name.startswith(OFFSET_PREFIX) else parameter_name
 
 
 def _parameter_value(label: str, name: str, entry: object) -> float:
     """Return the value of a parameter, or raise if it is unknown or outside its range."""
-    definition = _PARAMETERS.get(_parameter_key(name))
-    if definition is None or name == _OFFSET_PREFIX:
+    try:
+        definition = parameter_named(name)
+    except KeyError:
         raise IdentifiedBeamError(
             f"{label}.parameters.{name[:60]!r} is not known to this version, so what it changes "
             "cannot be taken into account; update rigd, or do without this document."
-        )
+        ) from None
     stated_value = entry.get("value") if isinstance(entry, dict) else None
     finite_value = finite_number(stated_value)
-    in_range = (
-        finite_value is not None
-        and definition.lower_limit <= finite_value < definition.upper_limit
-        and is_usable_size(finite_value)
-    )
     if (
         finite_value is not None
-        and in_range
-        and (finite_value > 0.0 or name not in _REQUIRED_PARAMETERS)
+        and definition.is_valid(finite_value)
+        and is_usable_size(finite_value)
     ):
         return finite_value
-    bound_text = "any size"
-    if definition.lower_limit > -inf:
-        bound_text = (
-            "more than 0" if name in _REQUIRED_PARAMETERS else f"{definition.lower_limit:g} or more"
-        )
-    if definition.upper_limit < inf:
-        bound_text += f" below {definition.upper_limit:g}"
-    unit_text = f" {definition.unit}" if definition.unit else ""
     raise IdentifiedBeamError(
         f"{label}.parameters.{name}.value = {json.dumps(stated_value, default=str)[:60]} "
-        f"must be a number of {bound_text}{unit_text}; {_ADVICE}."
+        f"must be a number of {definition.range_text}; {_ADVICE}."
     )
 
 
 def _require_known_effects(label: str, values_by_name: Mapping[str, float], use: Use) -> None:
     """Raise IdentifiedBeamError if the analysis found an effect that the use cannot include."""
     for parameter_name, parameter_value in values_by_name.items():
-        definition = _PARAMETERS[_parameter_key(parameter_name)]
-        if (
-            not definition.effect
-            or not parameter_value
-            or _parameter_key(parameter_name) in use.effects
-        ):
+        effect_key = _effect_key(parameter_name)
+        if not parameter_value or effect_key not in _EFFECTS or effect_key in use.effects:
             continue
+        description, remedy = _EFFECTS[effect_key]
         corner_hz = 0.0 if "filter" not in parameter_name else 1.0 / (2.0 * pi * parameter_value)
-        remedy_text = definition.remedy.format(
+        remedy_text = remedy.format(
             corner_hz=corner_hz, order=2 if parameter_name.startswith("second") else 1
         )
-        unit_text = f" {definition.unit}" if definition.unit else ""
+        unit = parameter_named(parameter_name).unit
+        unit_text = f" {unit}" if unit else ""
         raise IdentifiedBeamError(
             f"{label}.parameters.{parameter_name}.value = {parameter_value:.4g}{unit_text}: "
-            "the analysis found "
-            f"{definition.effect}, which {use.name} does not take into account; {remedy_text}."
+            f"the analysis found {description}, which {use.name} does not take into account; "
+            f"{remedy_text}."
         )
     if values_by_name.get("tip_mass_kg") and any(
-        values_by_name[n] for n in values_by_name if _parameter_key(n) == _OFFSET_PREFIX
+        values_by_name[n] for n in values_by_name if n.startswith(OFFSET_PREFIX)
     ):
         raise IdentifiedBeamError(
-            f"{label}.parameters: tip_mass_kg and {_OFFSET_PREFIX}… together are not defined; take "
+            f"{label}.parameters: tip_mass_kg and {OFFSET_PREFIX}… together are not defined; take "
             "the document of an analysis that found one of them."
         )
 
@@ -588,8 +501,8 @@ def _required_deviation(label: str, name: str, entry: Mapping[str, Any], use: Us
         return std_any_rig
     parameter_std = _standard_deviation(entry)
     # For a move the uncertainty of the modes includes the damping.
-    covered_by_modes = use is MOVE and not _PARAMETERS[_parameter_key(name)].effect
-    if _parameter_key(name) not in use.certain and (parameter_std is not None or covered_by_modes):
+    covered_by_modes = use is MOVE and _effect_key(name) not in _EFFECTS
+    if _effect_key(name) not in use.certain and (parameter_std is not None or covered_by_modes):
         return parameter_std
     raise IdentifiedBeamError(
         f"{label}.parameters.{name} is flagged ({str(entry_flag)[:100]}), and {use.name} "
@@ -611,21 +524,17 @@ def _standard_deviation(entry: Mapping[str, Any]) -> float | None:
     return std if std is not None and std > 0 else None
 
 
-def _stiffness_offsets(label: str, values_by_name: Mapping[str, float]) -> tuple[float, ...]:
-    """Return the relative stiffness offsets of modes 2, 3, … up to the last one in the document."""
-    offset_by_mode = {
-        int(n[len(_OFFSET_PREFIX) :]): offset_value
-        for n, offset_value in values_by_name.items()
-        if _parameter_key(n) == _OFFSET_PREFIX
-    }
-    mode_numbers = range(2, 2 + len(offset_by_mode))
-    if sorted(offset_by_mode) != list(mode_numbers):
-        given_modes = ", ".join(map(str, sorted(offset_by_mode)))
+def _check_offset_modes(label: str, values_by_name: Mapping[str, float]) -> None:
+    """Raise IdentifiedBeamError if the stiffness offsets are not those of modes 2, 3 etc."""
+    given_modes = sorted(
+        int(n.removeprefix(OFFSET_PREFIX)) for n in values_by_name if n.startswith(OFFSET_PREFIX)
+    )
+    if given_modes != list(range(2, 2 + len(given_modes))):
         raise IdentifiedBeamError(
-            f"{label}.parameters: {_OFFSET_PREFIX}… are those of modes {given_modes}, but must be "
-            f"those of modes 2 to {mode_numbers[-1]}; {_ADVICE}."
+            f"{label}.parameters: {OFFSET_PREFIX}… are those of modes "
+            f"{', '.join(map(str, given_modes))}, but must be those of modes 2 to "
+            f"{1 + len(given_modes)}; {_ADVICE}."
         )
-    return tuple(offset_by_mode[mode_number] for mode_number in mode_numbers)
 
 
 def _mode_uncertainty(label: str, modes: object) -> tuple[float, ...]:

@@ -6,11 +6,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rigd.beam import LoadedBeam, clamped_free_eigenvalues, participation
+from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, participation
 from rigd.identified_beam import MOVE, TOUCH, IdentifiedBeamError, read_identified_beam
 from rigd.profile import load_profile
 
-LENGTH_M = 0.98
+STATED = Plant(Beam(0.98, 4.7e-3, 0.09), Damping())
 OFFSETS = {"stiffness_offset_2": {"value": 0.03}, "stiffness_offset_3": {"value": -0.05}}
 
 
@@ -29,18 +29,18 @@ def changed(path, **more):
 
 def refusal(path, use):
     with pytest.raises(IdentifiedBeamError) as refused:
-        read_identified_beam(path, LENGTH_M, use)
+        read_identified_beam(path, STATED, use)
     assert str(refused.value).startswith(f"{path}: headlines[0].")
     return str(refused.value)
 
 
 def test_the_beam_of_an_analysis_is_read(analysed, profile):
-    found = read_identified_beam(analysed(), profile.rig.beam.length_m, MOVE)
-    assert found.damping == profile.rig.damping
-    assert found.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
+    found = read_identified_beam(analysed(), profile.plant, MOVE)
+    assert found.plant.damping == profile.rig.damping
+    assert found.plant.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
     assert found.pole_uncertainty(2) == pytest.approx((1e-4, 1e-4))
-    undamped = read_identified_beam(analysed(zeta=None, alpha=None), LENGTH_M, TOUCH)
-    assert undamped.damping.zeta == 0.0
+    undamped = read_identified_beam(analysed(zeta=None, alpha=None), STATED, TOUCH)
+    assert undamped.plant.damping.zeta == 0.0
 
 
 @pytest.mark.parametrize(
@@ -58,7 +58,7 @@ def test_the_beam_of_an_analysis_is_read(analysed, profile):
 )
 def test_what_is_wrong_with_the_document_is_said(analysed, other, says):
     with pytest.raises(IdentifiedBeamError, match=says) as refused:
-        read_identified_beam(analysed(**other), LENGTH_M, MOVE)
+        read_identified_beam(analysed(**other), STATED, MOVE)
     assert "model.json" in str(refused.value)
 
 
@@ -69,9 +69,9 @@ def test_a_file_that_is_no_document_is_refused(tmp_path, text):
     path = tmp_path / "model.json"
     path.write_text(text)
     with pytest.raises(IdentifiedBeamError, match="analyze session"):
-        read_identified_beam(path, LENGTH_M, MOVE)
+        read_identified_beam(path, STATED, MOVE)
     with pytest.raises(IdentifiedBeamError, match="cannot be read"):
-        read_identified_beam(tmp_path / "none.json", LENGTH_M, MOVE)
+        read_identified_beam(tmp_path / "none.json", STATED, MOVE)
 
 
 @pytest.mark.parametrize(
@@ -84,7 +84,7 @@ def test_a_file_that_is_no_document_is_refused(tmp_path, text):
 )
 def test_a_move_takes_the_ends_and_the_modes_and_a_touch_refuses_them(analysed, effect, read):
     path = analysed(**effect)
-    loaded = read_identified_beam(path, LENGTH_M, MOVE).loaded_beam
+    loaded = read_identified_beam(path, STATED, MOVE).plant
     found = loaded.tip_mass_kg, loaded.root_compliance_rad_per_nm, loaded.stiffness_offsets
     assert found == read
     refused = refusal(path, TOUCH)
@@ -113,7 +113,7 @@ def test_what_neither_accounts_for_is_refused_by_name(analysed, use, effect, say
 
 def test_an_effect_of_no_size_changes_nothing(analysed):
     none = {"drag": {"value": 0.0}, "filter_time_constant_s": {"value": 0.0}}
-    assert read_identified_beam(analysed(**none), LENGTH_M, TOUCH).loaded_beam.is_uniform_cantilever
+    assert read_identified_beam(analysed(**none), STATED, TOUCH).plant.is_uniform_cantilever
 
 
 @pytest.mark.parametrize("use", [MOVE, TOUCH])
@@ -131,7 +131,7 @@ def test_findings_that_no_parameter_carries_are_refused(analysed, use, what, acc
     finding = {"what": what, "value": None, "interval_95": None, "sentence": "It was found."}
     path = changed(analysed(), named=[{"what": "hum"}, finding])
     if accepted:
-        read_identified_beam(path, LENGTH_M, use)
+        read_identified_beam(path, STATED, use)
     else:
         assert f"named[1]: {what}, which {use.name} does not take" in refusal(path, use)
 
@@ -147,16 +147,16 @@ def test_a_flagged_number_is_refused_unless_a_deviation_covers_it(analysed):
             refused = refusal(path, use)
             assert f"{name} is flagged (another explanation fits), and {use.name}" in refused
         covered = analysed(**{name: flagged(0.05, std_any_rig=0.02)})
-        assert read_identified_beam(covered, LENGTH_M, TOUCH).std[name] == 0.02
+        assert read_identified_beam(covered, STATED, TOUCH).std[name] == 0.02
     assert "tip_mass_kg is flagged" in refusal(analysed(tip_mass_kg=flagged(1e-4)), MOVE)
 
 
 def test_of_a_flagged_damping_a_touch_takes_the_deviation_if_there_is_one(analysed):
     path = analysed(gamma=flagged(0.05, interval_95=[0.03, 0.07]))
-    assert read_identified_beam(path, LENGTH_M, TOUCH).std["gamma"] == pytest.approx(0.0102, 1e-2)
+    assert read_identified_beam(path, STATED, TOUCH).std["gamma"] == pytest.approx(0.0102, 1e-2)
     path = analysed(gamma={"value": 0.05, "std": None, "flag": "not identifiable"})
     assert "gamma is flagged" in refusal(path, TOUCH)
-    assert "gamma" not in read_identified_beam(path, LENGTH_M, MOVE).std
+    assert "gamma" not in read_identified_beam(path, STATED, MOVE).std
 
 
 def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
@@ -169,7 +169,7 @@ def test_the_uncertainty_of_the_poles_is_that_of_the_modes(analysed):
         }
 
     modes = [mode(1, 0.03, 0.004), mode(2, 0.001, 0.0, std_any_rig=0.1)]
-    found = read_identified_beam(changed(analysed(), modes=modes), LENGTH_M, MOVE)
+    found = read_identified_beam(changed(analysed(), modes=modes), STATED, MOVE)
     assert found.pole_uncertainty(3) == pytest.approx((0.005, 0.01, 0.01))
     assert "modes[0] is not mode 1" in refusal(changed(analysed(), modes=[mode(2, 0, 0)]), MOVE)
 
@@ -203,13 +203,13 @@ def test_of_a_uniform_beam_the_exact_parameters_are_read(analysed, profile):
     """They predict the record best; those with a tolerance of the geometry hold for its modes."""
     exact = json.loads(analysed().read_text())["headlines"][0]["parameters"]
     exact = {name: entry | {"flag": None} for name, entry in exact.items()}
-    loaded = LoadedBeam(profile.rig.beam, profile.rig.damping)
+    loaded = Plant(profile.rig.beam, profile.rig.damping)
     changes = {"validity": PASSED, "exact_geometry": {"parameters": exact, "modes": shown(loaded)}}
     path = analysed(density_over_stiffness={"value": 0.06, "std": 1e-4}, alpha=flagged(1.2))
     for use in (MOVE, TOUCH):
-        found = read_identified_beam(changed(path, **changes), LENGTH_M, use)
-        assert found.damping == profile.rig.damping
-        assert found.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
+        found = read_identified_beam(changed(path, **changes), STATED, use)
+        assert found.plant.damping == profile.rig.damping
+        assert found.plant.beam.density_kg_per_m == pytest.approx(profile.rig.beam.density_kg_per_m)
     assert found.pole_uncertainty(1)[0] == pytest.approx(1e-3 / 2.57, rel=0.02)
 
 
@@ -218,18 +218,18 @@ def test_of_a_beam_that_is_not_uniform_a_move_takes_the_modes_and_a_touch_refuse
 ):
     """No effective beam: frequencies and inertia are those of the modes."""
     beam = replace(profile.rig.beam, density_kg_per_m=5.1e-3, bending_stiffness_n_m2=0.1)
-    true = LoadedBeam(beam, profile.rig.damping, stiffness_offsets=(0.02, -0.03))
+    true = Plant(beam, profile.rig.damping, stiffness_offsets=(0.02, -0.03))
     effective = {name: flagged(value) for name, value in (
         ("density_over_stiffness", 0.0523), ("bending_stiffness_n_m2", 0.0907),
         ("tip_mass_kg", 1e-4),
     )}  # fmt: skip
     path = changed(analysed(**effective), validity=REFUSED, modes=shown(true))
     assert "validity.uniform_beam: a uniform beam does not predict" in refusal(path, TOUCH)
-    found = read_identified_beam(path, LENGTH_M, MOVE)
-    assert found.stiffness_offsets == pytest.approx((0.02, -0.03), abs=1e-5)
-    assert found.beam.density_kg_per_m == pytest.approx(5.1e-3)
-    assert found.beam.bending_stiffness_n_m2 == pytest.approx(0.1)
-    assert found.tip_mass_kg == 0.0
+    found = read_identified_beam(path, STATED, MOVE)
+    assert found.plant.stiffness_offsets == pytest.approx((0.02, -0.03), abs=1e-5)
+    assert found.plant.beam.density_kg_per_m == pytest.approx(5.1e-3)
+    assert found.plant.beam.bending_stiffness_n_m2 == pytest.approx(0.1)
+    assert found.plant.tip_mass_kg == 0.0
     assert max(found.pole_uncertainty(3)) < 1e-3
     doubtful = changed(path, modes=shown(true, flag="part of the record is unexplained"))
     assert "modes: a uniform beam does not predict" in refusal(doubtful, MOVE)
@@ -238,11 +238,11 @@ def test_of_a_beam_that_is_not_uniform_a_move_takes_the_modes_and_a_touch_refuse
     pooled = {**document["headlines"][0], "file": None, "validity": {"uniform_beam": None}}
     path.write_text(json.dumps({"headlines": [*document["headlines"], pooled]}))
     with pytest.raises(IdentifiedBeamError, match="does not predict the modes"):
-        read_identified_beam(path, LENGTH_M, TOUCH)
+        read_identified_beam(path, STATED, TOUCH)
 
 
 def test_damping_that_is_not_that_of_the_modes_counts_as_uncertainty(analysed, profile):
-    modes = shown(LoadedBeam(profile.rig.beam, profile.rig.damping))
+    modes = shown(Plant(profile.rig.beam, profile.rig.damping))
     modes[0]["damping_ratio"]["value"] += 0.002
-    found = read_identified_beam(changed(analysed(), validity=REFUSED, modes=modes), LENGTH_M, MOVE)
+    found = read_identified_beam(changed(analysed(), validity=REFUSED, modes=modes), STATED, MOVE)
     assert found.pole_uncertainty(2) == pytest.approx((0.002, 7e-5), rel=0.1)

@@ -11,9 +11,9 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import Candidate, ModeEstimate, Plant
+    from analysis.identify import Candidate, ModeEstimate
     from analysis.paper import FittedModel, Indices
-    from rigd.beam import Damping
+    from rigd.beam import Damping, Plant
 
 
 @dataclass(frozen=True, slots=True)

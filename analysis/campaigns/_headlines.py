@@ -14,8 +14,9 @@ from analysis.identify.headline import (
     ReportedValue,
 )
 from analysis.identify.verdict import BIC_DECISIVE
-from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+from analysis.models import STRUCTURES
 from analysis.statistics import student_t_quantile
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -192,7 +193,7 @@ def _reported_parameters(
     free_names = STRUCTURES[pooled_estimate.structure].free
     for parameter_name, fixed_value in pooled_estimate.plant.parameters.items():
         if parameter_name not in reported_parameters and (
-            parameter_name not in PARAMETERS or parameter_name in free_names
+            parameter_name not in DAMPING_PARAMETERS or parameter_name in free_names
         ):
             reported_parameters[parameter_name] = ReportedValue(
                 fixed_value, None, None, common_flag or _ON_BOUND_FLAG

@@ -18,8 +18,8 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import common_structure, freest_estimate, random_effects
-from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.statistics import chi_square_p_value
+from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Sequence

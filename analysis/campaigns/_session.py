@@ -22,11 +22,11 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import Candidate, ModalEstimate, Plant, Setting
+    from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
     from analysis.paper import Peak
     from analysis.results import WholeRecord
-    from rigd.beam import Beam
+    from rigd.beam import Beam, Plant
 
 
 _INVALIDATING_FINDINGS: Final = ("sign", "unit")
@@ -281,8 +281,8 @@ def _record_estimates(
     delay_s: float,
 ) -> tuple[RecordEstimate, ...]:
     """Return the fits of the requested damping structures and of the selected one."""
-    from analysis.identify import ResponseGrid
     from analysis.models import STRUCTURES
+    from rigd.beam import ResponseGrid
 
     omega = 2 * np.pi * measured_response.frequency_hz
     response_grid = ResponseGrid(1j * omega)

@@ -15,9 +15,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.campaigns.pooling import determines_damping, estimates_by_structure, pooled_bic
-from analysis.models import PARAMETERS, STRUCTURES, FrequencyResponseModel
+from analysis.models import STRUCTURES, FrequencyResponseModel
 from analysis.paper import fit_indices, peak_deviation, resonant_peaks
-from rigd.beam import undamped_frequencies_rad_s
+from rigd.beam import DAMPING_PARAMETERS, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -27,9 +27,8 @@ if TYPE_CHECKING:
     from analysis.campaigns._estimates import WelchFit
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.models import Parameter
     from analysis.paper import Indices, Peak
-    from rigd.beam import Beam, Damping
+    from rigd.beam import Beam, Damping, DampingParameter
 
 
 # Parameters
@@ -144,7 +143,7 @@ class NominalModel:
     structure: str
     weighting: str
     damping: Damping
-    parameters: Mapping[Parameter, float]
+    parameters: Mapping[DampingParameter, float]
     response: NDArray[np.complex128]
     peaks: tuple[Peak | None, ...]
     indices: tuple[Indices, ...]
@@ -254,11 +253,11 @@ def _nominal_model(
     )
 
 
-def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[Parameter, float]:
+def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[DampingParameter, float]:
     """Return the mean of each damping parameter over the sessions' fits."""
     return {
         parameter_name: float(np.mean([fit.parameters[parameter_name] for fit in welch_fits]))
-        for parameter_name in PARAMETERS
+        for parameter_name in DAMPING_PARAMETERS
     }
 
 

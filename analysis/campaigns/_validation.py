@@ -11,7 +11,8 @@ from analysis.campaigns._experiment import CampaignError, session_error_types
 from analysis.campaigns._statistics import mean_damping
 from analysis.campaigns.pooling import pooled_estimates
 from analysis.campaigns.workers import LostTask
-from analysis.identify import Measurement, Plant
+from analysis.identify import Measurement
+from rigd.beam import Plant
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence

@@ -15,16 +15,16 @@ References
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC_PARAMETERS, SETTINGS, Plant, damping_size
+from analysis.identify import SETTINGS, damping_size
 from analysis.identify.headline import ReportedLossFactor, ReportedValue
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
-from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam import LOGARITHMIC_PARAMETERS, Plant, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -492,21 +492,10 @@ def _covariance_block(
 
 def _pooled_plant(estimate: RecordEstimate, parameter_values: dict[str, float]) -> Plant:
     """Return a plant with given parameters and all other properties of a session's plant."""
-    stiffness = parameter_values["bending_stiffness_n_m2"]
-    free_names = STRUCTURES[estimate.structure].free
-    return replace(
-        estimate.plant,
-        beam=Beam(
-            estimate.plant.beam.length_m,
-            parameter_values["density_over_stiffness"] * stiffness,
-            stiffness,
-        ),
-        damping=STRUCTURES[estimate.structure].damping(
-            {parameter_name: parameter_values[parameter_name] for parameter_name in free_names}
-        ),
-        delay_s=parameter_values["delay_s"],
-        tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
-    )
+    structure = STRUCTURES[estimate.structure]
+    values: dict[str, float] = dict(structure.fixed.items())
+    values |= {name: parameter_values[name] for name in (*structure.free, *SETTINGS)}
+    return estimate.plant.with_parameters(values)
 
 
 # Freest structure that all sessions support

@@ -10,8 +10,9 @@ from analysis.campaigns._experiment import differing_fact_keys, fact_text
 from analysis.campaigns._statistics import PAPER_BEST_MODELS
 from analysis.campaigns._welch_bias import LARGEST_MISFIT
 from analysis.identify.sentences import LOSS_NAMES
-from analysis.models import COEFFICIENT_OF, QUANTITIES, STRUCTURES
+from analysis.models import STRUCTURES
 from analysis.statistics import student_t_quantile
+from rigd.beam import COEFFICIENT_OF, PARAMETERS
 from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
 
@@ -52,14 +53,16 @@ def label(quantity: str) -> tuple[str, float, str]:
     The quantity is a parameter, or ``frequency_hz_N`` or ``damping_ratio_N`` of mode N. A value
     times the factor is in the display unit.
     """
-    if quantity in QUANTITIES:
-        symbol, _, display_unit, display_factor = QUANTITIES[quantity]
-        display_unit, display_factor = _FINER_UNITS.get(quantity, (display_unit, display_factor))
+    if quantity in PARAMETERS:
+        definition = PARAMETERS[quantity]
+        display_unit, display_factor = _FINER_UNITS.get(
+            quantity, (definition.display_unit, definition.display_factor)
+        )
         power_text, _, unit_rest = display_unit.partition(" ")
         if power_text.startswith("1e"):
             display_unit = f"10{power_text.removeprefix('1e').translate(_SUPERSCRIPTS)} {unit_rest}"
         return (
-            _CLEARER_NAMES.get(quantity, symbol),
+            _CLEARER_NAMES.get(quantity, definition.symbol),
             display_factor,
             "" if display_unit == "1" else display_unit,
         )

@@ -34,11 +34,6 @@ from ._modal_model import BACKGROUND_COEFFICIENTS as BACKGROUND_COEFFICIENTS
 from ._modal_model import MODE_CONSTANT_NAMES as MODE_CONSTANT_NAMES
 from ._modal_model import ModalEstimate as ModalEstimate
 from ._modal_model import ModalModel as ModalModel
-from ._plant import LOGARITHMIC_PARAMETERS as LOGARITHMIC_PARAMETERS
-from ._plant import SETTINGS as SETTINGS
-from ._plant import Plant as Plant
-from ._plant import Setting as Setting
-from ._predictor import ResponseGrid as ResponseGrid
 from ._predictor import TorquePredictor as TorquePredictor
 from ._problem import Objective as Objective
 from ._result import RecordAnalysis as RecordAnalysis
@@ -47,4 +42,6 @@ from ._select import ORDER_ONE_STRUCTURE as ORDER_ONE_STRUCTURE
 from ._select import Selection as Selection
 from ._select import fit_freest_alone as fit_freest_alone
 from ._select import select as select
+from ._settings import SETTINGS as SETTINGS
+from ._settings import Setting as Setting
 from ._uncertainty import damping_size as damping_size

@@ -30,8 +30,7 @@ from rigd.beam import clamped_free_eigenvalues, mode_shape
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
-    from analysis.identify._plant import Plant
-    from rigd.beam import Beam
+    from rigd.beam import Beam, Plant
 
 GRAVITY_M_S2: Final = 9.81
 """Acceleration of gravity, in m/s²."""

@@ -13,7 +13,6 @@ from analysis.identify._channel_checks import sign_and_unit_findings
 from analysis.identify._comparison import Comparison
 from analysis.identify._fit import fit_record, refit_record
 from analysis.identify._leakage import without_leakage
-from analysis.identify._plant import free_settings
 from analysis.identify._refit import (
     DESCENT_EVALUATIONS,
     MISSED_COST_FRACTION,
@@ -21,9 +20,11 @@ from analysis.identify._refit import (
     Refit,
 )
 from analysis.identify._search import MAX_ANGLE_REESTIMATES
+from analysis.identify._settings import free_settings
 from analysis.identify.parametrization import Unknowns
 from analysis.identify.residual_tests import whiteness
-from analysis.models import COEFFICIENT_OF, PARAMETERS, STRUCTURES
+from analysis.models import STRUCTURES
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -32,10 +33,11 @@ if TYPE_CHECKING:
 
     from analysis.identify._data import Measurement
     from analysis.identify._finding import Finding
-    from analysis.identify._plant import Plant, Setting
     from analysis.identify._result import RecordAnalysis, RecordFit
+    from analysis.identify._settings import Setting
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 
 INTEGER_INTERNAL_ORDER: Final = (STRUCTURES["III"], STRUCTURES["VII"])
@@ -464,7 +466,9 @@ class CandidateSet:
         }
         fixed_values[order] = 1.0  # type: ignore[index]
         free_names = tuple(
-            parameter_name for parameter_name in PARAMETERS if parameter_name not in fixed_values
+            parameter_name
+            for parameter_name in DAMPING_PARAMETERS
+            if parameter_name not in fixed_values
         )
         both_dampings = replace(structure, free=free_names, fixed=fixed_values)
         unknowns = self.unknowns(both_dampings)

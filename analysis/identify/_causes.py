@@ -15,8 +15,7 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from analysis.identify._altered_beam import Alteration, Profile
-    from analysis.identify._plant import Plant
-    from rigd.beam import Beam
+    from rigd.beam import Beam, Plant
 
 _BUTTERWORTH_LOSS: Final = 2**0.5
 """Reciprocal quality factor of a second-order Butterworth filter."""

@@ -15,12 +15,7 @@ from analysis.identify._data import Decimation, MeasurementError, fast_length_be
 from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse
-from analysis.identify.free_decay import (
-    DecaySpectra,
-    LaterDecaySpectra,
-    count_decay_spectra,
-    mode_poles,
-)
+from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
 from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -31,10 +26,9 @@ if TYPE_CHECKING:
 
     from analysis.identify._data import Measurement
     from analysis.identify._modal_model import ModalModel
-    from analysis.identify._plant import Plant
     from analysis.identify.drag_torque import DragLaw
-    from analysis.identify.free_decay import Pole
     from analysis.identify.noise import Hum, NoiseSpectrum
+    from rigd.beam import Plant, Pole
 
 _MIN_BINS: Final = 50
 """Minimum number of frequency bins in the compared band."""
@@ -266,7 +260,7 @@ class Comparison:
         wrt : sequence of str
             Parameters with respect to which the poles are differentiated, as for `mode_poles`.
         """
-        poles = mode_poles(plant, self.visible_modes, wrt, self.last_poles_rad_s)
+        poles = plant.mode_poles(self.visible_modes, wrt, self.last_poles_rad_s)
         self.last_poles_rad_s[:] = [pole.at_rad_s for pole in poles]
         return poles
 

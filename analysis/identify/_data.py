@@ -21,9 +21,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import Plant
 from analysis.record_checks import MAX_GAP_S, longest_run, unknown_fraction_message
-from rigd.beam import Damping
+from rigd.beam import Damping, Plant
 
 if TYPE_CHECKING:
     from collections.abc import Iterable

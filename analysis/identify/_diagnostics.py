@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._estimates import ModeEstimate
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._plant import Setting
+    from analysis.identify._settings import Setting
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.headline import Headline
     from analysis.identify.residual_tests import Harmonic, InputRelation, Whiteness
@@ -274,13 +274,7 @@ def _initial_ringing_findings(candidate_set: CandidateSet, headline: Headline) -
 
 def _stated_value(candidate_set: CandidateSet, setting_name: Setting) -> float:
     """Return the value in SI units that the session file states for a setting."""
-    measurement = candidate_set.comparison.measurement
-    return {
-        "density_over_stiffness": measurement.beam.density_over_stiffness,
-        "bending_stiffness_n_m2": measurement.beam.bending_stiffness_n_m2,
-        "delay_s": measurement.delay_s,
-        "tool_inertia_kg_m2": measurement.tool_inertia_kg_m2,
-    }[setting_name]
+    return candidate_set.comparison.measurement.nominal.parameters[setting_name]
 
 
 # Disturbances, forces, and what remains

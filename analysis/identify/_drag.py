@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 
 # Search for drag

@@ -27,9 +27,9 @@ if TYPE_CHECKING:
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._causes import Cause
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._plant import Plant
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.uniform_beam import UniformBeamTest
+    from rigd.beam import Plant
 
 _CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
 """Additional standard deviation of all modal constants in successive descents.

@@ -10,10 +10,10 @@ import numpy as np
 
 from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
 from analysis.identify._comparison import Comparison
-from analysis.identify._plant import SETTINGS, free_settings
 from analysis.identify._problem import Objective
 from analysis.identify._result import RecordAnalysis, RecordFit
 from analysis.identify._search import CoarseResponse, Descent, StructureSearch
+from analysis.identify._settings import SETTINGS, free_settings
 from analysis.identify._uncertainty import (
     covariance_of_unknowns,
     interval_from_zero,
@@ -31,10 +31,11 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._plant import Plant, Setting
     from analysis.identify._problem import Projected
+    from analysis.identify._settings import Setting
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 BAND_HZ: Final[tuple[float, float]] = RECORD_BAND_HZ
 """First and last frequency that are compared, unless another band is given."""

@@ -20,9 +20,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
-    from analysis.identify.free_decay import Pole
     from analysis.identify.noise import NoiseSpectrum
+    from rigd.beam import Plant, Pole
 
 _RESONANCE_HALF_WIDTHS: Final = 3.0
 """Half width of the frequency range that counts as a resonance, in multiples of damping ratio times

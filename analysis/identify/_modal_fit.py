@@ -29,11 +29,10 @@ from analysis.identify._modal_model import (
     ModalEstimate,
     ModalModel,
 )
-from analysis.identify.free_decay import Pole
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
 from analysis.optimizer import Box, NormalEquations, RecentValues, descend
-from rigd.beam import LoadedBeam
+from rigd.beam import Pole
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -41,9 +40,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
     from analysis.identify.noise import NoiseSpectrum
     from analysis.identify.residual_tests import InputRelation, Whiteness
+    from rigd.beam import Plant
 
 _RELATIVE_TOLERANCE: Final = 1e-8
 """Relative tolerance of the sum of squares at which a descent has converged."""
@@ -228,12 +227,9 @@ class ModalFit(ModalEstimate):
             self.poles_rad_s[mode_number].imag / (2 * math.pi) for mode_number in visible_modes
         ]
         try:
-            loaded_beam = LoadedBeam(plant.beam, plant.damping).with_frequencies(frequency_hz)
+            return plant.with_frequencies(frequency_hz)
         except ValueError:
             return plant
-        return replace(
-            plant, beam=loaded_beam.beam, stiffness_offsets=loaded_beam.stiffness_offsets
-        )
 
 
 def fit_modes(

@@ -11,7 +11,6 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify._uncertainty import damping_size
 from analysis.identify.headline import (
     DAMPING_PARAMETER_NAMES,
@@ -29,8 +28,9 @@ from analysis.identify.verdict import (
     OrderVerdict,
     Status,
 )
-from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
+from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
 
 if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate

@@ -27,7 +27,6 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
-from analysis.identify._predictor import torque_channel_response
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
@@ -39,7 +38,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 
 # Torque by a force
@@ -159,7 +158,7 @@ class NonlinearForceSpectra:
             * self._inertia_and_external
             / dynamic_stiffness
             * force_transform
-            * torque_channel_response(self._plant, self._s)
+            * self._plant.channel_response(self._s)
         )
         torque_spectrum: NDArray[np.complex128] = self._comparison.spectrum(
             self._transform.inverse(torque_transform, self._comparison.retained)

@@ -1,43 +1,28 @@
-"""Torque predicted from the measured angle: response of beam, clamp and instruments.
+"""Torque predicted from the measured angle by the response of a plant (`ResponseGrid`).
 
-The response from measured angle to measured torque is::
-
-    H(s) = (R(s) + J_tool s²) Q(s) exp(-s tau),    R = G / (1 + kappa G)
-
-G is the exact fractional-order beam (Eq. 25 of the reference paper). With a tip mass, or with
-deviating stiffness of single modes, G is that of `rigd.beam._tip_mass`. kappa is the clamp's
-compliance, between tool and beam. Q is the response of the low-pass filters of the torque channel,
-``1 / (1 + tau_1 s)`` and ``1 / (1 + sqrt(2) tau_2 s + tau_2² s²)`` (Butterworth), and tau is the
-delay of the torque channel relative to the angle channel.
-
-The angle is convolved with H causally, over the whole record (`CausalTransform`).
+The angle is convolved with the response causally, over the whole record (`CausalTransform`).
 """
 
 from __future__ import annotations
 
 from copy import copy
 from functools import lru_cache
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from analysis.identify._modal_model import ModalModel
-from analysis.identify._plant import Plant
 from rigd.beam import (
-    PARAMETERS,
     CausalTransform,
-    TransferGrid,
+    Plant,
+    ResponseGrid,
     clamped_free_eigenvalues,
-    differentiated_response,
 )
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
 
-    from numpy.typing import ArrayLike, NDArray
-
-
-# Response
+    from numpy.typing import NDArray
 
 
 @lru_cache(maxsize=16)
@@ -51,143 +36,6 @@ def eigenvalues(count: int) -> NDArray[np.float64]:
     z = clamped_free_eigenvalues(count)
     z.flags.writeable = False
     return z
-
-
-_FILTER_TIME_CONSTANTS: Final = ("filter_time_constant_s", "second_order_filter_time_constant_s")
-"""Parameters of `Plant` that are time constants of filters of the torque channel."""
-
-_BUTTERWORTH_LOSS: Final = 2**0.5
-"""Reciprocal quality factor of a second-order Butterworth filter."""
-
-
-def torque_channel_response(
-    plant: Plant, s: NDArray[np.complexfloating[Any, Any]]
-) -> NDArray[np.complex128]:
-    """Return the dimensionless transfer function of the torque channel's delay and filters.
-
-    It has the shape of `s`.
-
-    Parameters
-    ----------
-    plant : Plant
-        Plant with the delay and the filters.
-    s : ndarray of complex
-        Laplace variable in rad/s.
-    """
-    complex_s = s.astype(np.complex128, copy=False)
-    channel_response: NDArray[np.complex128] = np.exp(-plant.delay_s * complex_s)
-    for filter_name in _FILTER_TIME_CONSTANTS:
-        time_constant_s = plant.optional_parameters[filter_name]
-        if time_constant_s:
-            channel_response /= _filter_denominator(filter_name, time_constant_s, complex_s)
-    return channel_response
-
-
-def _filter_denominator(
-    filter_name: str, time_constant_s: float, s: NDArray[np.complex128]
-) -> NDArray[np.complex128]:
-    """Return the denominator of the transfer function of a torque filter, at `s` in rad/s."""
-    if filter_name == "filter_time_constant_s":
-        return 1 + time_constant_s * s
-    return 1 + time_constant_s * (_BUTTERWORTH_LOSS * s + time_constant_s * s * s)
-
-
-class ResponseGrid:
-    """Evaluates the transfer function from motor angle to torque on a grid of the variable s.
-
-    It also evaluates the derivatives of the transfer function by parameters of the plant.
-
-    Parameters
-    ----------
-    s : array_like of complex, shape (n,)
-        Laplace variable in rad/s, not 0.
-    """
-
-    __slots__ = ("_beam", "_log_s", "_s", "_s_squared")
-
-    def __init__(self, s: ArrayLike) -> None:
-        self._s = np.asarray(s, dtype=np.complex128)
-        self._s_squared = self._s * self._s
-        self._log_s = np.log(self._s)
-        self._beam = TransferGrid(self._s)
-
-    @property
-    def s(self) -> NDArray[np.complex128]:
-        """Return the grid of the Laplace variable in rad/s, shape (n,)."""
-        return self._s
-
-    def evaluate(
-        self,
-        plant: Plant,
-        wrt: Sequence[str] = (),
-        angle_transform: NDArray[np.complex128] | float = 1.0,
-    ) -> NDArray[np.complex128]:
-        """Return the Laplace transform of a plant's torque for a motor angle, and its derivatives.
-
-        With the angle 1 this is the transfer function in N·m/rad.
-
-        Parameters
-        ----------
-        plant : Plant
-            Plant whose torque is computed.
-        wrt : sequence of str
-            Names of k parameters from `rigd.beam.PARAMETERS`, "delay_s" and "tool_inertia_kg_m2".
-            The torque is differentiated with respect to each while all others are constant.
-        angle_transform : ndarray of complex, shape (n,), or float
-            Transform of the angle.
-
-        Returns
-        -------
-        ndarray of complex, shape (1 + k, n)
-            Transform of the torque, then the derivatives in the order of `wrt`.
-        """
-        total_response, derivatives = self._beam_response(plant, wrt)
-        if plant.root_compliance_rad_per_nm:
-            clamp_factor = 1 / (1 + plant.root_compliance_rad_per_nm * total_response)
-            for parameter_name in derivatives:
-                derivatives[parameter_name] = derivatives[parameter_name] * clamp_factor**2
-            total_response = total_response * clamp_factor
-        total_response += plant.tool_inertia_kg_m2 * self._s_squared
-        derivatives["tool_inertia_kg_m2"] = self._s_squared
-        channel_times_angle = torque_channel_response(plant, self._s) * angle_transform
-        if "delay_s" in wrt:
-            derivatives["delay_s"] = -self._s * total_response
-        spectra = np.empty((1 + len(wrt), channel_times_angle.size), dtype=np.complex128)
-        for out, response_row in zip(
-            spectra,
-            [total_response, *(derivatives[parameter_name] for parameter_name in wrt)],
-            strict=True,
-        ):
-            np.multiply(response_row, channel_times_angle, out=out)
-        return spectra
-
-    def _beam_response(
-        self, plant: Plant, wrt: Sequence[str]
-    ) -> tuple[NDArray[np.complex128], dict[str, NDArray[np.complex128]]]:
-        """Return the transfer function G of the beam on a rigid clamp, and derivatives by name.
-
-        G is the torque over the motor angle, in N·m/rad. The derivatives are those by the
-        parameters in `wrt` on which G depends.
-        """
-        beam_names = [parameter_name for parameter_name in wrt if parameter_name in PARAMETERS]
-        if plant.tip_mass_kg or plant.stiffness_offsets:
-            loaded_response, derivatives = differentiated_response(
-                self._log_s,
-                self._s_squared,
-                plant.beam,
-                plant.damping,
-                plant.tip_mass_kg,
-                plant.stiffness_offsets,
-            )
-            return loaded_response.response, {
-                parameter_name: derivatives[parameter_name]() for parameter_name in beam_names
-            }
-        if not beam_names:
-            return self._beam.evaluate(plant.beam, plant.damping), {}
-        beam_response, derivative_rows = self._beam.evaluate_with_gradient(
-            plant.beam, plant.damping, beam_names
-        )
-        return beam_response, dict(zip(beam_names, derivative_rows, strict=True))
 
 
 # Prediction

@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify.free_decay import Pole
 from analysis.optimizer import NormalEquations, RecentValues, descend
+from rigd.beam import Pole
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

@@ -24,10 +24,10 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
     from analysis.identify._result import RecordFit
     from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import NormalEquations
+    from rigd.beam import Plant
 
 
 REFIT_EVALUATIONS: Final = 8

@@ -18,9 +18,9 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
     from analysis.identify._modal_fit import ModalFit
-    from analysis.identify._plant import Plant
     from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 
 @dataclass(frozen=True, slots=True)

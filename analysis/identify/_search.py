@@ -16,13 +16,13 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._hum import find_hum_near_modes, resonance_half_width_hz
-from analysis.identify._predictor import ResponseGrid
 from analysis.identify._problem import Objective
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.identify.noise import Hum, NoiseSpectrum, estimate_noise
 from analysis.identify.parametrization import Steps
 from analysis.optimizer import NormalEquations, descend
 from analysis.paper import thinned
+from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterable
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._comparison import Comparison
-    from analysis.identify._plant import Plant
     from analysis.identify.parametrization import Unknowns
     from analysis.optimizer import Minimum
+    from rigd.beam import Plant
 
 
 # Resonances

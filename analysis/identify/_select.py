@@ -67,9 +67,9 @@ from analysis.identify.verdict import (
     order_verdict,
     rivals,
 )
-from analysis.models import COEFFICIENT_OF, ORDER_RANGE, STRUCTURES
+from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
-from rigd.beam import clamped_free_eigenvalues
+from rigd.beam import COEFFICIENT_OF, clamped_free_eigenvalues
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Collection, Iterable, Mapping
@@ -82,8 +82,8 @@ if TYPE_CHECKING:
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._nonlinear import NonlinearForce
-    from analysis.identify._plant import Setting
     from analysis.identify._result import RecordFit
+    from analysis.identify._settings import Setting
     from analysis.identify._small_effects import SmallEffect
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify._time_varying import TemporalChange

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from analysis.identify._comparison import Comparison
     from analysis.identify._finding import Kind
     from analysis.identify._modal_fit import ModalFit
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 MIN_DEVIANCE_REDUCTION: Final = 16.0
 """Deviance by which an effect must reduce the residual. By chance one of nine effects does so in

@@ -29,13 +29,13 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify._finding import Finding
-from analysis.identify._predictor import ResponseGrid, eigenvalues, torque_channel_response
+from analysis.identify._predictor import eigenvalues
 from analysis.identify._refit import DESCENT_EVALUATIONS, Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
 from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
-from rigd.beam import CausalTransform
+from rigd.beam import CausalTransform, ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
     from analysis.identify._finding import Kind
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 
 # Search for changes along the record
@@ -391,7 +391,7 @@ def memory_torque(
     external_damping = damping.gamma * s**damping.lambda_
     inertial_term = beam.density_over_stiffness * s * s + external_damping
     changing_factor = internal_damping + 1 if changing_property == "stiffness" else internal_damping
-    angle_transform = transform.forward(comparison.angle_rad) * torque_channel_response(plant, s)
+    angle_transform = transform.forward(comparison.angle_rad) * plant.channel_response(s)
     total_torque = np.zeros(n)
 
     def in_time(laplace_transform: NDArray[np.complex128]) -> NDArray[np.float64]:

@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
-from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.statistics import NORMAL_95
+from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._problem import Projected
-    from analysis.identify.free_decay import Pole
     from analysis.identify.parametrization import Unknowns
+    from rigd.beam import Pole
 
 _MAX_CONDITION_NUMBER: Final = 1e13
 """Condition number of the scaled curvature from which the unknowns count as not determined."""

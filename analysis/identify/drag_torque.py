@@ -48,22 +48,27 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import BEAM_PARAMETERS
-from analysis.identify._predictor import eigenvalues, torque_channel_response
-from rigd.beam import AIR_DENSITY_KG_PER_M3, CausalTransform, DragGrid, poles_for_eigenvalues
+from analysis.identify._predictor import eigenvalues
+from rigd.beam import (
+    AIR_DENSITY_KG_PER_M3,
+    BEAM_PARAMETERS,
+    CausalTransform,
+    DragGrid,
+    poles_for_eigenvalues,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
     Real = NDArray[np.float64]
     Complex = NDArray[np.complex128]
     from collections.abc import Callable
 
-    from analysis.identify.free_decay import Pole
+    from rigd.beam import Pole
 
 DRAG_MODES: Final = 5
 """Number of beam modes that the drag force can excite in the computation."""
@@ -220,7 +225,7 @@ class DragResponse:
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
-        self._torque_channel = torque_channel_response(plant, s)
+        self._torque_channel = plant.channel_response(s)
         angle_transform = self._transform.forward(angle_rad)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
             self._inertial_response * s * angle_transform

@@ -8,121 +8,25 @@ form.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._predictor import eigenvalues
-from rigd.beam import LoadedBeam, pole_gradient, poles_for_eigenvalues
+from rigd.beam import Pole
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.identify._plant import Plant
-
 
 _HUM_DECAY_EXPONENT: Final = 1e-6
 """Decay of a hum over the whole record, so small that the hum is practically steady."""
 
 
-@dataclass(frozen=True, slots=True)
-class Pole:
-    """One pole of one mode: the upper one of a conjugate pair, or a real one.
-
-    Attributes
-    ----------
-    mode : int
-        Number of the mode, from 1.
-    at_rad_s : complex
-        Position of the pole in rad/s.
-    derivative : ndarray of complex, shape (k,)
-        Derivatives of the position by the requested parameters.
-    """
-
-    mode: int
-    at_rad_s: complex
-    derivative: NDArray[np.complex128]
-
-    @property
-    def oscillates(self) -> bool:
-        """Return whether the decay of this pole oscillates.
-
-        Then it has two spectra instead of one.
-        """
-        return self.at_rad_s.imag != 0
-
-
 def count_decay_spectra(poles: Sequence[Pole]) -> int:
     """Return the number of decay spectra of some poles: two for each that oscillates."""
     return sum(1 + pole.oscillates for pole in poles)
-
-
-def mode_poles(
-    plant: Plant, mode_count: int, wrt: Sequence[str], near_rad_s: Sequence[complex] = ()
-) -> tuple[Pole, ...]:
-    """Return the poles of the first `mode_count` modes of a beam, with their derivatives.
-
-    A mode for which no pole is found is left out.
-
-    Parameters
-    ----------
-    plant : Plant
-        Rig and beam.
-    mode_count : int
-        Number of modes.
-    wrt : sequence of str
-        Parameters of the derivatives, by the names of `ResponseGrid`. Some do not affect a pole.
-    near_rad_s : sequence of complex, optional
-        Approximate poles in the order of the modes, if all are known.
-    """
-    start_poles = np.array(near_rad_s) if len(near_rad_s) == mode_count > 0 else None
-    if plant.tip_mass_kg or plant.root_compliance_rad_per_nm:
-        return _loaded_poles(plant, mode_count, wrt, start_poles)
-    z = eigenvalues(mode_count).copy()
-    for mode_index, stiffness_offset in enumerate(
-        plant.stiffness_offsets[: mode_count - 1], start=1
-    ):
-        z[mode_index] *= (1 + stiffness_offset) ** 0.25
-    found_poles = []
-    for i, pole_pair in enumerate(poles_for_eigenvalues(z, plant.beam, plant.damping, start_poles)):
-        if np.isnan(pole_pair[0]):
-            continue
-        k4_per_m4 = float((z[i] / plant.beam.length_m) ** 4)
-        for pole in pole_pair[: 1 if pole_pair[0].imag else 2]:
-            pole_derivative = pole_gradient(
-                complex(pole), k4_per_m4, plant.beam, plant.damping, wrt
-            )
-            found_poles.append(
-                Pole(i + 1, complex(pole), pole_derivative.astype(np.complex128, copy=False))
-            )
-    return tuple(found_poles)
-
-
-def _loaded_poles(
-    plant: Plant, mode_count: int, wrt: Sequence[str], start_poles: NDArray[np.complex128] | None
-) -> tuple[Pole, ...]:
-    """Return the poles of a uniform beam with a tip mass or an elastic clamp, with derivatives."""
-    loaded_beam = LoadedBeam(
-        plant.beam, plant.damping, plant.tip_mass_kg, plant.root_compliance_rad_per_nm
-    )
-    mode_and_pole = [
-        (mode_number, pole)
-        for mode_number, pole_pair in enumerate(
-            loaded_beam.poles(eigenvalues(mode_count), start_poles), start=1
-        )
-        if not np.isnan(pole_pair).any()
-        for pole in pole_pair[: 1 if pole_pair[0].imag else 2]
-    ]
-    pole_derivatives = loaded_beam.pole_gradients(
-        np.array([pole for _, pole in mode_and_pole], dtype=np.complex128), wrt
-    )
-    return tuple(
-        Pole(mode_number, complex(pole), row)
-        for (mode_number, pole), row in zip(mode_and_pole, pole_derivatives, strict=True)
-    )
 
 
 class DecaySpectra:

@@ -14,15 +14,14 @@ from dataclasses import KW_ONLY, dataclass, field, replace
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
-from analysis.identify._plant import BEAM_PARAMETERS
 from analysis.identify.verdict import (
     BIC_DECISIVE,
     EXCLUSION_DEVIANCES,
     SECOND_DAMPING_REASON,
     WITH_DRAG_REASON,
 )
-from analysis.models import COEFFICIENT_OF
 from analysis.statistics import NORMAL_95
+from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping

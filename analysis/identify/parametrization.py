@@ -25,23 +25,23 @@ the same.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import SETTINGS, Plant
+from analysis.identify._settings import SETTINGS
 from analysis.models import ORDER_RANGE, SIZE_RANGE
-from rigd.beam import Beam, undamped_frequencies_rad_s
+from rigd.beam import DAMPING_PARAMETERS, Plant, gradient_name, undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from numpy.typing import NDArray
 
-    from analysis.identify._plant import Setting
+    from analysis.identify._settings import Setting
     from analysis.models import Structure
 
 
@@ -55,12 +55,6 @@ _DELAY_UNIT_S: Final = 1e-3
 
 _DELAY_RANGE_S: Final = 0.02
 """Largest magnitude of the delay in seconds."""
-
-_GRADIENT_NAMES: Final[Mapping[str, str]] = {
-    "density_over_stiffness": "ln_density_over_stiffness",
-    "bending_stiffness_n_m2": "ln_stiffness",
-}
-"""Names of parameters whose derivatives the prediction has by their logarithms."""
 
 _QUARTER_TURN_RAD: Final = math.pi / 2
 """Phase of ``s^1`` on the imaginary axis, in radians."""
@@ -124,9 +118,7 @@ class Unknowns:
 
         Beam parameters are logarithms there.
         """
-        return tuple(
-            _GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in self.names
-        )
+        return tuple(map(gradient_name, self.names))
 
     @property
     def bounds(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -252,24 +244,8 @@ class Unknowns:
 
     def _plant_of(self, parameter_values: Mapping[str, float]) -> Plant:
         """Return the rig and beam for values of all parameters, by name."""
-        density_over_stiffness, stiffness_n_m2 = (
-            parameter_values["density_over_stiffness"],
-            parameter_values["bending_stiffness_n_m2"],
-        )
-        return replace(
-            self.nominal,
-            beam=Beam(
-                self.nominal.beam.length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2
-            ),
-            damping=self.structure.damping(
-                {
-                    parameter_name: parameter_values[parameter_name]
-                    for parameter_name in self.structure.free
-                }
-            ),
-            delay_s=parameter_values["delay_s"],
-            tool_inertia_kg_m2=parameter_values["tool_inertia_kg_m2"],
-        )
+        names = (*DAMPING_PARAMETERS, *SETTINGS)
+        return self.nominal.with_parameters({name: parameter_values[name] for name in names})
 
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return all plant parameters by name, free and fixed, for a vector of unknowns."""

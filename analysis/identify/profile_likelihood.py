@@ -17,7 +17,8 @@ import numpy as np
 
 from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
 from analysis.identify._refit import MISSED_COST_FRACTION, Refit
-from analysis.models import COEFFICIENT_OF, ORDER_RANGE, PARAMETERS, Structure
+from analysis.models import ORDER_RANGE, Structure
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -26,7 +27,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._plant import Plant
+    from rigd.beam import Plant
 
 
 # Profile
@@ -330,7 +331,9 @@ def with_free_order(structure: Structure, order: Order) -> Structure:
         if parameter_name not in (damping_coefficient, order)
     }
     free_names = tuple(
-        parameter_name for parameter_name in PARAMETERS if parameter_name not in fixed_values
+        parameter_name
+        for parameter_name in DAMPING_PARAMETERS
+        if parameter_name not in fixed_values
     )
     return Structure(structure.name, free_names, MappingProxyType(fixed_values))
 

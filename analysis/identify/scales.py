@@ -21,8 +21,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._plant import LOGARITHMIC_PARAMETERS
 from analysis.statistics import NORMAL_95
+from rigd.beam import LOGARITHMIC_PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Mapping

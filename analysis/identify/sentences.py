@@ -9,6 +9,7 @@ from analysis.identify._visible_modes import is_excited
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION, ONE_MODE_REASON
 from analysis.identify.verdict import SECOND_DAMPING_REASON, deviance_of_order_one
 from analysis.statistics import NORMAL_95
+from rigd.beam import DAMPING_PARAMETERS
 from rigd.printable import listed
 from rigd.units import decimals, to_uncertainty
 
@@ -272,7 +273,7 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
     )
     number_texts = [
         f"{parameter_name} = {_value_and_interval_text(simpler.parameters[parameter_name])}"
-        for parameter_name in ("zeta", "alpha", "gamma", "lambda")
+        for parameter_name in DAMPING_PARAMETERS
         if parameter_name in simpler.parameters
     ]
     return (

@@ -18,11 +18,16 @@ import numpy as np
 
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
-from analysis.identify._plant import LOGARITHMIC_PARAMETERS
-from analysis.identify._predictor import torque_channel_response
 from analysis.optimizer import Box, NormalEquations, descend
 from analysis.statistics import NORMAL_95, chi_square_p_value
-from rigd.beam import Beam, Damping, clamped_free_eigenvalues
+from rigd.beam import (
+    BEAM_PARAMETERS,
+    DAMPING_PARAMETERS,
+    LOGARITHMIC_PARAMETERS,
+    Beam,
+    Damping,
+    clamped_free_eigenvalues,
+)
 from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:
@@ -32,18 +37,10 @@ if TYPE_CHECKING:
 
     from analysis.identify._altered_beam import ModeTerms
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify._plant import Plant
     from analysis.optimizer import Minimum
+    from rigd.beam import Plant
 
-PARAMETERS: Final = (
-    "zeta",
-    "alpha",
-    "gamma",
-    "lambda",
-    "density_over_stiffness",
-    "bending_stiffness_n_m2",
-    "delay_s",
-)
+PARAMETERS: Final = (*DAMPING_PARAMETERS, *BEAM_PARAMETERS, "delay_s")
 """Names of the seven uniform-beam parameters that determine the modal constants."""
 
 _START_ORDERS: Final = (0.4, 1.0, 1.6)
@@ -114,9 +111,6 @@ _IDLE_CURVATURE: Final = 1e-4
 
 _DAMPING_COEFFICIENTS: Final = ("zeta", "gamma")
 """Damping coefficients that are tested for their absence."""
-
-_PROFILED_PARAMETERS: Final = ("zeta", "alpha", "gamma", "lambda")
-"""Parameters whose intervals come from the profile of chi-square."""
 
 _MAX_PROFILE_STEPS: Final = 8
 """Largest number of values at which the profile is computed towards one end of an interval."""
@@ -316,7 +310,7 @@ class UniformBeamProblem:
             if np.abs(pole_step).max() < _POLE_TOLERANCE * np.abs(s).max():
                 break
         s = np.where((s.imag > 0) & (s.real < 0), s, complex(np.nan, np.nan))
-        channel_response = torque_channel_response(replace(self.nominal, delay_s=0.0), s) * np.exp(
+        channel_response = replace(self.nominal, delay_s=0.0).channel_response(s) * np.exp(
             -delay_s * s
         )
         channel_response = channel_response * mode_terms.alteration.channel(s)
@@ -801,7 +795,7 @@ def _estimate_at_minimum(
             float(parameter_values[parameter_index]),
             float(parameter_stds[parameter_index]),
         )
-        if parameter_name in _PROFILED_PARAMETERS:
+        if parameter_name in DAMPING_PARAMETERS:
             lower_end, upper_end = (
                 _interval_end(problem, parameter_index, best_minimum, interval_side * parameter_std)
                 for interval_side in (-1.0, 1.0)

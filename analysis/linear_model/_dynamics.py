@@ -14,14 +14,14 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import ResponseGrid
-from rigd.beam import LoadedBeam, clamped_free_eigenvalues
+from rigd.beam import ResponseGrid, clamped_free_eigenvalues
 from rigd.errors import UserError
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
-    from analysis.identify import ModalModel, Plant
+    from analysis.identify import ModalModel
+    from rigd.beam import Plant
 
 Response = Callable[[NDArray[np.complex128]], NDArray[np.complex128]]
 """Function from s in rad/s to a frequency response."""
@@ -195,11 +195,6 @@ def _beam_poles(
 
     The upper poles include a few modes beyond the band. The real poles are those within the band.
     """
-    if plant.tip_mass_kg and any(plant.stiffness_offsets):
-        raise LinearModelError(
-            "The model has a tip mass and modes of their own stiffness, which together are not "
-            "defined; export the modal model, without --beam."
-        )
     quartic_eigenvalue_limit = (
         2 * np.pi * BEAM_BAND_HZ[1]
     ) ** 2 * plant.beam.density_over_stiffness
@@ -209,20 +204,13 @@ def _beam_poles(
             f"{plant.beam} has some {mode_count} modes below {BEAM_BAND_HZ[1]:g} Hz, and a model "
             f"of at most {_MAX_BEAM_MODES} is exported; check length and stiffness."
         )
-    loaded_beam = LoadedBeam(
-        plant.beam,
-        plant.damping,
-        plant.tip_mass_kg,
-        plant.root_compliance_rad_per_nm,
-        plant.stiffness_offsets,
-    )
-    poles_rad_s = loaded_beam.poles(clamped_free_eigenvalues(mode_count + _MODES_BEYOND_BAND + 1))
+    poles_rad_s = plant.poles(clamped_free_eigenvalues(mode_count + _MODES_BEYOND_BAND + 1))
     missing_modes = np.flatnonzero(np.isnan(poles_rad_s[:, 0]))
     poles_rad_s = poles_rad_s[: missing_modes[0] if missing_modes.size else None]
     upper_poles_rad_s, band_end_rad_s = poles_rad_s[:, 0], 2 * np.pi * BEAM_BAND_HZ[1]
     modes_beyond_band = np.flatnonzero(np.abs(upper_poles_rad_s) >= band_end_rad_s)
     if missing_modes.size and not modes_beyond_band.size:
-        raise LinearModelError(f"The poles of {loaded_beam} were not found; check its parameters.")
+        raise LinearModelError(f"The poles of {plant} were not found; check its parameters.")
     is_oscillating = upper_poles_rad_s.imag > 0
     is_realised = (np.abs(upper_poles_rad_s) < band_end_rad_s) | (
         -upper_poles_rad_s.real < _MAX_OSCILLATING_DAMPING_RATIO * np.abs(upper_poles_rad_s)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
-from analysis.identify import BACKGROUND_COEFFICIENTS, ModalModel, Plant
+from analysis.identify import BACKGROUND_COEFFICIENTS, ModalModel
 from analysis.linear_model._dynamics import (
     LinearModelError,
     UncertainDynamics,
@@ -17,7 +17,7 @@ from analysis.linear_model._dynamics import (
     modal_dynamics,
 )
 from analysis.linear_model._modal_constants import constant_value, with_changed_constants
-from rigd.beam import Beam, Damping
+from rigd.beam import OFFSET_PREFIX, Plant, parameter_named
 from rigd.identified_beam import (
     findings_without_parameter,
     parameter_values,
@@ -37,9 +37,6 @@ _ANALYZE_AGAIN_ADVICE: Final = "analyze the session again"
 _LOGARITHM_PREFIX: Final = "ln_"
 """Prefix of the name of a parameter whose logarithm has the covariance."""
 
-_STIFFNESS_OFFSET_PREFIX: Final = "stiffness_offset_"
-"""Prefix of the name of the stiffness offset of one mode; its number follows."""
-
 _MAX_OFFSET_MODE: Final = 50
 """Largest mode number that a stiffness offset may have."""
 
@@ -53,12 +50,6 @@ _REASONS_TO_LEAVE_OUT: Final = {
 """Parameters that a linear model from motion to torque leaves out, and why. A clock rate difference
 is a parameter in documents of older versions only, as offsets of modes and the compliance of the
 clamp are."""
-_SIGNED_PREFIXES: Final = ("delay_s", _STIFFNESS_OFFSET_PREFIX)
-"""Prefixes of parameters that may be negative."""
-
-_ORDER_NAMES: Final = ("alpha", "lambda")
-"""Names of the damping orders."""
-
 _DEFAULT_BAND_HZ: Final = (0.05, 50.0)
 """Band of a document that does not state its band."""
 
@@ -455,60 +446,37 @@ def _is_finite(complex_number: complex) -> bool:
 
 def _is_possible_beam(sampled_values: Mapping[str, float]) -> bool:
     """Return whether sampled parameters describe a physically possible beam."""
-    has_valid_orders = all(
-        0 <= sampled_values[parameter_name] < 2
-        for parameter_name in _ORDER_NAMES
-        if parameter_name in sampled_values
-    )
-    has_valid_signs = all(
-        parameter_value >= 0
-        or parameter_name in _REASONS_TO_LEAVE_OUT
-        or parameter_name.startswith(_SIGNED_PREFIXES)
+    return all(
+        parameter_name in _REASONS_TO_LEAVE_OUT
+        or parameter_named(parameter_name).is_valid(parameter_value)
         for parameter_name, parameter_value in sampled_values.items()
     )
-    return has_valid_orders and has_valid_signs
 
 
 def _plant_of_parameters(beam_values: Mapping[str, float], length_m: float) -> Plant:
     """Return the rig with a beam of given parameters, by name, and length in metres."""
-    density_over_stiffness, stiffness_n_m2 = (
-        beam_values["density_over_stiffness"],
-        beam_values["bending_stiffness_n_m2"],
-    )
     last_offset_mode = max(
         (
-            int(key_name.removeprefix(_STIFFNESS_OFFSET_PREFIX))
+            int(key_name.removeprefix(OFFSET_PREFIX))
             for key_name in beam_values
-            if key_name.startswith(_STIFFNESS_OFFSET_PREFIX)
+            if key_name.startswith(OFFSET_PREFIX)
         ),
         default=1,
     )
     if last_offset_mode > _MAX_OFFSET_MODE:
         raise LinearModelError(
-            f"{_STIFFNESS_OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
+            f"{OFFSET_PREFIX}{last_offset_mode} is of a mode beyond the band; "
             f"{_ANALYZE_AGAIN_ADVICE}."
         )
-    return Plant(
-        beam=Beam(length_m, density_over_stiffness * stiffness_n_m2, stiffness_n_m2),
-        damping=Damping(
-            zeta=beam_values.get("zeta", 0.0),
-            alpha=beam_values.get("alpha", 1.0),
-            gamma=beam_values.get("gamma", 0.0),
-            lambda_=beam_values.get("lambda", 1.0),
-        ),
-        stiffness_offsets=tuple(
-            beam_values.get(f"{_STIFFNESS_OFFSET_PREFIX}{mode_number}", 0.0)
-            for mode_number in range(2, last_offset_mode + 1)
-        ),
-        **{
-            parameter_name: beam_values.get(parameter_name, 0.0)
-            for parameter_name in (
-                "delay_s",
-                "tool_inertia_kg_m2",
-                "root_compliance_rad_per_nm",
-                "tip_mass_kg",
-                "filter_time_constant_s",
-                "second_order_filter_time_constant_s",
-            )
-        },
-    )
+    plant_values = {
+        parameter_name: parameter_value
+        for parameter_name, parameter_value in beam_values.items()
+        if parameter_name not in _REASONS_TO_LEAVE_OUT
+    }
+    try:
+        return Plant.from_parameters(length_m, plant_values)
+    except ValueError:
+        raise LinearModelError(
+            "The model has a tip mass and modes of their own stiffness, which together are not "
+            "defined; export the modal model, without --beam."
+        ) from None

@@ -36,18 +36,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from analysis.models import (
-    PARAMETERS,
     STRUCTURES,
     DampingUnknowns,
     FrequencyResponseModel,
-    Parameter,
     Structure,
     Weighting,
     weighting_name,
     weights,
 )
 from analysis.optimizer import Box, Minimum, NormalEquations, RecentValues, descend
-from rigd.beam import Beam, Damping
+from rigd.beam import DAMPING_PARAMETERS, Beam, Damping, DampingParameter
 
 # Fits
 
@@ -290,7 +288,9 @@ def _fit(
         structure=structure,
         weighting=weighting,
         damping=unknowns.damping(best_minimum.x),
-        parameters={parameter_name: parameters[parameter_name] for parameter_name in PARAMETERS},
+        parameters={
+            parameter_name: parameters[parameter_name] for parameter_name in DAMPING_PARAMETERS
+        },
         std=None if are_at_bound.any() else _standard_deviations(whole_problem, best_minimum.x),
         cost=best_minimum.cost,
         at_bounds=tuple(
@@ -337,7 +337,7 @@ def _standard_deviations(
     variance_by_name = dict(zip(frf_problem.unknowns.structure.free, variances, strict=True))
     return {
         parameter_name: math.sqrt(max(float(variance_by_name.get(parameter_name, 0.0)), 0.0))
-        for parameter_name in PARAMETERS
+        for parameter_name in DAMPING_PARAMETERS
     }
 
 
@@ -408,7 +408,7 @@ def thinned(
 
 # Starts
 
-_START_GRID: Final[dict[Parameter, tuple[float, ...]]] = {
+_START_GRID: Final[dict[DampingParameter, tuple[float, ...]]] = {
     "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
     "alpha": (0.3, 0.8, 1.3, 1.8),
     "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),

@@ -17,7 +17,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 import rigd
-from analysis.identify import ResponseGrid
 from analysis.models import FrequencyResponseModel
 from analysis.paper import fit_indices
 from analysis.report._shown_model import ShownModel
@@ -25,6 +24,7 @@ from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report.table import unreported_parameters
 from analysis.results import finite
 from analysis.statistics import nrmse_percent
+from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence

@@ -8,7 +8,6 @@ from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
-from analysis.models import QUANTITIES
 from analysis.paper import LARGEST_FREQUENCY_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
@@ -25,6 +24,7 @@ from analysis.report.table import (
     number_cell,
     unreported_parameters,
 )
+from rigd.beam import DAMPING_PARAMETERS, PARAMETERS
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
@@ -33,8 +33,6 @@ if TYPE_CHECKING:
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.results import WholeRecord
 
-_DAMPING_PARAMETERS: Final = ("zeta", "alpha", "gamma", "lambda")
-"""Names of the damping parameters."""
 _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by the data."
 """Note on estimates at the limit of the search range."""
 
@@ -121,7 +119,7 @@ def _damping_columns() -> list[Column]:
     """Return the columns of value and standard deviation of each damping parameter."""
     return [
         value_column
-        for parameter_name in _DAMPING_PARAMETERS
+        for parameter_name in DAMPING_PARAMETERS
         for value_column in (
             Column(_parameter_heading(parameter_name), parameter_name),
             Column("std", f"{parameter_name}_std", std_of_previous=True),
@@ -143,7 +141,7 @@ def _damping_cells(
     """
     not_reported = unreported_parameters(structure, unsupported_orders)
     parameter_cells: list[Cell] = []
-    for parameter_name in _DAMPING_PARAMETERS:
+    for parameter_name in DAMPING_PARAMETERS:
         if not structure.has(parameter_name):
             parameter_cells += [number_cell(None), number_cell(None)]
             continue
@@ -153,7 +151,7 @@ def _damping_cells(
         value_cell, std_cell = estimate_cells(
             (parameters[parameter_name], parameter_std),
             parameter_std,
-            QUANTITIES[parameter_name][3],
+            PARAMETERS[parameter_name].display_factor,
         )
         if parameter_name in at_bounds:
             value_cell = replace(value_cell, text=f"{value_cell.text}*")
@@ -170,8 +168,10 @@ def _parameter_heading(parameter_name: str) -> str:
 
     The units are omitted, because they depend on the orders and would be too long.
     """
-    parameter_symbol, _meaning, unit, display_factor = QUANTITIES[parameter_name]
-    return parameter_symbol if display_factor == 1.0 else f"{parameter_symbol} ({unit.split()[0]})"
+    definition = PARAMETERS[parameter_name]
+    if definition.display_factor == 1.0:
+        return definition.symbol
+    return f"{definition.symbol} ({definition.display_unit.split()[0]})"
 
 
 _NAME_COLUMNS: Final = (
@@ -237,7 +237,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
         parameter_values, index_values = (
             {key: [file_values[key] for file_values in results_of_files] for key in fit_keys}
             for fit_keys, results_of_files in (
-                (_DAMPING_PARAMETERS, [fit.parameters for fit in model_fits]),
+                (DAMPING_PARAMETERS, [fit.parameters for fit in model_fits]),
                 (_INDEX_NAMES, [asdict(model.indices) for model in same_models]),
             )
         )

@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
     from analysis.campaigns import CampaignResult
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
-    from analysis.identify import ModeEstimate, Plant
+    from analysis.identify import ModeEstimate
     from analysis.models import Structure
+    from rigd.beam import Plant
 
 _FREEST_TYPE: Final = "VI"
 """Damping structure with internal and external damping, both of free order."""
@@ -348,7 +349,7 @@ def _draw_sessions(
     grid_hz: NDArray[np.float64],
 ) -> float:
     """Draw the response of each session; return the lower limit of their magnitudes in dB."""
-    from analysis.identify import ResponseGrid
+    from rigd.beam import ResponseGrid
 
     lowest_db = np.inf
     for session in shown_sessions(campaign):

@@ -6,7 +6,6 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
-from analysis.models import QUANTITIES
 from analysis.report._scales import scale_notes
 from analysis.report._shown_model import ShownModel
 from analysis.report.table import (
@@ -23,6 +22,7 @@ from analysis.report.table import (
     number_cell,
 )
 from analysis.statistics import NORMAL_95
+from rigd.beam import parameter_named
 from rigd.printable import listed
 
 if TYPE_CHECKING:
@@ -321,19 +321,18 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
     if simpler_estimates is None:
         return None
     assumption_text = " and ".join(
-        f"{QUANTITIES[parameter_name][0]} = {fixed_value:g}"
+        f"{parameter_named(parameter_name).symbol} = {fixed_value:g}"
         for parameter_name, fixed_value in simpler_estimates.fixed.items()
     )
     table_rows: list[tuple[Entry, ...]] = []
     for parameter_name, simpler_value in simpler_estimates.parameters.items():
-        parameter_symbol, _meaning, unit_symbol, display_factor = _parameter_description(
-            parameter_name
-        )
+        definition = parameter_named(parameter_name)
+        display_factor = definition.display_factor
         free_value = headline.parameters.get(parameter_name)
         table_rows.append(
             (
-                Cell(parameter_name, parameter_symbol),
-                _unit_cell(unit_symbol),
+                Cell(parameter_name, definition.symbol),
+                _unit_cell(definition.display_unit),
                 *estimate_cells(
                     (simpler_value.value, *_interval_ends(simpler_value)),
                     simpler_value.std,
@@ -375,7 +374,9 @@ def simpler_structure_table(whole_record: WholeRecord) -> Table | None:
 def correlations_table(whole_record: WholeRecord) -> Table:
     """Return the table of correlations between the determined parameters of the selected fit."""
     fit = whole_record.fit
-    parameter_symbols = [_parameter_symbol(parameter_name) for parameter_name in fit.determined]
+    parameter_symbols = [
+        parameter_named(parameter_name).symbol for parameter_name in fit.determined
+    ]
     return Table.of(
         "correlations",
         "Correlations of the parameters on an exactly uniform beam, "
@@ -413,9 +414,8 @@ def _parameter_row(
     is_fixed: bool,
 ) -> tuple[Entry, ...]:
     """Return the row of a parameter in a table: symbol, meaning, unit, values and remark."""
-    parameter_symbol, parameter_meaning, unit_symbol, display_factor = _parameter_description(
-        parameter_name
-    )
+    definition = parameter_named(parameter_name)
+    display_factor = definition.display_factor
     value_cells = estimate_cells(
         (parameter.value, parameter.std or None, *_interval_ends(parameter)),
         parameter.std,
@@ -432,9 +432,9 @@ def _parameter_row(
     if parameter.flag is not None:
         value_cells = (mark_cell(value_cells[0]), *map(grey_cell, value_cells[1:]))
     return (
-        Cell(parameter_name, parameter_symbol),
-        parameter_meaning,
-        _unit_cell(unit_symbol),
+        Cell(parameter_name, definition.symbol),
+        definition.meaning,
+        _unit_cell(definition.display_unit),
         *value_cells,
         "fixed" if is_fixed else parameter.flag or "",
     )
@@ -492,24 +492,6 @@ def _reason_notes(reported_values: Iterable[ReportedValue]) -> tuple[str, ...]:
         reported_value.flag for reported_value in reported_values if reported_value.flag is not None
     )
     return tuple(f"{NOT_REPORTED_MARK} {flag_text}." for flag_text in flag_texts)
-
-
-def _parameter_description(parameter_name: str) -> tuple[str, str, str, float]:
-    """Return the symbol, meaning, unit and factor of a parameter."""
-    default_description = (
-        _parameter_symbol(parameter_name),
-        "stiffness beyond the uniform beam's",
-        "%",
-        100.0,
-    )
-    return QUANTITIES.get(parameter_name, default_description)
-
-
-def _parameter_symbol(parameter_name: str) -> str:
-    """Return the symbol of a parameter; of a stiffness correction, δ and the mode's number."""
-    if parameter_name in QUANTITIES:
-        return QUANTITIES[parameter_name][0]
-    return f"δ{parameter_name.rsplit('_', 1)[-1]}"
 
 
 def _correlation_cell(is_diagonal: bool, correlation_value: float) -> Cell:

@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify.scales import SCALE_EXPONENTS, density_check, parameters_compensate_scales
-from analysis.models import QUANTITIES
 from analysis.report.table import estimate_cells
+from rigd.beam import parameter_named
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping
@@ -22,7 +22,9 @@ _SUPERSCRIPTS: Final = str.maketrans("-123456789", "⁻¹²³⁴⁵⁶⁷⁸⁹"
 def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
     """Yield notes on the scales: which uncertainties the intervals include, and which not."""
     if not parameters_compensate_scales(whole_record.fit):
-        held_parameters = ", ".join(QUANTITIES[scale_key][0] for scale_key in whole_record.fixed)
+        held_parameters = ", ".join(
+            parameter_named(scale_key).symbol for scale_key in whole_record.fixed
+        )
         yield (
             f"Intervals are statistical only: the file's values of {held_parameters}, "
             "which were held, the torque scale and the length are assumed exact."
@@ -79,9 +81,9 @@ def scale_notes(whole_record: WholeRecord) -> Iterator[str]:
 def _scale_dependence(whole_record: WholeRecord) -> str:
     """Return as text how each parameter depends on the scales, as products of their powers."""
     return ", ".join(
-        f"{QUANTITIES[parameter_name][0]} ∝ {_product_text(SCALE_EXPONENTS[parameter_name])}"
-        for parameter_name in whole_record.headline.parameters
-        if parameter_name in SCALE_EXPONENTS
+        f"{parameter_named(name).symbol} ∝ {_product_text(SCALE_EXPONENTS[name])}"
+        for name in whole_record.headline.parameters
+        if name in SCALE_EXPONENTS
     )
 
 

@@ -12,10 +12,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from analysis.identify import ModalFit, ModalModel, Plant, RecordFit
+    from analysis.identify import ModalFit, ModalModel, RecordFit
     from analysis.identify.headline import Headline
     from analysis.record import Record
     from analysis.report.bands import ResponseBand
+    from rigd.beam import Plant
 
     # Array of real numbers.
     Real = NDArray[np.float64]

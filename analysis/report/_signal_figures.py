@@ -21,10 +21,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify import ModalModel, Plant
+    from analysis.identify import ModalModel
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
+    from rigd.beam import Plant
 
     # Matplotlib's properties of a line.
     LineStyle = dict[str, Any]

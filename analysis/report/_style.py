@@ -23,9 +23,10 @@ from matplotlib.patches import PathPatch
 from matplotlib.path import Path as Outline
 from matplotlib.ticker import FixedLocator, FuncFormatter, NullFormatter, NullLocator
 
-from analysis.models import QUANTITIES, STRUCTURES
+from analysis.models import STRUCTURES
 from analysis.report.folder import write_new
 from analysis.results import FIGURE_FORMATS
+from rigd.beam import parameter_named
 from rigd.spectral import magnitude_db
 
 if TYPE_CHECKING:
@@ -404,7 +405,7 @@ def type_panels(
         )
         magnitude_axes, phase_axes = figure.add_subplot(subgrid[0]), figure.add_subplot(subgrid[1])
         symbols = ", ".join(
-            QUANTITIES[parameter_name][0] for parameter_name in STRUCTURES[type_name].free
+            parameter_named(parameter_name).symbol for parameter_name in STRUCTURES[type_name].free
         )
         magnitude_axes.set_title(f"({ascii_lowercase[panel_number]}) Type {type_name}   {symbols}")
         magnitude_axes.set_ylim(db_limits)

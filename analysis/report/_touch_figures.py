@@ -160,7 +160,7 @@ def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
             if t.point_m is not None
         ]
     )
-    length_m = max(session.model.beam.length_m for session in touched_sessions)
+    length_m = max(session.model.plant.beam.length_m for session in touched_sessions)
     spread_m = float(np.ptp(contact_points_m, axis=0).max())
     has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)

@@ -7,21 +7,22 @@ from typing import TYPE_CHECKING, Final, Protocol
 
 import numpy as np
 
-from analysis.identify import LOGARITHMIC_PARAMETERS, ResponseGrid
 from analysis.identify.uniform_beam import PARAMETERS
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
+from rigd.beam import LOGARITHMIC_PARAMETERS, ResponseGrid, gradient_name
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
 
-    from analysis.identify import ModalFit, Plant, RecordAnalysis
+    from analysis.identify import ModalFit, RecordAnalysis
     from analysis.identify.uniform_beam import TolerantEstimate
     from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord
+    from rigd.beam import Plant
 
     # Lowest and highest frequency of a band, in hertz.
     Band = tuple[float, float]
@@ -201,12 +202,6 @@ def dense_grid(first_hz: float, last_hz: float, peaks_hz: Sequence[float]) -> Re
 
 _QUARTER_TURN: Final = np.pi / 2
 """Phase of the imaginary unit, in radians."""
-_GRADIENT_NAMES: Final = {
-    "density_over_stiffness": "ln_density_over_stiffness",
-    "bending_stiffness_n_m2": "ln_stiffness",
-}
-"""Names under which the response's derivatives by a parameter's logarithm are computed, by
-parameter."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,14 +254,15 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     parameter_names = [fit.determined[i] for i in parameter_indices]
     response, *derivatives = ResponseGrid(2j * np.pi * frequency_hz).evaluate(
         delay_free_plant,
-        [_GRADIENT_NAMES.get(parameter_name, parameter_name) for parameter_name in parameter_names],
+        [gradient_name(parameter_name) for parameter_name in parameter_names],
     )
     log_response_gradient = np.empty((len(parameter_names), frequency_hz.size), dtype=np.complex128)
     for gradient_row, parameter_name, response_derivative in zip(
         log_response_gradient, parameter_names, derivatives, strict=True
     ):
         scale_by_value = (
-            parameter_name in LOGARITHMIC_PARAMETERS and parameter_name not in _GRADIENT_NAMES
+            parameter_name in LOGARITHMIC_PARAMETERS
+            and gradient_name(parameter_name) == parameter_name
         )
         gradient_row[:] = (
             response_derivative

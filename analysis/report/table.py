@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
-from analysis.models import COEFFICIENT_OF
+from rigd.beam import COEFFICIENT_OF
 from rigd.units import to_uncertainty
 
 if TYPE_CHECKING:

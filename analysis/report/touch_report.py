@@ -296,7 +296,7 @@ def _collect_facts(touched_sessions: Sequence[TouchedSession]) -> list[Facts]:
 
 def _beam_text(session: TouchedSession) -> str:
     """Return length, density and bending stiffness of a session's beam model as text."""
-    model_beam = session.model.beam
+    model_beam = session.model.plant.beam
     return (
         f"length {model_beam.length_m:g} m, density {model_beam.density_kg_per_m:.5g} kg/m, "
         f"bending stiffness {model_beam.bending_stiffness_n_m2:.5g} N·m²"

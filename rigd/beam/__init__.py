@@ -2,8 +2,9 @@
 
 Offers the transfer function from motor angle to coupling torque (`transfer`, `TransferGrid`), the
 modes and their poles (`modes`, `poles`), the deflection (`DeflectionFilter`), a force at a point of
-the beam (`PointForceGrid`, `realise_force`), a beam with a tip mass (`LoadedBeam`), the air's drag
-(`DragGrid`), and responses in time from transfer functions (`CausalTransform`). Its public module
+the beam (`PointForceGrid`, `realise_force`), the whole of beam, ends and torque channel (`Plant`)
+with the table of its parameters (`PARAMETERS`), the air's drag (`DragGrid`), and responses in time
+from transfer functions (`CausalTransform`). Its public module
 `realisation` has the state space that runs in real time, and `tip` the motion of the free end. It
 knows of no rig and no file.
 """

@@ -87,7 +87,7 @@ class Damping:
 
 # Transfer function
 
-PARAMETERS = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
+GRADIENT_NAMES = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
 """Names of the parameters by which the transfer function G can be differentiated.
 
 Each derivative holds the other five parameters constant."""
@@ -156,7 +156,7 @@ class TransferGrid:
         return g.reshape(self.shape)
 
     def evaluate_with_gradient(
-        self, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
+        self, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
     ) -> tuple[Complex, Complex]:
         """Return the coupling torque per motor angle and its derivatives by parameters.
 
@@ -165,7 +165,7 @@ class TransferGrid:
         beam, damping
             Parameters at which G is evaluated.
         wrt
-            Names from `PARAMETERS`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
+            Names from `GRADIENT_NAMES`. ``ln_density_over_stiffness`` is ln(rho/EI) at constant EI,
             ``ln_stiffness`` is ln(EI) at constant rho/EI and gamma.
 
         Returns
@@ -178,12 +178,12 @@ class TransferGrid:
         Raises
         ------
         ValueError
-            If a name is not one of `PARAMETERS`.
+            If a name is not one of `GRADIENT_NAMES`.
         """
-        unknown_names = set(wrt) - set(PARAMETERS)
+        unknown_names = set(wrt) - set(GRADIENT_NAMES)
         if unknown_names:
             raise ValueError(
-                f"{sorted(unknown_names)} are not parameters of G: choose from {PARAMETERS}."
+                f"{sorted(unknown_names)} are not parameters of G: choose from {GRADIENT_NAMES}."
             )
         per_length = -beam.bending_stiffness_n_m2 / beam.length_m
         stiffness_volume = beam.bending_stiffness_n_m2 * beam.length_m**3
@@ -270,7 +270,7 @@ def transfer(s: ArrayLike, beam: Beam, damping: Damping) -> Complex:
 
 
 def transfer_and_gradient(
-    s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = PARAMETERS[:4]
+    s: ArrayLike, beam: Beam, damping: Damping, wrt: Sequence[str] = GRADIENT_NAMES[:4]
 ) -> tuple[Complex, Complex]:
     """Return the coupling torque per motor angle at `s`, and its derivatives by parameters.
 
@@ -281,7 +281,7 @@ def transfer_and_gradient(
     beam, damping
         Parameters of the exact model.
     wrt
-        Names from `PARAMETERS`: see `TransferGrid.evaluate_with_gradient`.
+        Names from `GRADIENT_NAMES`: see `TransferGrid.evaluate_with_gradient`.
 
     Returns
     -------
@@ -293,7 +293,7 @@ def transfer_and_gradient(
     Raises
     ------
     ValueError
-        If a name is not one of `PARAMETERS`.
+        If a name is not one of `GRADIENT_NAMES`.
 
     Examples
     --------

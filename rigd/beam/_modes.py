@@ -313,8 +313,8 @@ def pole_gradient(
     beam, damping
         Parameters of the exact model.
     wrt
-        Names of `rigd.beam.PARAMETERS`. The derivative with respect to a parameter that does not
-        affect the pole is 0.
+        Names of `rigd.beam.GRADIENT_NAMES`. The derivative with respect to a parameter that does
+        not affect the pole is 0.
 
     Examples
     --------

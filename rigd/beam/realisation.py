@@ -22,9 +22,9 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from rigd.beam._model import Beam, Damping, TransferGrid
+from rigd.beam._model import Beam, Damping
 from rigd.beam._modes import clamped_free_eigenvalues
-from rigd.beam._tip_mass import LoadedBeam
+from rigd.beam._plant import Plant
 from rigd.errors import UserError
 
 ERROR_BAND_HZ = (0.05, 100.0)
@@ -221,25 +221,14 @@ def _basis_functions(s: Complex, poles: Complex) -> Complex:
 
 
 def realise(
-    beam: Beam,
-    damping: Damping,
-    *,
-    max_relative_error: float = 1e-3,
-    tip_mass_kg: float = 0.0,
-    root_compliance_rad_per_nm: float = 0.0,
-    stiffness_offsets: tuple[float, ...] = (),
-    modes_of: Beam | None = None,
+    plant: Plant, *, max_relative_error: float = 1e-3, modes_of: Beam | None = None
 ) -> Realisation:
     """Fit a finite-dimensional state space to the exact model of the beam.
 
     Parameters
     ----------
-    beam, damping
-        Parameters of the exact model.
-    tip_mass_kg, root_compliance_rad_per_nm
-        Point mass at its tip, and rotation of its clamp per torque.
-    stiffness_offsets
-        Relative differences of the stiffness of modes 2, 3, … from the uniform beam's.
+    plant
+        Beam with its damping and ends. The torque channel is not used.
     max_relative_error
         Largest acceptable relative error over `ERROR_BAND_HZ`.
     modes_of
@@ -257,35 +246,33 @@ def realise(
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping, transfer
+    >>> from rigd.beam import Beam, Damping, Plant
     >>> from rigd.beam.realisation import realise
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
-    >>> damping = Damping(zeta=7e-5, alpha=0.9)
-    >>> realisation = realise(beam, damping)
+    >>> plant = Plant(beam, Damping(zeta=7e-5, alpha=0.9))
+    >>> realisation = realise(plant)
     >>> s = 2j * np.pi * np.geomspace(0.1, 50, 200)
-    >>> error = np.abs(realisation.transfer(s) / transfer(s, beam, damping) - 1)
+    >>> error = np.abs(realisation.transfer(s) / plant.transfer(s) - 1)
     >>> bool(error.max() < 1e-3)
     True
     """
+    beam, damping = plant.beam, plant.damping
     _check_passive(damping)
-    loaded_beam = LoadedBeam(
-        beam, damping, tip_mass_kg, root_compliance_rad_per_nm, stiffness_offsets
-    )
-    poles, modes = _realised_poles(loaded_beam, beam if modes_of is None else modes_of)
-    zeros = _zeros_in_band(loaded_beam)
+    poles, modes = _realised_poles(plant, beam if modes_of is None else modes_of)
+    zeros = _zeros_in_band(plant)
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
 
     omega, point_weights = _fit_grid(poles_and_zeros)
     far = _far_from_landmarks(omega, poles, zeros)
     s = 1j * omega[far]
-    exact_response = _exact_transfer(loaded_beam, s)
+    exact_response = plant.transfer(s)
     relative_weight = point_weights[far] / exact_response
     output_coefficients = _fit_coefficients(
         _basis_functions(s, poles) * relative_weight[:, None],
         point_weights[far].astype(np.complex128),
     )
 
-    relative_error = _relative_error(loaded_beam, poles, zeros, output_coefficients)
+    relative_error = _relative_error(plant, poles, zeros, output_coefficients)
     if not relative_error <= max_relative_error:
         raise RealisationError(
             f"{damping} on {beam} is realised with a relative error of {relative_error:.1e} "
@@ -317,14 +304,7 @@ def _check_passive(damping: Damping) -> None:
         )
 
 
-def _exact_transfer(loaded: LoadedBeam, s: Complex) -> Complex:
-    """Return the exact coupling torque per motor angle in N·m/rad, in the shape of `s`."""
-    if loaded.is_uniform_cantilever:
-        return TransferGrid(s).evaluate(loaded.beam, loaded.damping)
-    return loaded.transfer(np.asarray(s, dtype=np.complex128))
-
-
-def _realised_poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
+def _realised_poles(plant: Plant, modes_of: Beam) -> tuple[Complex, NDArray[np.intp]]:
     """Return the realisation's poles in rad/s and the index of each pole's mode.
 
     The poles up to 1.2 kHz are ordered as in `Realisation.poles_rad_s`; `modes_of` is the beam
@@ -340,11 +320,11 @@ def _realised_poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArra
             "stiffness."
         )
     eigenvalues = clamped_free_eigenvalues(mode_count)
-    pole_pairs = loaded.poles(eigenvalues)
-    if modes_of == loaded.beam:
+    pole_pairs = plant.poles(eigenvalues)
+    if modes_of == plant.beam:
         is_selected = _select_poles(pole_pairs)
     else:
-        is_selected = _select_poles(replace(loaded, beam=modes_of).poles(eigenvalues))
+        is_selected = _select_poles(replace(plant, beam=modes_of).poles(eigenvalues))
     oscillating = pole_pairs[:, 0].imag > 0
     # A pair may have ceased, or begun, to oscillate; one pole alone cannot.
     if (
@@ -352,7 +332,7 @@ def _realised_poles(loaded: LoadedBeam, modes_of: Beam) -> tuple[Complex, NDArra
         or (oscillating & (is_selected.sum(axis=1) == 1)).any()
     ):
         raise RealisationError(
-            f"{loaded.beam} with {loaded.damping} does not have the modes of {modes_of}."
+            f"{plant.beam} with {plant.damping} does not have the modes of {modes_of}."
         )
     upper_rows = np.flatnonzero(oscillating & is_selected[:, 0])
     over_damped = is_selected & ~oscillating[:, None]
@@ -380,13 +360,13 @@ def _select_poles(pole_pairs: Complex) -> NDArray[np.bool_]:
     return is_selected
 
 
-def _zeros_in_band(loaded: LoadedBeam) -> Complex:
+def _zeros_in_band(plant: Plant) -> Complex:
     """Return the zeros of G in rad/s up to 500 Hz, which are poles of the pinned–free beam."""
-    beam = loaded.beam
+    beam = plant.beam
     highest_k_fourth = (2 * np.pi * _FIT_BAND_HZ[1]) ** 2 * beam.density_over_stiffness
     zero_count = int(highest_k_fourth**0.25 * beam.length_m / np.pi) + 1
     z = np.pi * np.arange(1.25, zero_count + 1)  # of tan z = tanh z, within 4e-4
-    zeros = loaded.zeros(z)[:, 0]
+    zeros = plant.zeros(z)[:, 0]
     upper_zeros: Complex = zeros[zeros.imag > 0]
     return upper_zeros
 
@@ -446,9 +426,7 @@ def _fit_coefficients(equation_columns: Complex, equation_target: Complex) -> Re
         ]
 
 
-def _relative_error(
-    loaded: LoadedBeam, poles: Complex, zeros: Complex, coefficients: Real
-) -> float:
+def _relative_error(plant: Plant, poles: Complex, zeros: Complex, coefficients: Real) -> float:
     """Return the realisation's largest relative error on a grid denser than that of the fit."""
     lowest_hz, highest_hz = ERROR_BAND_HZ
     poles_and_zeros = np.concatenate([poles[poles.imag > 0], zeros])
@@ -457,7 +435,7 @@ def _relative_error(
     )
     omega = 2 * np.pi * frequency_hz[(frequency_hz >= lowest_hz) & (frequency_hz <= highest_hz)]
     s = 1j * omega[_far_from_landmarks(omega, poles, zeros)]
-    exact_response = _exact_transfer(loaded, s)
+    exact_response = plant.transfer(s)
     return float(np.max(np.abs(_basis_functions(s, poles) @ coefficients / exact_response - 1)))
 
 

@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam._causal_transform import CausalTransform, fast_transform_length
-from rigd.beam._model import Beam, Damping
-from rigd.beam._tip_mass import LoadedBeam
+from rigd.beam._plant import Plant
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -71,36 +70,26 @@ class TipMotion:
     """Largest speed of the tip in still air, including the rotation of the root."""
 
 
-def tip_motion(
-    beam: Beam,
-    damping: Damping,
-    angle_rad: Real,
-    rate_hz: float,
-    *,
-    tip_mass_kg: float = 0.0,
-    root_compliance_rad_per_nm: float = 0.0,
-) -> TipMotion:
+def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
     """Predict the tip's largest deflection, slope and speed from a record of the motor angle.
 
     Parameters
     ----------
-    beam, damping
-        Parameters of the exact model, without air drag.
+    plant
+        Beam with its damping and ends, without air drag.
     angle_rad
         Motor angle from rest, shape (n,).
     rate_hz
         Sampling rate of the angle.
-    tip_mass_kg, root_compliance_rad_per_nm
-        Point mass at the tip, and rotation of the clamp per torque.
 
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.beam import Beam, Damping, Plant
     >>> from rigd.beam.tip import tip_motion
     >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> angle_rad = 0.02 * np.sin(2 * np.pi * np.arange(5000) / 1000)
-    >>> motion = tip_motion(beam, Damping(zeta=7e-5), angle_rad, rate_hz=1000)
+    >>> motion = tip_motion(Plant(beam, Damping(zeta=7e-5)), angle_rad, rate_hz=1000)
     >>> print(f"{1e3 * motion.deflection_m:.1f} mm, {motion.slope_rad:.4f} rad")
     14.2 mm, 0.0201 rad
     """
@@ -112,25 +101,20 @@ def tip_motion(
     # The angle stays at its final value: a jump back would ring at the last samples.
     deflection_spectrum = transform.forward(angle_rad - angle_rad[0], hold=True)
     tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
-    loaded_beam = LoadedBeam(beam, damping, tip_mass_kg, root_compliance_rad_per_nm)
     # Block by block and without copies: these arrays have the record's length.
     for block_start in range(0, s.size, _BLOCK_POINTS):
         block_slice = slice(block_start, block_start + _BLOCK_POINTS)
         angle_spectrum = deflection_spectrum[block_slice].copy()
         root_angle: Complex = angle_spectrum  # turns like the motor, except for a compliant clamp
-        if loaded_beam.is_uniform_cantilever:
-            tip_displacement, slope_per_angle = tip_response(beam, damping, s[block_slice])
-            tip_displacement -= beam.length_m
-            slope_per_angle -= 1
-        else:
-            tip_displacement, slope_per_angle = loaded_beam.tip_response(s[block_slice])
+        tip_displacement, slope_per_angle = plant.tip_response(s[block_slice])
+        if plant.root_compliance_rad_per_nm:
             root_angle = angle_spectrum * (
-                1 - root_compliance_rad_per_nm * loaded_beam.transfer(s[block_slice])
+                1 - plant.root_compliance_rad_per_nm * plant.transfer(s[block_slice])
             )
         deflection_spectrum[block_slice] = tip_displacement * angle_spectrum
         tip_slope[block_slice] = slope_per_angle * angle_spectrum
         tip_speed[block_slice] = s[block_slice] * (
-            deflection_spectrum[block_slice] + beam.length_m * root_angle
+            deflection_spectrum[block_slice] + plant.beam.length_m * root_angle
         )
 
     def largest(spectrum: Complex) -> float:
@@ -142,36 +126,3 @@ def tip_motion(
         slope_rad=largest(tip_slope),
         speed_m_s=largest(tip_speed),
     )
-
-
-def tip_response(beam: Beam, damping: Damping, s: Complex) -> tuple[Complex, Complex]:
-    """Return the tip's displacement and slope per motor angle.
-
-    Parameters
-    ----------
-    beam, damping
-        Parameters of the exact model.
-    s
-        Laplace variable in rad/s, not 0.
-
-    Returns
-    -------
-    displacement
-        Displacement of the tip per angle in m/rad, in the shape of `s`.
-    tip_slope
-        Slope of the tip per angle, dimensionless, in the shape of `s`.
-    """
-    external = damping.gamma * s**damping.lambda_
-    internal = 1 + damping.zeta * s**damping.alpha
-    fourth_power = -(beam.density_over_stiffness * s * s + external) / internal
-    z = beam.length_m * np.sqrt(np.sqrt(fourth_power))
-    # Numerators and denominator over exp(z - j sign z): nothing overflows.
-    imaginary_sign = np.where(z.imag < 0, -1.0, 1.0)
-    rotation, decay = np.exp(1j * imaginary_sign * z), np.exp(-z)
-    a, b = decay * decay, rotation * rotation
-    reciprocal = 1 / (4 * rotation * decay + (1 + b) * (1 + a))
-    sines = 2 * rotation * (1 - a) + 2j * imaginary_sign * decay * (1 - b)
-    cosines = 2 * rotation * (1 + a) + 2 * decay * (1 + b)
-    displacement: Complex = beam.length_m * sines * reciprocal / z
-    tip_slope: Complex = cosines * reciprocal
-    return displacement, tip_slope

@@ -14,7 +14,7 @@ from math import exp, floor, pi
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, Damping, LoadedBeam, undamped_frequencies_rad_s
+from rigd.beam import Damping, Plant, undamped_frequencies_rad_s
 from rigd.beam.realisation import Realisation, couple, propagator, realise
 from rigd.control._pid import (
     ControlDesignError,
@@ -66,16 +66,13 @@ class LoopModel:
 
     rate_hz: float
     """Ticks a second."""
-    beam: Beam | None
-    """Beam on the motor; None: the motor alone."""
-    damping: Damping
-    """Damping of the beam."""
+    plant: Plant | None
+    """Beam on the motor, with its damping and ends and the tool inertia; None: the motor alone. The
+    delay of the torque relative to the angle follows from the ages of both readings."""
     motor_inertia_kg_m2: float
     """Inertia of the motor, at the output shaft."""
     viscous_nm_s_per_rad: float
     """Viscous friction of the motor, at the output shaft."""
-    tool_inertia_kg_m2: float
-    """Inertia between torque sensor and beam."""
     actuation_delay_s: float
     """Delay from a tick to the instant when its command takes effect; any fraction of a period."""
     angle_delay_s: float
@@ -84,24 +81,6 @@ class LoopModel:
     """Age of the coupling torque reading at the tick that uses it."""
     settings: ControlSettings
     """Settings of the controller."""
-    tip_mass_kg: float = 0.0
-    """Point mass at the beam's tip."""
-    root_compliance_rad_per_nm: float = 0.0
-    """Rotation of the clamp per torque on the beam's root."""
-    stiffness_offsets: tuple[float, ...] = ()
-    """Relative differences of the stiffness of modes 2, 3, … from that of the uniform beam."""
-
-    @property
-    def loaded_beam(self) -> LoadedBeam:
-        """Beam with tip mass, root compliance and stiffness offsets; the model must have a beam."""
-        assert self.beam is not None
-        return LoadedBeam(
-            self.beam,
-            self.damping,
-            self.tip_mass_kg,
-            self.root_compliance_rad_per_nm,
-            self.stiffness_offsets,
-        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -311,17 +290,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     """
     settings = model.settings
     gains = design_pid(model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad, settings.pole_rad_s)
-    realisation = (
-        None
-        if model.beam is None
-        else realise(
-            model.beam,
-            model.damping,
-            tip_mass_kg=model.tip_mass_kg,
-            root_compliance_rad_per_nm=model.root_compliance_rad_per_nm,
-            stiffness_offsets=model.stiffness_offsets,
-        )
-    )
+    realisation = None if model.plant is None else realise(model.plant)
     discrete_plant = _DiscretePlant(model, realisation)
     n = discrete_plant.a.shape[0]
 
@@ -444,10 +413,8 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
     )
     if growth_rate_per_s > MAX_GROWTH_PER_S:
         raise ControlDesignError(f"{instability_text}; {remedy_text}.")
-    if closed_loop.model.beam is not None:
-        lightly_damped_loop = close_loop(
-            lightly_damped_model(closed_loop.model, closed_loop.model.beam)
-        )
+    if (plant := closed_loop.model.plant) is not None:
+        lightly_damped_loop = close_loop(lightly_damped_model(closed_loop.model, plant))
         least_damped_pole = lightly_damped_loop.least_damped()
         if _damping_ratio(least_damped_pole) < _LIGHT_DAMPING_RATIO - MAX_DAMPING_REDUCTION:
             raise ControlDesignError(
@@ -513,20 +480,19 @@ def _stability_remedy(settings: ControlSettings) -> str:
     )
 
 
-def lightly_damped_model(model: LoopModel, beam: Beam) -> LoopModel:
-    """Return the parameters of a closed loop, with almost no damping of the beam.
+def lightly_damped_model(model: LoopModel, plant: Plant) -> LoopModel:
+    """Return the model of a closed loop with a plant that has almost no damping.
 
     Parameters
     ----------
     model
         Model of the loop.
-    beam
-        Beam of the returned model.
+    plant
+        Plant of the returned model, but for the damping.
     """
-    first_mode_rad_s = float(undamped_frequencies_rad_s(beam, 1)[0])
-    return replace(
-        model, beam=beam, damping=Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s)
-    )
+    first_mode_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
+    damping = Damping(zeta=2.0 * _LIGHT_DAMPING_RATIO / first_mode_rad_s)
+    return replace(model, plant=replace(plant, damping=damping))
 
 
 def _damping_ratio(pole_rad_s: complex) -> float:
@@ -552,7 +518,7 @@ class _DiscretePlant:
             realisation,
             motor_inertia_kg_m2=model.motor_inertia_kg_m2,
             viscous_nm_s_per_rad=model.viscous_nm_s_per_rad,
-            tool_inertia_kg_m2=model.tool_inertia_kg_m2,
+            tool_inertia_kg_m2=0.0 if model.plant is None else model.plant.tool_inertia_kg_m2,
         )
         period_s = 1.0 / model.rate_hz
         whole_periods, period_fraction = _split_delay(

@@ -139,21 +139,23 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
     from rigd.control._closed_loop import MAX_GROWTH_PER_S, close_loop, lightly_damped_model
 
     loop_model = closed_loop.model
-    if loop_model.beam is None:
+    if (plant := loop_model.plant) is None:
         return None
-    first_rad_s = float(undamped_frequencies_rad_s(loop_model.beam, 1)[0])
+    first_rad_s = float(undamped_frequencies_rad_s(plant.beam, 1)[0])
     settings = DamperSettings(
-        yield_rad_per_nm_s=_DAMPING_STRENGTH / (loop_model.beam.inertia_kg_m2 * first_rad_s),
+        yield_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
         lead_s=2.0 / loop_model.settings.pole_rad_s,
         slow_rad_s=_SLOW_CORNER_OVER_MODE * first_rad_s,
         fast_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
-    bending_stiffness_n_m2 = loop_model.beam.bending_stiffness_n_m2
+    bending_stiffness_n_m2 = plant.beam.bending_stiffness_n_m2
     beams = [
-        replace(loop_model.beam, bending_stiffness_n_m2=stiffness_ratio * bending_stiffness_n_m2)
+        replace(plant.beam, bending_stiffness_n_m2=stiffness_ratio * bending_stiffness_n_m2)
         for stiffness_ratio in _STIFFNESS_RATIOS
     ]
-    loops = [close_loop(lightly_damped_model(loop_model, beam)) for beam in beams]
+    loops = [
+        close_loop(lightly_damped_model(loop_model, replace(plant, beam=beam))) for beam in beams
+    ]
     for _ in range(_MAX_HALVINGS):
         growth_rates_per_s = [
             damped_poles(damped_loop, settings).real.max() for damped_loop in loops

@@ -23,11 +23,9 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import CausalTransform, fast_transform_length, transfer, transfer_and_gradient
-from rigd.beam.tip import tip_response
+from rigd.beam import CausalTransform, fast_transform_length, gradient_name
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    DERIVATIVE_NAMES,
     MODAL_CONSTANTS,
     PARAMETERS,
     POLE_AND_RESIDUE_DERIVATIVES,
@@ -158,17 +156,12 @@ def responses(estimate: BeamEstimate, s: Complex) -> tuple[Complex, Complex, Com
     Returns
     -------
     of_beam, measured, slope
-        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and delay;
+        Torque on the beam in N·m/rad; measured torque in N·m/rad, with tool inertia and channel;
         slope of the tip relative to the root, per angle.
     """
-    loaded_beam = estimate.loaded
-    if loaded_beam is None:
-        g = transfer(s, estimate.beam, estimate.damping)
-        slope_response = tip_response(estimate.beam, estimate.damping, s)[1] - 1.0
-    else:
-        at = s.astype(np.complex128)
-        g, slope_response = loaded_beam.transfer(at), loaded_beam.tip_slope(at)
-    measured_response = (g + estimate.tool_inertia_kg_m2 * s * s) * np.exp(-s * estimate.delay_s)
+    plant = estimate.plant
+    g, slope_response = plant.transfer(s), plant.tip_slope(s)
+    measured_response = (g + plant.tool_inertia_kg_m2 * s * s) * plant.channel_response(s)
     return g, measured_response, slope_response
 
 
@@ -190,31 +183,25 @@ def whitened_kernels(estimate: BeamEstimate, s: Complex, sample_hz: float) -> Co
         parameter_name for parameter_name in estimate.names if parameter_name in PARAMETERS
     ]
     derivative_names = [
-        DERIVATIVE_NAMES.get(n, n)
-        for n in parameter_names
-        if n not in ("delay_s", "tool_inertia_kg_m2")
+        gradient_name(n) for n in parameter_names if n not in ("delay_s", "tool_inertia_kg_m2")
     ]
-    loaded_beam = estimate.loaded
+    plant = estimate.plant
     g = beam_gradient = np.zeros((0, s.size), dtype=np.complex128)
     if parameter_names:
-        g, beam_gradient = (
-            transfer_and_gradient(s, estimate.beam, estimate.damping, derivative_names)
-            if loaded_beam is None
-            else loaded_beam.transfer_and_gradient(s.astype(np.complex128), derivative_names)
-        )
-    delay_factor = np.exp(-s * estimate.delay_s)
+        g, beam_gradient = plant.transfer_and_gradient(s, derivative_names)
+    channel_response = plant.channel_response(s)
     kernels: Complex = np.empty((len(estimate.names), s.size), dtype=np.complex128)
-    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * delay_factor
+    kernels[len(parameter_names) :] = _derivatives_by_constants(estimate, s) * channel_response
     gradient_rows = iter(beam_gradient)
     for out, parameter_name, parameter_scale in zip(
         kernels[: len(parameter_names)], parameter_names, parameter_scales(estimate), strict=True
     ):
         if parameter_name == "delay_s":
-            out[:] = -s * (g + estimate.tool_inertia_kg_m2 * s * s) * delay_factor
+            out[:] = -s * (g + plant.tool_inertia_kg_m2 * s * s) * channel_response
         elif parameter_name == "tool_inertia_kg_m2":
-            out[:] = s * s * delay_factor
+            out[:] = s * s * channel_response
         else:
-            out[:] = parameter_scale * next(gradient_rows) * delay_factor
+            out[:] = parameter_scale * next(gradient_rows) * channel_response
     kernels *= _whitening_weights(estimate, s.imag / (2 * pi), sample_hz)
     return kernels
 
@@ -224,7 +211,7 @@ def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
 
     The shape is (number of constants, K).
     """
-    poles_by_mode = {beam_mode.number: beam_mode.pole_rad_s for beam_mode in estimate.modes()}
+    poles_by_mode = {beam_mode.mode: beam_mode.at_rad_s for beam_mode in estimate.modes()}
     derivative_rows = []
     for parameter_name in estimate.names:
         if parameter_name in PARAMETERS:
@@ -234,9 +221,7 @@ def _derivatives_by_constants(estimate: BeamEstimate, s: Complex) -> Complex:
             derivative_rows.append((s / (2 * pi * BAND_HZ)) ** int(mode_number))
             continue
         mode_pole = poles_by_mode[int(mode_number)]
-        mode_residue = (
-            complex(estimate.loaded_beam.residues(np.array([mode_pole]))[0]) * mode_pole**2
-        )
+        mode_residue = complex(estimate.plant.residues(np.array([mode_pole]))[0]) * mode_pole**2
         pole_derivative, residue_derivative = POLE_AND_RESIDUE_DERIVATIVES[constant_kind](
             mode_pole, mode_residue
         )
@@ -383,11 +368,11 @@ def information(angle_rad: Real, estimate: BeamEstimate, rate_hz: float) -> Real
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.beam import Beam, Damping, Plant
     >>> from rigd.excitation import BeamEstimate, chirp, information
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> estimate = BeamEstimate(
-    ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
-    ...     damping=Damping(zeta=7e-5, gamma=0.02),
+    ...     plant=Plant(beam, Damping(zeta=7e-5, gamma=0.02)),
     ...     names=("zeta", "gamma", "density_over_stiffness"),
     ...     noise_frequency_hz=np.array([1.0]),
     ...     noise_nm2_per_hz=np.array([2e-7]),
@@ -448,7 +433,7 @@ def covariance_of(fisher_information: Real, estimate: BeamEstimate) -> Real:
 
 def _prior_std(name: str, estimate: BeamEstimate) -> float:
     """Return the standard deviation that a parameter is assumed to have before any record."""
-    beam = estimate.beam
+    beam = estimate.plant.beam
     constant_kind = name.rpartition("_")[0]
     if constant_kind == "background":
         return 10.0 * beam.bending_stiffness_n_m2 / beam.length_m
@@ -469,7 +454,7 @@ def _nuisance_terms(estimate: BeamEstimate, sample_count: int, sample_hz: float)
     The shape is (m, samples).
     """
     time_s = np.arange(sample_count) / sample_hz
-    mode_poles = np.array([beam_mode.pole_rad_s for beam_mode in estimate.modes()])
+    mode_poles = np.array([beam_mode.at_rad_s for beam_mode in estimate.modes()])
     free_decays = np.exp(np.outer(mode_poles, time_s))
     decay_weights = _whitening_weights(estimate, mode_poles.imag / (2 * pi), sample_hz)[:, None]
     constant_weight = _whitening_weights(estimate, np.zeros(1), sample_hz)[0]

@@ -21,7 +21,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
 
-from rigd.beam import PARAMETERS, Beam, Damping, transfer_and_gradient, undamped_frequencies_rad_s
+from rigd.beam import (
+    GRADIENT_NAMES,
+    Beam,
+    Damping,
+    transfer_and_gradient,
+    undamped_frequencies_rad_s,
+)
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
 from rigd.excitation._signals import (
@@ -401,7 +407,7 @@ def _information_rates(
         s = 2j * pi * frequency_hz
         band_beam = _beam_with_mode(rig.beam, sweep_band.mode.frequency_hz)
         g, gradient = transfer_and_gradient(
-            s, band_beam, damping, (*parameter_names, *PARAMETERS[4:])
+            s, band_beam, damping, (*parameter_names, *GRADIENT_NAMES[4:])
         )
         gradient[: len(parameter_names)] *= np.array(
             [damping_factors[parameter_name] for parameter_name in parameter_names]

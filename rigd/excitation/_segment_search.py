@@ -276,13 +276,12 @@ class SegmentSearch:
                 ),
             ]
             sweep_bands += [
-                _SweepBand(beam_mode.number, hz, offset_width, _FADE_S)
-                for offset_width in widths_hz
+                _SweepBand(beam_mode.mode, hz, offset_width, _FADE_S) for offset_width in widths_hz
             ]
             # Fades as long as the beat with the mode: a shorter one excites the mode as well.
             sweep_bands += [
                 _SweepBand(
-                    beam_mode.number,
+                    beam_mode.mode,
                     (1.0 + offset_step) * hz,
                     0.0,
                     max(_FADE_S, 1.0 / (_SIDE_OFFSET * hz)),
@@ -618,7 +617,7 @@ class SegmentSearch:
             self.amplitude_matrix
             @ tip_slope_fractions[first_sample : first_sample + self.amplitude_matrix.shape[1]]
         )
-        mode_row = 2 * [beam_mode.number for beam_mode in self.modes].index(sweep_band.mode_number)
+        mode_row = 2 * [beam_mode.mode for beam_mode in self.modes].index(sweep_band.mode_number)
         drive_factors = continued_drive.per_amplitude @ mode_amplitudes[mode_row : mode_row + 2]
         rows_before = weighted_rows[:, :first_sample]
         rows_after = weighted_rows[:, first_sample:] + np.tensordot(
@@ -634,7 +633,7 @@ class SegmentSearch:
         """
         time_s = np.arange(self.model_samples(_TAIL_S)) / self.model.sample_hz
         free_oscillations = np.exp(
-            np.outer([beam_mode.pole_rad_s for beam_mode in self.modes], time_s)
+            np.outer([beam_mode.at_rad_s for beam_mode in self.modes], time_s)
         )
         decay_columns = np.stack([free_oscillations.real, -free_oscillations.imag], axis=1).reshape(
             -1, time_s.size
@@ -648,14 +647,14 @@ class SegmentSearch:
             sine_pair = self.sweep_pair(replace(sweep_band, half_width_hz=0.0), duration_s)
             weighted_rows = np.stack([sine_sweep.weighted for sine_sweep in sine_pair])
             driven_mode = next(
-                beam_mode for beam_mode in self.modes if beam_mode.number == sweep_band.mode_number
+                beam_mode for beam_mode in self.modes if beam_mode.mode == sweep_band.mode_number
             )
             end_sample = self.model_samples(duration_s - _FADE_S)
             tail_window = slice(end_sample - self.model_samples(_TAIL_S), end_sample)
             time_s = np.arange(tail_window.start, tail_window.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
-            ring_up_fraction = 1.0 - np.exp(driven_mode.pole_rad_s.real * (time_s - 0.5 * _FADE_S))
-            oscillation = np.exp(1j * driven_mode.pole_rad_s.imag * time_s)
+            ring_up_fraction = 1.0 - np.exp(driven_mode.at_rad_s.real * (time_s - 0.5 * _FADE_S))
+            oscillation = np.exp(1j * driven_mode.at_rad_s.imag * time_s)
             oscillation_columns = (
                 np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
             )
@@ -714,7 +713,7 @@ class SegmentSearch:
             at_mode_s = float(
                 times_s[np.abs(self.line_hz - beam_mode.frequency_hz) < range_hz].sum()
             )
-            decay_s = -1.0 / beam_mode.pole_rad_s.real
+            decay_s = -1.0 / beam_mode.at_rad_s.real
             if at_mode_s > 0.01 * needed_s:
                 needed_s += (
                     decay_s * float(np.interp(at_mode_s / decay_s, information_gain, time_ratios))

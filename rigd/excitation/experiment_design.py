@@ -22,7 +22,7 @@ from typing import Final, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import LoadedBeam
+from rigd.beam import Plant
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
 from rigd.excitation._fisher_information import RecordSoFar, covariance_of, information
@@ -52,13 +52,13 @@ class DesignRig(Protocol):
     def start_rad(self) -> float:
         """Present angle of the motor from the rig's zero, in rad."""
 
-    def plant_with(self, beam: LoadedBeam) -> MovePlant:
+    def plant_with(self, plant: Plant) -> MovePlant:
         """Return the rig's closed loop and limits with an estimated beam, not the profile's.
 
         Parameters
         ----------
-        beam
-            Estimated beam, with tip mass and root compliance.
+        plant
+            Estimated beam, with its ends.
         """
 
 
@@ -117,13 +117,11 @@ def next_segment(
     ExcitationError
         If there is no target, or no segment fits into the time or drives a mode.
     """
-    driven_modes = [
-        beam_mode.number for beam_mode in estimate.modes() if beam_mode.number in through
-    ]
+    driven_modes = [beam_mode.mode for beam_mode in estimate.modes() if beam_mode.mode in through]
     quantities = Quantities.linearised(targets, estimate)
     if not quantities.items:
         raise ExcitationError("No precision is requested; give for example --damping 1%.")
-    move_plant = rig.plant_with(estimate.loaded_beam)
+    move_plant = rig.plant_with(estimate.plant)
     record_so_far = RecordSoFar.from_angle(
         angle_rad_so_far, estimate, move_plant.rate_hz, HORIZON_S
     )
@@ -194,7 +192,7 @@ def geometry_floors(
     ]
     if not targets or not uniformity:
         return ()
-    move_plant = rig.plant_with(estimate.loaded_beam)
+    move_plant = rig.plant_with(estimate.plant)
     resting_record = RecordSoFar.from_angle(np.zeros(1), estimate, move_plant.rate_hz, SHORTEST_S)
     quantities = Quantities.linearised(targets, estimate)
     segment_search = SegmentSearch(
@@ -275,15 +273,15 @@ def design_excitation(
     Examples
     --------
     >>> import numpy as np
-    >>> from rigd.beam import Beam, Damping
+    >>> from rigd.beam import Beam, Damping, Plant
     >>> from rigd.excitation import BeamEstimate
     >>> from rigd.excitation.experiment_design import design_excitation
     >>> from rigd.excitation.targets import parse_target
     >>> from rigd.profile import load_profile
     >>> from rigd.runner.planning import RigPreview
+    >>> beam = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903)
     >>> estimate = BeamEstimate(
-    ...     beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.0903),
-    ...     damping=Damping(zeta=7e-5, gamma=0.02),
+    ...     plant=Plant(beam, Damping(zeta=7e-5, gamma=0.02)),
     ...     names=("zeta", "gamma", "density_over_stiffness", "bending_stiffness_n_m2"),
     ...     noise_frequency_hz=np.array([1.0]),
     ...     noise_nm2_per_hz=np.array([5e-8]),
@@ -293,7 +291,7 @@ def design_excitation(
     >>> all(each.reached for each in design.expected), design.reference_rad.size < 10_000
     (True, True)
     """
-    move_plant = rig.plant_with(estimate.loaded_beam)
+    move_plant = rig.plant_with(estimate.plant)
     before_rad = np.zeros(1) if angle_rad_so_far is None else angle_rad_so_far
     reference_rad = angle_rad = np.zeros(0)
     remaining_s = duration_s

@@ -8,11 +8,10 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS, LOGARITHMIC_PARAMETERS, Pole
 from rigd.excitation._beam_estimate import (
     BAND_HZ,
-    LOGARITHMIC_PARAMETERS,
     BeamEstimate,
-    EstimatedMode,
 )
 from rigd.excitation._signals import ExcitationError
 
@@ -20,7 +19,7 @@ Real = NDArray[np.float64]
 
 MODE_QUANTITIES: Final = ("damping", "frequency")
 """Names of the target quantities that belong to a mode."""
-QUANTITIES: Final = (*MODE_QUANTITIES, "zeta", "alpha", "gamma", "lambda")
+QUANTITIES: Final = (*MODE_QUANTITIES, *DAMPING_PARAMETERS)
 """Names of the quantities whose precision can be a target: damping ratio and frequency of modes,
 and the parameters of the damping."""
 
@@ -31,8 +30,6 @@ _USELESS_STD: Final = {"damping": 0.01, "zeta": 0.5, "alpha": 0.5, "gamma": 0.5,
 sign was probably forgotten."""
 _MAX_MODE_NUMBER: Final = 20
 """Largest number of a mode in a target."""
-_COEFFICIENT_OF_ORDER: Final = {"alpha": "zeta", "lambda": "gamma"}
-"""Coefficient of the damping to which each order belongs."""
 _DAMPING_KIND: Final = {
     "zeta": "internal",
     "alpha": "internal",
@@ -239,15 +236,15 @@ class Quantities:
         )
 
 
-def _targets_of_modes(given_target: Target, modes: tuple[EstimatedMode, ...]) -> list[Target]:
+def _targets_of_modes(given_target: Target, modes: tuple[Pole, ...]) -> list[Target]:
     """Return a target for each mode, if the given target applies to every mode in the band."""
     if given_target.quantity not in MODE_QUANTITIES or given_target.mode is not None:
         return [given_target]
-    return [replace(given_target, mode=estimated_mode.number) for estimated_mode in modes]
+    return [replace(given_target, mode=estimated_mode.mode) for estimated_mode in modes]
 
 
 def _linearise(
-    given_target: Target, estimate: BeamEstimate, modes: tuple[EstimatedMode, ...]
+    given_target: Target, estimate: BeamEstimate, modes: tuple[Pole, ...]
 ) -> tuple[float, Real, str]:
     """Return the value of a quantity and its derivatives by the beam's parameters, shape (k,).
 
@@ -260,24 +257,22 @@ def _linearise(
             (
                 estimated_mode
                 for estimated_mode in modes
-                if estimated_mode.number == given_target.mode
+                if estimated_mode.mode == given_target.mode
             ),
             None,
         )
         if target_mode is None:
-            mode_numbers = (
-                ", ".join(str(estimated_mode.number) for estimated_mode in modes) or "none"
-            )
+            mode_numbers = ", ".join(str(estimated_mode.mode) for estimated_mode in modes) or "none"
             return (
                 0.0,
                 quantity_gradient,
                 f"mode {given_target.mode} is not below {BAND_HZ:g} Hz (seen: {mode_numbers})",
             )
         if quantity_name == "damping":
-            return target_mode.damping_ratio, target_mode.damping_gradient, ""
-        return target_mode.frequency_hz, target_mode.frequency_gradient_hz, ""
+            return target_mode.damping_ratio, target_mode.damping_ratio_derivative, ""
+        return target_mode.frequency_hz, target_mode.frequency_derivative_hz, ""
     quantity_value = estimate.values[quantity_name]
-    coefficient_name = _COEFFICIENT_OF_ORDER.get(quantity_name, quantity_name)
+    coefficient_name = COEFFICIENT_OF.get(quantity_name, quantity_name)
     if estimate.values[coefficient_name] == 0.0 or quantity_name not in estimate.names:
         impossible_reason = (
             "is absent"

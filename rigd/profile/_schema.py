@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from annotated_types import Ge, Gt, Le, MinLen
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 from rigd.control import ControlSettings, LoopModel
 from rigd.devices import describe_unknown_values
 from rigd.devices.parameters import (
@@ -315,6 +315,18 @@ class Profile:
         """Motor for which the controller is designed."""
         return self.design_motor or self.rig.motor
 
+    @property
+    def plant(self) -> Plant:
+        """Beam and torque channel as the profile states them."""
+        rig = self.rig
+        return Plant(
+            rig.beam,
+            rig.damping,
+            delay_s=rig.sensor.delay_s - rig.encoder.delay_s,
+            tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
+            tip_mass_kg=self.tip_mass_kg or 0.0,
+        )
+
     def loop_model(self) -> LoopModel:
         """Return the model of this rig's closed loop, for its design and prediction.
 
@@ -332,14 +344,11 @@ class Profile:
             )
         return LoopModel(
             rate_hz=rig.rate_hz,
-            beam=rig.beam,
-            damping=rig.damping,
+            plant=self.plant,
             motor_inertia_kg_m2=self.control_motor.inertia_kg_m2,
             viscous_nm_s_per_rad=self.control_motor.viscous_nm_s_per_rad,
-            tool_inertia_kg_m2=rig.sensor.tool_inertia_kg_m2,
             actuation_delay_s=rig.actuation.delay_s,
             angle_delay_s=rig.encoder.delay_s,
             torque_delay_s=rig.sensor.delay_s,
             settings=self.control,
-            tip_mass_kg=self.tip_mass_kg or 0.0,
         )

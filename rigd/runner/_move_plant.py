@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import LoadedBeam, clamped_free_eigenvalues
+from rigd.beam import clamped_free_eigenvalues
 from rigd.control import (
     ClosedLoop,
     Disturbances,
@@ -36,36 +36,21 @@ _NOISE_REALISATIONS = 4
 
 
 def loop_model_with(profile: Profile, identified_beam: IdentifiedBeam | None) -> LoopModel:
-    """Return the loop model of a rig with an identified beam, tool inertia and delays.
+    """Return the loop model of a rig with an identified beam and its torque channel.
 
     If `identified_beam` is None, the model has the values of the profile.
     """
     loop_model = profile.loop_model()
     if identified_beam is None:
         return loop_model
-    loop_model = with_beam(loop_model, identified_beam.loaded_beam)
-    if identified_beam.tool_inertia_kg_m2 is not None:
-        loop_model = replace(loop_model, tool_inertia_kg_m2=identified_beam.tool_inertia_kg_m2)
-    if identified_beam.delay_s is not None:
-        # Only the difference of the two delays is identified, and neither can be negative.
-        angle_delay_s = max(loop_model.angle_delay_s, -identified_beam.delay_s)
-        loop_model = replace(
-            loop_model,
-            angle_delay_s=angle_delay_s,
-            torque_delay_s=angle_delay_s + identified_beam.delay_s,
-        )
-    return loop_model
-
-
-def with_beam(model: LoopModel, loaded_beam: LoadedBeam) -> LoopModel:
-    """Return a copy of a loop model with another beam, tip mass and root compliance."""
+    # Only the difference of the two delays is identified, and neither can be negative.
+    delay_s = identified_beam.plant.delay_s
+    angle_delay_s = max(loop_model.angle_delay_s, -delay_s)
     return replace(
-        model,
-        beam=loaded_beam.beam,
-        damping=loaded_beam.damping,
-        tip_mass_kg=loaded_beam.tip_mass_kg,
-        root_compliance_rad_per_nm=loaded_beam.root_compliance_rad_per_nm,
-        stiffness_offsets=loaded_beam.stiffness_offsets,
+        loop_model,
+        plant=identified_beam.plant,
+        angle_delay_s=angle_delay_s,
+        torque_delay_s=angle_delay_s + delay_s,
     )
 
 
@@ -86,7 +71,8 @@ def move_plant_of(
     check_stability(uncompensated_loop)
     locked_hub_poles, closed_loop_poles = mode_poles(uncompensated_loop)
     # Torque of a mode for the angle's acceleration: 2 Re(r exp(p t)), r its residue in G(s)/s².
-    torque_per_angle = 2.0 * np.abs(model.loaded_beam.residues(locked_hub_poles))
+    assert model.plant is not None
+    torque_per_angle = 2.0 * np.abs(model.plant.residues(locked_hub_poles))
     frequency_uncertainty = (_DEFAULT_FREQUENCY_UNCERTAINTY,) * closed_loop_poles.size
     if identified_beam is not None:
         frequency_uncertainty = identified_beam.pole_uncertainty(closed_loop_poles.size)
@@ -146,7 +132,8 @@ def mode_poles(loop: ClosedLoop) -> tuple[Complex, Complex]:
     loop damps a mode.
     """
     loop_model = loop.model
-    locked_hub_poles = loop_model.loaded_beam.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
+    assert loop_model.plant is not None
+    locked_hub_poles = loop_model.plant.poles(clamped_free_eigenvalues(_MAX_MODES))[:, 0]
     locked_hub_poles = locked_hub_poles[
         (locked_hub_poles.imag > 0.0)
         & (np.abs(locked_hub_poles) < 0.5 * math.pi * loop_model.rate_hz)

@@ -335,7 +335,7 @@ class ExcitationPlanner:
             else:
                 self._append_pause(min(PAUSE_S, remaining_s))
             return
-        move_plant = self._preview.plant_with(estimate.loaded_beam)
+        move_plant = self._preview.plant_with(estimate.plant)
         angle_rad = move_plant.respond(reference_rad).angle_rad
         next_planned_segment = next_segment(
             estimate,

@@ -51,19 +51,14 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
 
     rig = profile.rig
     sensor = rig.sensor
-    stated_values: dict[str, Any] = {
-        "angle_delay_s": rig.encoder.delay_s,
-        "torque_delay_s": sensor.delay_s,
-        "tool_inertia_kg_m2": sensor.tool_inertia_kg_m2,
-        "sensor_filter": _sensor_filter(rig),
-    }
+    sensor_filter = _sensor_filter(rig)
     analysis_path = str(excitation.parameters["file"])
     if analysis_path:
         touch_model = TouchModel.from_analysis(
-            analysis_path, length_m=rig.beam.length_m, **stated_values
+            analysis_path, profile.plant, rig.encoder.delay_s, sensor_filter
         )
     else:
-        touch_model = TouchModel.assumed(rig.beam, rig.damping, **stated_values)
+        touch_model = TouchModel.assumed(profile.plant, rig.encoder.delay_s, sensor_filter)
     beam_prediction = watched_beam(touch_model, rig.rate_hz, _reading_noise(profile))
     shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, LoadedBeam
+from rigd.beam import Beam, Plant
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import PaperCheckResult, check_on_paper
@@ -27,7 +27,6 @@ from rigd.runner._move_plant import (
     mode_poles,
     move_plant_of,
     torque_noise_nm,
-    with_beam,
 )
 from rigd.runner._tip_slope import (
     KINDS_WITH_TARGET_ANGLE,
@@ -109,7 +108,7 @@ class RigPreview:
     def __init__(self, profile: Profile, start_rad: float = 0.0) -> None:
         self._profile = profile
         self.start_rad = start_rad
-        self._last_estimated_plant: tuple[LoadedBeam, MovePlant] | None = None
+        self._last_estimated_plant: tuple[Plant, MovePlant] | None = None
 
     @property
     def beam(self) -> Beam:
@@ -126,8 +125,7 @@ class RigPreview:
         """Beam estimate with the profile's values and the sensor's noise, and free parameters."""
         rig = self._profile.rig
         density_nm2_per_hz = 2.0 * torque_noise_nm(self._profile) ** 2 / rig.rate_hz
-        tip_mass_kg = self._profile.loop_model().tip_mass_kg
-        return BeamEstimate.stated(rig.beam, rig.damping, density_nm2_per_hz, tip_mass_kg)
+        return BeamEstimate.stated(self._profile.plant, density_nm2_per_hz)
 
     @cached_property
     def _closed_loop(self) -> ClosedLoop:
@@ -175,7 +173,7 @@ class RigPreview:
         RealisationError
             If the beam's damping cannot be realised by a model with poles.
         """
-        identified_beam = read_identified_beam(path, self.beam.length_m, use) if path else None
+        identified_beam = read_identified_beam(path, self._profile.plant, use) if path else None
         loop_model = loop_model_with(self._profile, identified_beam)
         return move_plant_of(
             self._profile, loop_model, _sensor_limit_nm(self._profile), identified_beam
@@ -184,10 +182,9 @@ class RigPreview:
     def tip_slope_rad(self, reference_rad: Real) -> float:
         """Return the predicted peak slope of the beam's free end for a reference angle (n,)."""
         angle_rad = self._closed_loop.simulate(reference_rad).angle_rad
-        rig = self._profile.rig
-        return tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
+        return tip_motion(self._profile.plant, angle_rad, self._profile.rig.rate_hz).slope_rad
 
-    def plant_with(self, beam: LoadedBeam) -> MovePlant:
+    def plant_with(self, plant: Plant) -> MovePlant:
         """Return the model of motor, estimated beam and closed loop for the design of excitation.
 
         If the loop cannot be computed with the estimated damping, the damping of the profile is
@@ -196,8 +193,8 @@ class RigPreview:
 
         Parameters
         ----------
-        beam
-            Estimated beam with its tip mass and root compliance.
+        plant
+            Estimated beam and ends. Delay and tool inertia are those of the profile.
 
         Raises
         ------
@@ -206,22 +203,24 @@ class RigPreview:
         RealisationError
             If neither damping can be realised by a model with poles.
         """
-        if self._last_estimated_plant is not None and self._last_estimated_plant[0] == beam:
+        if self._last_estimated_plant is not None and self._last_estimated_plant[0] == plant:
             return self._last_estimated_plant[1]
-        profile = self._profile
-        coupling_limit_nm = _sensor_limit_nm(profile)
+        profile, stated = self._profile, self._profile.plant
+        loop_model, coupling_limit_nm = profile.loop_model(), _sensor_limit_nm(profile)
+        # An early estimate of the torque channel is less accurate than the profile.
+        estimated = replace(
+            plant, delay_s=stated.delay_s, tool_inertia_kg_m2=stated.tool_inertia_kg_m2
+        )
         try:
             move_plant = move_plant_of(
-                profile, with_beam(profile.loop_model(), beam), coupling_limit_nm
+                profile, replace(loop_model, plant=estimated), coupling_limit_nm
             )
         except (ControlDesignError, RealisationError):
-            beam_with_stated_damping = replace(beam, damping=profile.rig.damping)
+            with_stated_damping = replace(estimated, damping=stated.damping)
             move_plant = move_plant_of(
-                profile,
-                with_beam(profile.loop_model(), beam_with_stated_damping),
-                coupling_limit_nm,
+                profile, replace(loop_model, plant=with_stated_damping), coupling_limit_nm
             )
-        self._last_estimated_plant = beam, move_plant
+        self._last_estimated_plant = plant, move_plant
         return move_plant
 
 
@@ -349,7 +348,7 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) 
 
 def _motion_after_record(loop: ClosedLoop, *, stays: bool) -> Ending:
     """Return the motion after the record: a vibration-free return to the start, with damping."""
-    if loop.model.beam is None:
+    if loop.model.plant is None:
         return Ending(stays=stays)
     return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), design_damper(loop))
 
@@ -566,15 +565,8 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
     angle_rad = loop_response.angle_rad.copy()
     del loop_response  # an hour of response takes 150 MB, and the tip motion needs as much again
     loop_model = closed_loop.model
-    if loop_model.beam is not None:
-        tip = tip_motion(
-            loop_model.beam,
-            loop_model.damping,
-            angle_rad,
-            loop_model.rate_hz,
-            tip_mass_kg=loop_model.tip_mass_kg,
-            root_compliance_rad_per_nm=loop_model.root_compliance_rad_per_nm,
-        )
+    if loop_model.plant is not None:
+        tip = tip_motion(loop_model.plant, angle_rad, loop_model.rate_hz)
         predicted_peaks = replace(predicted_peaks, tip=tip)
     if excitation.kind not in KINDS_WITH_TARGET_ANGLE:
         return predicted_peaks

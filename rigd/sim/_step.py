@@ -11,7 +11,7 @@ from functools import cache, partial
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import Beam, LoadedBeam
+from rigd.beam import Beam, Plant
 from rigd.beam.realisation import (
     CoupledModel,
     Realisation,
@@ -53,24 +53,18 @@ def beam_and_coupled_models(
     modes_of
         As for :func:`rigd.beam.realisation.realise`.
     """
-    beam_realisation = realise(
+    plant = Plant(
         parameters.beam,
         parameters.damping,
         tip_mass_kg=simulation.tip_mass_kg,
         root_compliance_rad_per_nm=simulation.clamp_compliance_rad_per_nm,
-        modes_of=modes_of,
     )
-    loaded_beam = LoadedBeam(
-        parameters.beam,
-        parameters.damping,
-        simulation.tip_mass_kg,
-        simulation.clamp_compliance_rad_per_nm,
-    )
+    beam_realisation = realise(plant, modes_of=modes_of)
     attach_beam = partial(
         couple,
         beam_realisation,
         tool_inertia_kg_m2=parameters.sensor.tool_inertia_kg_m2,
-        shear=state_output(beam_realisation, loaded_beam.shear, inertial=True),
+        shear=state_output(beam_realisation, plant.shear, inertial=True),
     )
     free_model = attach_beam(
         motor_inertia_kg_m2=parameters.motor.inertia_kg_m2,

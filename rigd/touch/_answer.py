@@ -157,7 +157,9 @@ def _position_estimate(
 ) -> Estimated:
     """Return the position of the touch in m, with the additional uncertainty from bounces."""
     position = _common_parameter(likely_explanations, 0)
-    is_near_tip = position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.beam.length_m
+    is_near_tip = (
+        position.value > NEAR_TIP_FRACTION * explanation_search.tables.model.plant.beam.length_m
+    )
     additional_std_m = (
         _TWO_OBSTACLES_STD_M
         if likely_explanations[0].kind == "two"
@@ -170,7 +172,7 @@ def _position_estimate(
         )
         for end, interval_sign in zip(position.interval_95, (-1.0, 1.0), strict=True)
     )
-    length_m = explanation_search.tables.model.beam.length_m
+    length_m = explanation_search.tables.model.plant.beam.length_m
     return Estimated(
         position.value,
         float(np.hypot(position.std, additional_std_m)),

@@ -368,7 +368,9 @@ class ExplanationSearch:
         they are twice as long elsewhere, for a first search.
         """
         tables = self.tables
-        is_near_tip = bool(np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.beam.length_m)
+        is_near_tip = bool(
+            np.median(rows[:, 0]) > NEAR_TIP_FRACTION * tables.model.plant.beam.length_m
+        )
         kernels = tables.finest if is_near_tip else tables.coarse if first else tables.middle
         obstacle_contact = ObstacleContact(kernels, tables.x_m, self.motion)
         return lambda candidates, window: obstacle_contact.predict(candidates, window)[0]
@@ -419,7 +421,7 @@ class ExplanationSearch:
 
         Minima are close together there.
         """
-        if np.median(candidates[:, 0]) <= NEAR_TIP_FRACTION * self.tables.model.beam.length_m:
+        if np.median(candidates[:, 0]) <= NEAR_TIP_FRACTION * self.tables.model.plant.beam.length_m:
             return candidates
         nearby_candidates = np.repeat(candidates[None, :2], _NEARBY_OFFSETS_M.size, axis=0)
         nearby_candidates[:, :, 0] = np.clip(

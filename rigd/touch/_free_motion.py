@@ -109,10 +109,10 @@ class FreeBeam:
         step_hz = STEPS_PER_SAMPLE * rate_hz
         self.transform = CausalTransform(n, step_hz, DECAY_EXPONENT, _BAND_FRACTION * step_hz / 2)
         s = self.transform.s
-        self._grid = force_grid = PointForceGrid(s, model.beam, model.damping)
+        self._grid = force_grid = PointForceGrid(s, model.plant.beam, model.plant.damping)
         filter_response = model.sensor_filter.response(s)
         filter_response *= np.exp(-s * (model.wrench_delay_s - model.angle_delay_s))
-        tool_inertia = model.tool_inertia_kg_m2 * s * s
+        tool_inertia = model.plant.tool_inertia_kg_m2 * s * s
         self._torque: Complex = filter_response * (force_grid.torque_per_angle() + tool_inertia)
         self._shear: Complex = filter_response * force_grid.shear_per_angle()
         self.modes = FreeVibration.from_model(model, np.empty(0))
@@ -145,7 +145,7 @@ class FreeBeam:
         if x_m.size > _NODE_COUNT:
             nodes_m, self._between = chebyshev_nodes(x_m, _NODE_COUNT)
         self._displacement: Complex = self._grid.per_angle(nodes_m).T
-        self.modes = self.modes.at_positions(x_m / self.model.beam.length_m)
+        self.modes = self.modes.at_positions(x_m / self.model.plant.beam.length_m)
 
     def displacement_per_sample(self, position_index: int, sample_count: int) -> Real:
         """Return the displacement at a position that one sample of the angle causes, in m/rad.
@@ -342,7 +342,7 @@ class FreeVibration:
     @classmethod
     def from_model(cls, model: TouchModel, x_m: Real) -> "FreeVibration":
         """Return the free vibrations of a model, with the displacement at positions `x_m`."""
-        beam, damping = model.beam, model.damping
+        beam, damping = model.plant.beam, model.plant.damping
         candidate_modes = 12
         mode_poles = poles(beam, damping, candidate_modes)[:, 0]
         mode_count = max(1, int(np.sum(mode_poles.imag < 2 * np.pi * _MAX_MODE_HZ)))

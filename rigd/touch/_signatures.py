@@ -64,16 +64,16 @@ def watched_beam(model: "TouchModel", rate_hz: float, noise_stds: ChannelNoise) 
         Noise of torque, base shear and angle.
     """
     observed_model = observed_beam(
-        model.beam,
-        model.damping,
+        model.plant.beam,
+        model.plant.damping,
         rate_hz,
         noise_stds,
-        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
+        tool_inertia_kg_m2=model.plant.tool_inertia_kg_m2,
         torque_after_angle_s=model.wrench_delay_s - model.angle_delay_s,
         sensor_filter=model.sensor_filter,
     )
     unit_signatures = signatures(
-        model.beam, model.damping, rate_hz, observed_model, model.sensor_filter
+        model.plant.beam, model.plant.damping, rate_hz, observed_model, model.sensor_filter
     )
     return WatchedBeam(observed_model, unit_signatures)
 

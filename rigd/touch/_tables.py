@@ -25,12 +25,12 @@ class TouchTables:
 
     def __init__(self, model: TouchModel, rate_hz: float) -> None:
         self.model, self.rate_hz = model, rate_hz
-        self.x_m = positions(model.beam.length_m, _SPACING_M)
+        self.x_m = positions(model.plant.beam.length_m, _SPACING_M)
         steps_per_sample = 4 * max(1, round(4000 / rate_hz))
         step_count = round((FINAL_S + DETECTION_DELAYS_S[-1] + 0.01) * rate_hz * steps_per_sample)
         self.finest = contact_kernels(
-            model.beam,
-            model.damping,
+            model.plant.beam,
+            model.plant.damping,
             self.x_m,
             1 / (steps_per_sample * rate_hz),
             step_count,
@@ -44,7 +44,7 @@ class TouchTables:
             steps_per_sample // 2, step_count // (steps_per_sample // 2)
         )
         self.crossing = cross_kernels(
-            model.beam, model.damping, self.x_m, self.coarse.step_s, self.coarse.steps
+            model.plant.beam, model.plant.damping, self.x_m, self.coarse.step_s, self.coarse.steps
         )
         self.any_force = AnyForceEstimator(
             half_sample_kernels, 2, round((FIRST_S + DETECTION_DELAYS_S[-1]) * rate_hz) + 1

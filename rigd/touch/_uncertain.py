@@ -56,8 +56,8 @@ def uncertainty_effects(
             touch_record, quiet_samples, quiet_samples - 4, free_motion.angle_transform
         )
         nearby_kernels = contact_kernels(
-            nearby_beam.model.beam,
-            nearby_beam.model.damping,
+            nearby_beam.model.plant.beam,
+            nearby_beam.model.plant.damping,
             np.array([x]),
             touch_tables.middle.step_s,
             round((free_motion.t[-1] - likely_obstacle[0, 1]) / touch_tables.middle.step_s) + 4,
@@ -85,7 +85,7 @@ def _free_motion_effects(
     free_motion = sample_window.motion
     spread = free_motion.spread
     amplitude_count = free_motion.ringing.poles.size * 2
-    position_fraction = likely_obstacle[:1] / touch_tables.model.beam.length_m
+    position_fraction = likely_obstacle[:1] / touch_tables.model.plant.beam.length_m
     step_count = free_motion.displacement_m.shape[1]
     # Times from the record's beginning, as for the amplitudes.
     t = (

@@ -15,7 +15,7 @@ from analysis.online import OnlineEstimate, OnlineEstimator, serve
 from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
-from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, modes
+from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, modes
 from rigd.session import read_session
 from rigd.session.layout import encode_samples
 from rigd.session.online_fit import (
@@ -137,8 +137,8 @@ def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
     n = signals.angle_rad.size
     decay = np.exp(-6.0 * np.arange(n) / n)
     s = 6.0 * 1000 / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1e-3)
-    more = LoadedBeam(PAPER_BEAM, damping, tip_kg).transfer(s)
-    more -= LoadedBeam(PAPER_BEAM, damping).transfer(s)
+    more = Plant(PAPER_BEAM, damping, tip_mass_kg=tip_kg).transfer(s)
+    more -= Plant(PAPER_BEAM, damping).transfer(s)
     spectrum = np.fft.rfft(signals.angle_rad * decay, 4 * n) * np.where(s.imag < 600.0, more, 0.0)
     torque_nm = signals.torque_nm + np.fft.irfft(spectrum, 4 * n)[:n] / decay
     return replace(signals, torque_nm=torque_nm)
@@ -146,7 +146,7 @@ def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
 
 def test_both_estimates_have_the_modes_of_a_beam_that_is_not_uniform(session):
     """Those of the modal model, without a flag; and the plant to excite next has them."""
-    beam = LoadedBeam(PAPER_BEAM, PAPER_DAMPING, 1.8e-4)
+    beam = Plant(PAPER_BEAM, PAPER_DAMPING, tip_mass_kg=1.8e-4)
     poles = beam.poles(clamped_free_eigenvalues(3))[:, 0]
     fit = fed_with(with_mass_at_tip(scan(), 1.8e-4), session)
     for whole in (False, True):
@@ -165,7 +165,7 @@ def test_both_estimates_have_the_modes_of_a_beam_that_is_not_uniform(session):
             assert abs(mode.damping_ratio.value - ratio) < 4 * mode.damping_ratio.std
         plant = estimate.plant
         assert len(plant.stiffness_offsets) == 2
-        found = LoadedBeam(plant.beam, plant.damping, stiffness_offsets=plant.stiffness_offsets)
+        found = Plant(plant.beam, plant.damping, stiffness_offsets=plant.stiffness_offsets)
         near = found.poles(clamped_free_eigenvalues(3))[:, 0]
         np.testing.assert_allclose(near.imag, poles.imag, rtol=1e-3)
 

@@ -2,8 +2,8 @@
 
 import pytest
 
-from analysis.models import PARAMETERS, STRUCTURES
-from rigd.beam import Damping
+from analysis.models import STRUCTURES
+from rigd.beam import DAMPING_PARAMETERS, Damping
 
 TABLE_2 = {
     "I": {"alpha": 1, "lambda": 0, "gamma": 0},
@@ -25,7 +25,7 @@ def test_fixed_and_free(name):
     structure = STRUCTURES[name]
     assert structure.name == name
     assert dict(structure.fixed) == TABLE_2[name]
-    assert structure.free == tuple(p for p in PARAMETERS if p not in TABLE_2[name])
+    assert structure.free == tuple(p for p in DAMPING_PARAMETERS if p not in TABLE_2[name])
     assert structure.internal == (name not in ("II", "V"))
     assert structure.external == (name not in ("I", "IV"))
 

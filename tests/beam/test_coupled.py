@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.linalg import expm as scipy_expm
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 from rigd.beam.realisation import couple, propagator, realise
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
-REALISATION = realise(BEAM, Damping(7.1e-5, 0.996, 0.055, 0.594))
+REALISATION = realise(Plant(BEAM, Damping(7.1e-5, 0.996, 0.055, 0.594)))
 MOTOR = {"motor_inertia_kg_m2": 2e-3, "viscous_nm_s_per_rad": 0.02}
 
 

@@ -6,7 +6,7 @@ from math import pi
 import numpy as np
 import pytest
 
-from rigd.beam import Beam, Damping, PointForceGrid, mode_mean, mode_shape, realise_force
+from rigd.beam import Beam, Damping, Plant, PointForceGrid, mode_mean, mode_shape, realise_force
 from rigd.beam.realisation import RealisationError, realise, state_output
 
 BEAM = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
@@ -72,7 +72,7 @@ def test_an_order_that_is_too_high_is_refused_where_it_damps():
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
 @pytest.mark.parametrize("x_m", [0.1, 0.7])
 def test_displacement_told_by_the_states(damping, x_m):
-    realisation = realise(BEAM, damping)
+    realisation = realise(Plant(BEAM, damping))
     told = state_output(
         realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(x_m), inertial=False
     )
@@ -82,7 +82,7 @@ def test_displacement_told_by_the_states(damping, x_m):
 
 @pytest.mark.parametrize("damping", DAMPINGS.values(), ids=DAMPINGS)
 def test_shear_told_by_the_states(damping):
-    realisation = realise(BEAM, damping)
+    realisation = realise(Plant(BEAM, damping))
     told = state_output(
         realisation, lambda s: PointForceGrid(s, BEAM, damping).shear_per_angle(), inertial=True
     )
@@ -111,7 +111,7 @@ def errors(realisation, told, damping, response_of):
 def test_torque_of_a_force_is_the_displacement_of_an_angle(at_m):
     damping = DAMPINGS["paper"]
     s = 2j * pi * np.geomspace(0.05, 300, 1000)
-    realisation = realise(BEAM, damping)
+    realisation = realise(Plant(BEAM, damping))
     told = state_output(
         realisation, lambda s: PointForceGrid(s, BEAM, damping).per_angle(at_m), inertial=False
     )

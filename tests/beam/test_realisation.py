@@ -5,7 +5,7 @@ import pytest
 from cases import further
 from paper_table import table_3
 
-from rigd.beam import Beam, Damping, modes, transfer
+from rigd.beam import Beam, Damping, Plant, modes, transfer
 from rigd.beam.realisation import RealisationError, couple, realise
 
 PAPER_BEAM = Beam(0.98, 4.7e-3, 0.090275)
@@ -45,7 +45,7 @@ def measured_error(realisation, beam, damping):
 
 @pytest.mark.parametrize("name", SETS)
 def test_table_3(name):
-    realisation = realise(PAPER_BEAM, SETS[name])
+    realisation = realise(Plant(PAPER_BEAM, SETS[name]))
     error = measured_error(realisation, PAPER_BEAM, SETS[name])
     assert error < 5e-5
     assert error < 2 * realisation.relative_error + 1e-9
@@ -63,12 +63,12 @@ def test_table_3(name):
 )
 def test_plants_that_the_analysis_is_proved_on(damping):
     """EI is known to 4e-4 from 20 pooled chirps or from one session of narrow sweeps."""
-    assert measured_error(realise(PAPER_BEAM, damping), PAPER_BEAM, damping) < 5e-5
+    assert measured_error(realise(Plant(PAPER_BEAM, damping)), PAPER_BEAM, damping) < 5e-5
 
 
 def test_random_beams_and_dampings():
     for beam, damping in random_rigs(60, seed=1):
-        realisation = realise(beam, damping)
+        realisation = realise(Plant(beam, damping))
         assert measured_error(realisation, beam, damping) < 3 * realisation.relative_error + 1e-9
         for share in (0.1, 1.0, 10.0):
             motor = couple(realisation, motor_inertia_kg_m2=share * beam.inertia_kg_m2)
@@ -76,7 +76,7 @@ def test_random_beams_and_dampings():
 
 
 def test_state_space_is_the_transfer_function_and_block_diagonal():
-    realisation = realise(PAPER_BEAM, SETS["VI-omega"])
+    realisation = realise(Plant(PAPER_BEAM, SETS["VI-omega"]))
     s = 2j * np.pi * np.geomspace(0.01, 500, 40)
     states = np.array(
         [np.linalg.solve(x * np.eye(realisation.b.size) - realisation.a, realisation.b) for x in s]
@@ -101,24 +101,24 @@ def test_state_space_is_the_transfer_function_and_block_diagonal():
 
 def test_direct_terms_dissipate_or_store():
     for name, damping in SETS.items():
-        realisation = realise(PAPER_BEAM, damping)
+        realisation = realise(Plant(PAPER_BEAM, damping))
         assert realisation.direct_inertia_kg_m2 >= 0, name
         assert realisation.direct_viscosity_nm_s_per_rad >= 0, name
         assert realisation.direct_stiffness_nm_per_rad >= 0, name
 
 
 def test_refusal_names_the_error_achieved():
-    achieved = realise(PAPER_BEAM, SETS["VI-omega"]).relative_error
+    achieved = realise(Plant(PAPER_BEAM, SETS["VI-omega"])).relative_error
     with pytest.raises(RealisationError, match=rf"{achieved:.1e}.*1\.0e-07 was requested"):
-        realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1e-7)
-    assert realise(PAPER_BEAM, SETS["VI-omega"], max_relative_error=1.01 * achieved)
+        realise(Plant(PAPER_BEAM, SETS["VI-omega"]), max_relative_error=1e-7)
+    assert realise(Plant(PAPER_BEAM, SETS["VI-omega"]), max_relative_error=1.01 * achieved)
 
 
 def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
     """No damping is known that fails this check; the undamped beam does under a stricter limit."""
     monkeypatch.setattr("rigd.beam.realisation.MAX_GROWTH_PER_S", 1e-6)
     with pytest.raises(RealisationError, match="without friction would be unstable"):
-        realise(PAPER_BEAM, Damping())
+        realise(Plant(PAPER_BEAM, Damping()))
 
 
 @pytest.mark.parametrize(
@@ -134,13 +134,13 @@ def test_refusal_of_what_would_make_a_motor_unstable(monkeypatch):
 )
 def test_active_beams_are_refused(damping):
     with pytest.raises(RealisationError, match="creates energy"):
-        realise(PAPER_BEAM, damping)
+        realise(Plant(PAPER_BEAM, damping))
 
 
 def test_a_beam_of_too_many_modes_is_refused_at_once():
     millimetres_for_metres = Beam(980.0, 4.7e-3, 0.090275)
     with pytest.raises(RealisationError, match=r"modes below 1200 Hz.*units"):
-        realise(millimetres_for_metres, Damping())
+        realise(Plant(millimetres_for_metres, Damping()))
 
 
 @pytest.mark.parametrize("share", [0.95, further(0.98), further(1.02), 1.05])
@@ -150,20 +150,19 @@ def test_a_beam_of_another_stiffness_has_as_many_states(share):
         for damping in (Damping(7.1e-5, 0.996, 0.055, 0.594), Damping(zeta=1.075e-3)):
             beam = Beam(length_m, 4.7e-3, 0.090275)
             other = Beam(length_m, 4.7e-3, share * 0.090275)
-            one, two = realise(beam, damping), realise(other, damping, modes_of=beam)
+            one, two = realise(Plant(beam, damping)), realise(Plant(other, damping), modes_of=beam)
             assert one.b.size == two.b.size
             assert np.array_equal(np.unique(one.modes), np.unique(two.modes))
             of_first = two.poles_rad_s[two.modes == 0] / one.poles_rad_s[one.modes == 0]
             assert of_first.imag == pytest.approx(0.0, abs=1e-2)
             assert of_first.real == pytest.approx(share**0.5, rel=1e-2)
-            own = realise(beam, damping, modes_of=beam)
+            own = realise(Plant(beam, damping), modes_of=beam)
             assert np.array_equal(own.c, one.c)
 
 
 def test_modes_of_quite_another_beam_are_refused():
     with pytest.raises(RealisationError, match="does not have the modes of"):
         realise(
-            Beam(0.98, 4.7e-3, 0.090275),
-            Damping(zeta=1.075e-3),
+            Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(zeta=1.075e-3)),
             modes_of=Beam(0.98, 4.7e-3, 0.9),
         )

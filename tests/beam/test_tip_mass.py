@@ -8,7 +8,7 @@ import pytest
 from rigd.beam import (
     Beam,
     Damping,
-    LoadedBeam,
+    Plant,
     clamped_free_eigenvalues,
     pole_gradient,
     poles,
@@ -23,6 +23,10 @@ DAMPINGS = {
     "integer": Damping(7.1e-5, 1.0, 1.2e-2, 1.0),
 }
 ENDS = [(0.0, 0.0), (5e-5, 0.0), (0.0, 0.01), (5e-4, 0.05)]
+
+
+def ends(mass, compliance):
+    return {"tip_mass_kg": mass, "root_compliance_rad_per_nm": compliance}
 
 
 def textbook(s, damping, tip_mass_kg, compliance):
@@ -62,7 +66,7 @@ def solved(s, damping, tip_mass_kg, compliance):
 @pytest.mark.parametrize("name", DAMPINGS)
 def test_the_closed_form_solves_the_boundary_value_problem(name, mass, compliance):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 60)
-    loaded = LoadedBeam(BEAM, DAMPINGS[name], mass, compliance)
+    loaded = Plant(BEAM, DAMPINGS[name], **ends(mass, compliance))
     assert loaded.transfer(s) == pytest.approx(
         textbook(s, DAMPINGS[name], mass, compliance), rel=1e-7
     )
@@ -73,7 +77,12 @@ OFFSETS = (0.04, -0.07, 0.1)
 
 def offset(compliance):
     """Give a beam whose modes have stiffnesses of their own."""
-    return LoadedBeam(BEAM, DAMPINGS["fractional"], 0.0, compliance, OFFSETS)
+    return Plant(
+        BEAM,
+        DAMPINGS["fractional"],
+        root_compliance_rad_per_nm=compliance,
+        stiffness_offsets=OFFSETS,
+    )
 
 
 @pytest.mark.parametrize("compliance", [0.0, 0.05])
@@ -106,10 +115,7 @@ def test_their_poles_are_found_and_realised(compliance):
     at_poles = loaded.poles(clamped_free_eigenvalues(6))[:, 0]
     far, near = (np.abs(loaded.transfer(at_poles * (1 + h))) for h in (1e-4, 1e-8))
     assert (near > 1e3 * far).all()
-    made = realise(
-        BEAM, DAMPINGS["fractional"], root_compliance_rad_per_nm=compliance,
-        stiffness_offsets=OFFSETS,
-    )  # fmt: skip
+    made = realise(loaded)
     s = 2j * np.pi * np.geomspace(0.1, 90, 200)
     assert made.transfer(s) == pytest.approx(loaded.transfer(s), rel=1e-3)
     # The residues are those of the realisation: half of what both states of a pair contribute.
@@ -136,7 +142,7 @@ def test_their_tip_moves_as_the_sum_of_the_modes():
     displacement, slope = loaded.tip_response(s)
     assert displacement == pytest.approx(2 * size.sum(axis=1), rel=1e-7, abs=1e-9)
     slopes = 2 * z * root_shear_ratio(z.size) / BEAM.length_m
-    uniform = LoadedBeam(BEAM, DAMPINGS["fractional"])
+    uniform = Plant(BEAM, DAMPINGS["fractional"])
     same = (
         -inertial[:, None]
         * turn
@@ -171,17 +177,17 @@ def test_they_are_differentiated_as_those_of_the_uniform_beam(compliance):
 def test_a_beam_is_given_the_frequencies_of_modes():
     wanted_hz = offset(0.0).poles(clamped_free_eigenvalues(3))[:, 0].imag / (2 * np.pi)
     heavier = replace(BEAM, density_kg_per_m=1.2 * BEAM.density_kg_per_m)
-    found = LoadedBeam(heavier, DAMPINGS["fractional"]).with_frequencies(wanted_hz)
+    found = Plant(heavier, DAMPINGS["fractional"]).with_frequencies(wanted_hz)
     assert found.stiffness_offsets == pytest.approx(OFFSETS[:2], abs=1e-5)
     assert found.beam.density_kg_per_m == pytest.approx(BEAM.density_kg_per_m, rel=1e-5)
     with pytest.raises(ValueError, match="does not oscillate"):
-        LoadedBeam(BEAM, Damping(gamma=1e3)).with_frequencies(wanted_hz)
+        Plant(BEAM, Damping(gamma=1e3)).with_frequencies(wanted_hz)
 
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS)
 def test_the_slope_of_the_tip_is_that_of_the_boundary_value_problem(mass, compliance):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 80, 60)
-    loaded = LoadedBeam(BEAM, DAMPINGS["fractional"], mass, compliance)
+    loaded = Plant(BEAM, DAMPINGS["fractional"], **ends(mass, compliance))
     exact = solved(s, DAMPINGS["fractional"], mass, compliance)[1]
     assert loaded.tip_slope(s) == pytest.approx(exact, rel=1e-6)
 
@@ -217,7 +223,7 @@ def changed(loaded, name, step):
 @pytest.mark.parametrize(("mass", "compliance"), [(5e-5, 0.002), (5e-4, 0.05)])
 def test_the_derivatives_are_those_of_differences(mass, compliance, name):
     s = 0.5 + 2j * np.pi * np.geomspace(0.5, 60, 40)
-    loaded = LoadedBeam(BEAM, DAMPINGS["fractional"], mass, compliance)
+    loaded = Plant(BEAM, DAMPINGS["fractional"], **ends(mass, compliance))
     step, z = STEPS[name], clamped_free_eigenvalues(3)
     above, below = changed(loaded, name, step), changed(loaded, name, -step)
     found, (gradient,) = loaded.transfer_and_gradient(s, [name])
@@ -232,7 +238,7 @@ def test_the_derivatives_are_those_of_differences(mass, compliance, name):
 
 @pytest.mark.parametrize("mass", [0.0, 5e-5])
 def test_next_to_the_pole_on_a_rigid_clamp_the_derivatives_are_those_of_differences(mass):
-    loaded, z = LoadedBeam(BEAM, DAMPINGS["fractional"], mass), clamped_free_eigenvalues(3)
+    loaded, z = Plant(BEAM, DAMPINGS["fractional"], tip_mass_kg=mass), clamped_free_eigenvalues(3)
     for name in ("zeta", "ln_density_over_stiffness", "tip_mass_kg"):
         step = STEPS[name]
         poles = loaded.poles(z)[:, 0]
@@ -246,7 +252,7 @@ def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(
     """Without a warning, and by what is the beam's own as in the bare beam's closed form."""
     beam = Beam(0.98, 4.7e-3, stiffness)
     own, ends = ("zeta", "ln_density_over_stiffness"), ("tip_mass_kg", "root_compliance_rad_per_nm")
-    loaded, z = LoadedBeam(beam, damping), clamped_free_eigenvalues(3)
+    loaded, z = Plant(beam, damping), clamped_free_eigenvalues(3)
     poles = loaded.poles(z)[:, 0]
     moved = loaded.pole_gradients(poles, (*own, *ends))
     for pole, root, row in zip(poles, z, moved, strict=True):
@@ -259,7 +265,7 @@ def test_poles_of_a_bare_beam_move_with_its_ends_where_the_response_is_infinite(
 
 def test_without_either_it_is_the_bare_beam():
     s = 2j * np.pi * np.geomspace(0.01, 400, 300)
-    bare = LoadedBeam(BEAM, DAMPINGS["fractional"])
+    bare = Plant(BEAM, DAMPINGS["fractional"])
     assert bare.transfer(s) == pytest.approx(transfer(s, BEAM, DAMPINGS["fractional"]), rel=1e-9)
     z = clamped_free_eigenvalues(5)
     assert (bare.poles(z) == poles(BEAM, DAMPINGS["fractional"], 5)).all()
@@ -268,7 +274,7 @@ def test_without_either_it_is_the_bare_beam():
 @pytest.mark.parametrize(("mass", "compliance"), ENDS[1:])
 @pytest.mark.parametrize("name", DAMPINGS)
 def test_the_response_is_infinite_at_the_poles_and_nought_at_the_zeros(name, mass, compliance):
-    loaded = LoadedBeam(BEAM, DAMPINGS[name], mass, compliance)
+    loaded = Plant(BEAM, DAMPINGS[name], **ends(mass, compliance))
     at_poles = loaded.poles(clamped_free_eigenvalues(4))[:, 0]
     beside = loaded.transfer(at_poles * (1 + 1e-4))
     assert (np.abs(loaded.transfer(at_poles * (1 + 1e-9))) > 1e4 * np.abs(beside)).all()
@@ -279,9 +285,7 @@ def test_the_response_is_infinite_at_the_poles_and_nought_at_the_zeros(name, mas
 
 @pytest.mark.parametrize(("mass", "compliance"), ENDS[1:])
 def test_the_realisation_is_that_of_the_beam_with_its_ends(mass, compliance):
-    made = realise(
-        BEAM, DAMPINGS["fractional"], tip_mass_kg=mass, root_compliance_rad_per_nm=compliance
-    )
+    made = realise(Plant(BEAM, DAMPINGS["fractional"], **ends(mass, compliance)))
     s = 2j * np.pi * np.geomspace(0.1, 90, 200)
     of_states = [made.c @ np.linalg.solve(x * np.eye(made.b.size) - made.a, made.b) for x in s]
     response = s**2 * (np.array(of_states) + made.direct_inertia_kg_m2)

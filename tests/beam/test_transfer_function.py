@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from rigd.beam import PARAMETERS, Beam, Damping, TransferGrid, transfer, transfer_and_gradient
+from rigd.beam import GRADIENT_NAMES, Beam, Damping, TransferGrid, transfer, transfer_and_gradient
 
 DATA = Path(__file__).parent.parent / "data"
 PAPER_BEAM = Beam(0.98, 4.7e-3, 0.090275)
@@ -60,7 +60,7 @@ def test_golden_values(case):
     assert np.max(np.abs(g - exact) / np.abs(exact)) < 1e-12
 
 
-@pytest.mark.parametrize("name", PARAMETERS)
+@pytest.mark.parametrize("name", GRADIENT_NAMES)
 @pytest.mark.parametrize("case", DERIVATIVES)
 def test_derivatives(case, name):
     rows = DERIVATIVES[case]
@@ -78,8 +78,8 @@ def test_derivatives(case, name):
 def test_gradient_comes_in_the_order_asked_for_with_the_value_of_transfer():
     s = 2j * np.pi * np.geomspace(1e-3, 5e3, 500)
     damping = Damping(7e-5, 0.996, 0.055, 0.594)
-    g, gradient = transfer_and_gradient(s, PAPER_BEAM, damping, PARAMETERS)
-    _, reverse = transfer_and_gradient(s, PAPER_BEAM, damping, PARAMETERS[::-1])
+    g, gradient = transfer_and_gradient(s, PAPER_BEAM, damping, GRADIENT_NAMES)
+    _, reverse = transfer_and_gradient(s, PAPER_BEAM, damping, GRADIENT_NAMES[::-1])
     assert np.array_equal(gradient, reverse[::-1])
     np.testing.assert_allclose(g, transfer(s, PAPER_BEAM, damping), rtol=1e-14)
 
@@ -103,7 +103,7 @@ def test_any_shape(shape):
 
 @given(beam=beams, damping=dampings)
 def test_zero_frequency_gives_zero(beam, damping):
-    g, gradient = transfer_and_gradient([0.0, 1j], beam, damping, PARAMETERS)
+    g, gradient = transfer_and_gradient([0.0, 1j], beam, damping, GRADIENT_NAMES)
     assert g[0] == 0
     assert not gradient[:, 0].any()
     assert g[1] == pytest.approx(transfer(1j, beam, damping), rel=1e-13)
@@ -112,7 +112,7 @@ def test_zero_frequency_gives_zero(beam, damping):
 @given(beam=beams, damping=dampings, real=st.floats(-1e3, 1e3), imag=st.floats(1e-3, 1e4))
 def test_conjugate_symmetry(beam, damping, real, imag):
     s = np.array([complex(real, imag), complex(real, -imag)])
-    g, gradient = transfer_and_gradient(s, beam, damping, PARAMETERS)
+    g, gradient = transfer_and_gradient(s, beam, damping, GRADIENT_NAMES)
     np.testing.assert_allclose(g[1], np.conj(g[0]), rtol=1e-12)
     np.testing.assert_allclose(gradient[:, 1], np.conj(gradient[:, 0]), rtol=1e-11, atol=1e-300)
 
@@ -120,7 +120,7 @@ def test_conjugate_symmetry(beam, damping, real, imag):
 @given(beam=beams, damping=dampings)
 def test_finite_over_eighteen_decades(beam, damping):
     s = 1j * np.geomspace(1e-9, 1e9, 800)
-    g, gradient = TransferGrid(s).evaluate_with_gradient(beam, damping, PARAMETERS)
+    g, gradient = TransferGrid(s).evaluate_with_gradient(beam, damping, GRADIENT_NAMES)
     assert np.isfinite(g).all()
     assert np.isfinite(gradient).all()
 

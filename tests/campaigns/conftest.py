@@ -17,10 +17,10 @@ from analysis.campaigns import (
     campaign,
 )
 from analysis.campaigns._experiment import Experiment
-from analysis.identify import ModeEstimate, Plant
+from analysis.identify import ModeEstimate
 from analysis.models import STRUCTURES, WelchSettings
 from analysis.paper import Indices, Peak
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 
 RATE_HZ = 250.0

@@ -11,7 +11,7 @@ from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
 from analysis.campaigns._validation import left_out_errors, models_without_session
-from analysis.identify import BAND_HZ, Plant
+from analysis.identify import BAND_HZ
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
 from analysis.report import campaign_document
@@ -19,7 +19,7 @@ from analysis.report._campaign_tables import session_list_table, sessions_table,
 from analysis.report.campaign_report import campaign_tables, campaign_text, write_campaign
 from analysis.report.table import json_rows
 from analysis.results import whole_record
-from rigd.beam import modes
+from rigd.beam import Plant, modes
 
 pytestmark = pytest.mark.fit
 

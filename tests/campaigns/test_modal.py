@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 from cauchy_residues import modal_constants
 
-from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel, Plant
+from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel
 from analysis.identify.sentences import uniformity
+from rigd.beam import Plant
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING
 
 pytestmark = pytest.mark.fit

@@ -137,9 +137,9 @@ def test_pieces_join_at_rest(record):
 
 
 def test_the_free_end_stays_within_small_slopes(record):
-    rig = load_profile("sim").rig
+    profile = load_profile("sim")
     angle_rad = record.samples["angle_rad"]
-    slope_rad = tip_motion(rig.beam, rig.damping, angle_rad, rig.rate_hz).slope_rad
+    slope_rad = tip_motion(profile.plant, angle_rad, profile.rig.rate_hz).slope_rad
     assert 0.5 * SMALL_SLOPE_RAD < slope_rad < SMALL_SLOPE_RAD
 
 

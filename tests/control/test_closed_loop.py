@@ -29,10 +29,10 @@ def run_tick_by_tick(model, reference_rad, torque_limit_nm=math.inf):
     Returns angle, torque command and sensor torque at the ticks, friction left out of the plant.
     """
     coupled = couple(
-        None if model.beam is None else realise(model.beam, model.damping),
+        None if model.plant is None else realise(model.plant),
         motor_inertia_kg_m2=model.motor_inertia_kg_m2,
         viscous_nm_s_per_rad=model.viscous_nm_s_per_rad,
-        tool_inertia_kg_m2=model.tool_inertia_kg_m2,
+        tool_inertia_kg_m2=0.0 if model.plant is None else model.plant.tool_inertia_kg_m2,
     )
     phi, gamma = propagator(coupled, 1 / model.rate_hz / SUBSTEPS)
     gains = design_pid(
@@ -65,6 +65,10 @@ def run_tick_by_tick(model, reference_rad, torque_limit_nm=math.inf):
         applied = torques[sent] if sent >= 0 else 0.0
         x = phi @ x + gamma * applied
     return angles[before::SUBSTEPS], torques, sensed[before::SUBSTEPS]
+
+
+def damped(model, damping):
+    return replace(model, plant=replace(model.plant, damping=damping))
 
 
 def without_friction(model):
@@ -113,7 +117,7 @@ def test_any_fractions_of_a_period_as_delays(loop_model, actuation, angle, torqu
         actuation_delay_s=actuation * eighth_s,
         angle_delay_s=angle * eighth_s,
         torque_delay_s=torque * eighth_s,
-        tool_inertia_kg_m2=tool,
+        plant=replace(loop_model.plant, tool_inertia_kg_m2=tool),
     )
     reference = np.random.default_rng(1).normal(size=200) * 1e-2
     truth = run_tick_by_tick(model, reference)
@@ -204,7 +208,7 @@ def test_response_agrees_with_the_simulation(loop_model):
 
 
 def test_each_of_the_papers_sets_is_stable(loop_model, paper_damping):
-    loop = close_loop(replace(loop_model, damping=paper_damping))
+    loop = close_loop(damped(loop_model, paper_damping))
     assert loop.spectral_radius < 1
     assert check_stability(loop) is None
 
@@ -212,7 +216,7 @@ def test_each_of_the_papers_sets_is_stable(loop_model, paper_damping):
 @pytest.mark.parametrize("pole_rad_s", [40.0, 60.0, 80.0, 100.0])
 def test_without_feed_forward_it_is_refused(loop_model, paper_damping, pole_rad_s):
     change = {"feedforward_gain": 0.0, "pole_rad_s": pole_rad_s}
-    loop = close_loop(changed(replace(loop_model, damping=paper_damping), change))
+    loop = close_loop(changed(damped(loop_model, paper_damping), change))
     with pytest.raises(ControlDesignError, match=r"feedforward_gain = 0 .* set it to 1"):
         check_stability(loop)
 
@@ -265,7 +269,7 @@ def test_what_is_known_to_be_tolerable_is_accepted(loop_model, change):
 
 
 def test_a_beam_with_almost_no_damping_gives_a_warning(loop_model):
-    loop = close_loop(replace(loop_model, damping=Damping(zeta=1e-6)))
+    loop = close_loop(damped(loop_model, Damping(zeta=1e-6)))
     warning = check_stability(loop)
     assert warning is not None
     assert "2.55 Hz" in warning

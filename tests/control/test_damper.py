@@ -17,10 +17,11 @@ def model(request):
 
 
 def ratios(model, settings, stiffness):
-    beam = replace(model.beam, bending_stiffness_n_m2=stiffness * model.beam.bending_stiffness_n_m2)
-    loop = close_loop(replace(model, beam=beam))
+    beam = model.plant.beam
+    beam = replace(beam, bending_stiffness_n_m2=stiffness * beam.bending_stiffness_n_m2)
+    loop = close_loop(replace(model, plant=replace(model.plant, beam=beam)))
     found = loop.poles_rad_s if settings is None else damped_poles(loop, settings)
-    modes = [found[np.argmin(np.abs(found - s))] for s in poles(beam, model.damping, 3)[:, 0]]
+    modes = [found[np.argmin(np.abs(found - s))] for s in poles(beam, model.plant.damping, 3)[:, 0]]
     return np.array([-s.real / abs(s) for s in modes]), found
 
 
@@ -43,7 +44,7 @@ def test_where_the_torque_is_old_it_is_weaker_or_none(model):
 
 
 def test_without_a_beam_there_is_nothing_to_damp(model):
-    assert design_damper(close_loop(replace(model, beam=None))) is None
+    assert design_damper(close_loop(replace(model, plant=None))) is None
 
 
 def test_the_recursion_gives_the_designed_poles(model):
@@ -59,7 +60,7 @@ def test_the_recursion_gives_the_designed_poles(model):
         torques.append(reading @ state)
         state = loop.a @ state + loop.b * (pushed + damper.step(torques[-1]))
     modes = damped_poles(loop, settings)
-    first = modes[np.argmin(np.abs(modes - poles(model.beam, model.damping, 1)[0, 0]))]
+    first = modes[np.argmin(np.abs(modes - poles(model.plant.beam, model.plant.damping, 1)[0, 0]))]
     period = round(model.rate_hz * 2 * np.pi / first.imag)
     spans = [np.ptp(torques[start : start + period]) for start in (900, 900 + 2 * period)]
     expected = np.exp(first.real * 2 * period / model.rate_hz)

@@ -127,7 +127,7 @@ def test_phase_margin_is_taken_either_way(loop_model):
 
 def test_no_frequency_of_a_fine_grid_is_nearer_to_minus_one(loop_model):
     """Sharp resonances are not stepped over, not even those of a beam with no damping."""
-    light = replace(loop_model, damping=Damping(zeta=1e-5))
+    light = replace(loop_model, plant=replace(loop_model.plant, damping=Damping(zeta=1e-5)))
     grid = 2 * np.pi * np.concatenate([np.linspace(2.5, 2.6, 801), np.linspace(15.8, 16.2, 801)])
     for model in (loop_model, light):
         loop = close_loop(model)

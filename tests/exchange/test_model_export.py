@@ -15,7 +15,7 @@ from typer.testing import CliRunner
 from analysis.cli.app import app
 from analysis.identify import ModalModel
 from analysis.linear_model import ModelOptions, identified_in_session, linear_model
-from rigd.beam import Beam, Damping, LoadedBeam
+from rigd.beam import Beam, Damping, Plant
 
 BAND_HZ = (0.05, 100.0)
 RELATIVE_STD = 1e-3
@@ -69,11 +69,11 @@ def random_beam(seed):
 def exact(values, s):
     """Response from angle to torque, from the beam's exact model and not from the export."""
     stiffness = values["bending_stiffness_n_m2"]
-    beam = LoadedBeam(
+    beam = Plant(
         Beam(LENGTH_M, values["density_over_stiffness"] * stiffness, stiffness),
         Damping(values["zeta"], values["alpha"], values["gamma"], values["lambda"]),
-        values.get("tip_mass_kg", 0.0),
-        values.get("root_compliance_rad_per_nm", 0.0),
+        tip_mass_kg=values.get("tip_mass_kg", 0.0),
+        root_compliance_rad_per_nm=values.get("root_compliance_rad_per_nm", 0.0),
     )
     torque = beam.transfer(s) + values["tool_inertia_kg_m2"] * s**2
     x = values.get("filter_time_constant_s", 0.0) * s

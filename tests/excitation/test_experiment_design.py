@@ -13,7 +13,6 @@ from rigd.excitation.experiment_design import design_excitation, next_segment
 from rigd.excitation.targets import parse_target
 
 RATE_HZ = 1000.0
-LINK = ESTIMATE.beam
 LIMIT_FRACTION = 0.9
 DAMPING = [parse_target("damping", "1%")]
 
@@ -22,7 +21,7 @@ DAMPING = [parse_target("damping", "1%")]
 def scanned(rig):
     """Angle of a fast scan."""
     scan = chirp(rate_hz=RATE_HZ, start_hz=0.5, duration_s=5.0, rest_s=1.0, ring_down_s=0.0)
-    plant = rig.plant_with(ESTIMATE.loaded_beam)
+    plant = rig.plant_with(ESTIMATE.plant)
     return plant.respond(scan.reference_rad).angle_rad
 
 
@@ -48,10 +47,10 @@ def test_angle_speed_and_acceleration_are_zero_at_the_joints(design):
 
 
 def test_the_loop_with_an_estimate_is_computed_once(rig):
-    plant = rig.plant_with(ESTIMATE.loaded_beam)
-    assert rig.plant_with(replace(ESTIMATE.loaded_beam)) is plant
-    assert rig.plant_with(replace(ESTIMATE.loaded_beam, damping=Damping(zeta=7e-5))) is not plant
-    assert rig.plant_with(replace(ESTIMATE.loaded_beam, tip_mass_kg=3e-4)) is not plant
+    plant = rig.plant_with(ESTIMATE.plant)
+    assert rig.plant_with(replace(ESTIMATE.plant)) is plant
+    assert rig.plant_with(replace(ESTIMATE.plant, damping=Damping(zeta=7e-5))) is not plant
+    assert rig.plant_with(replace(ESTIMATE.plant, tip_mass_kg=3e-4)) is not plant
 
 
 def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
@@ -64,12 +63,12 @@ def test_everything_asked_is_reached_soon_and_the_time_is_kept(design):
 
 def test_the_whole_session_keeps_the_limits_and_the_small_slopes(rig):
     """By another way: the whole reference through the loop, the tip from the whole angle."""
-    plant = rig.plant_with(ESTIMATE.loaded_beam)
+    plant = rig.plant_with(ESTIMATE.plant)
     alone = design_excitation(ESTIMATE, rig, DAMPING, 6.0)
     response = plant.respond(alone.reference_rad)
     torque = np.abs(response.torque_nm).max() + plant.friction_nm
     assert torque < 1.05 * LIMIT_FRACTION * (plant.peak_torque_nm + plant.friction_nm)
-    slope = tip_motion(LINK, ESTIMATE.damping, response.angle_rad, RATE_HZ).slope_rad
+    slope = tip_motion(ESTIMATE.plant, response.angle_rad, RATE_HZ).slope_rad
     # Ringing moves the motor a little, which no piece knows: the share left over is for that.
     assert 0.8 * 0.9 * 0.14 < slope < 0.14
 
@@ -99,8 +98,7 @@ def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
         for slope in (0.14, 0.07)
     )
     slopes = [
-        tip_motion(LINK, ESTIMATE.damping, piece.angle_rad, RATE_HZ).slope_rad
-        for piece in (free, held)
+        tip_motion(ESTIMATE.plant, piece.angle_rad, RATE_HZ).slope_rad for piece in (free, held)
     ]
     assert slopes[1] < 0.064
     assert slopes[0] < 0.13
@@ -123,7 +121,7 @@ def test_what_cannot_be_reached_is_said_with_the_reason(rig, scanned):
     assert not easy.reason
     internal = replace(
         ESTIMATE,
-        damping=Damping(zeta=7.1e-5),
+        plant=replace(ESTIMATE.plant, damping=Damping(zeta=7.1e-5)),
         names=tuple(name for name in UNIFORM if name not in ("gamma", "lambda")),
     )
     absent = next_segment(internal, scanned, [parse_target("gamma", "5%")], rig, 60.0)
@@ -163,6 +161,6 @@ def test_a_mode_that_has_to_be_driven_is_driven_whatever_else_tells_more(rig, sc
 def test_nothing_asked_and_nothing_to_drive_are_refused(rig, scanned):
     with pytest.raises(ExcitationError, match="No precision is requested"):
         next_segment(ESTIMATE, scanned, [], rig, 10.0)
-    stiff = replace(ESTIMATE, beam=Beam(0.1, 4.7e-3, 0.090275))
+    stiff = replace(ESTIMATE, plant=replace(ESTIMATE.plant, beam=Beam(0.1, 4.7e-3, 0.090275)))
     with pytest.raises(ExcitationError, match="no mode below 50 Hz"):
         next_segment(stiff, scanned, [parse_target("zeta", "5%")], rig, 10.0)

@@ -10,17 +10,16 @@ from beam_estimates import UNIFORM, covariance_of
 
 from analysis.identify import Measurement, fit_record
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, modes, transfer
+from rigd.beam import LOGARITHMIC_PARAMETERS, Beam, modes, transfer
 from rigd.excitation import BeamEstimate, ExcitationError, information
 
 RATE_HZ = 1000.0
-LINK = beam_estimates.ESTIMATE.beam
+LINK = beam_estimates.ESTIMATE.plant.beam
 NOISE_NM = 5e-3
 ESTIMATE = replace(
     beam_estimates.ESTIMATE,
     noise_nm2_per_hz=np.array([2.0 * NOISE_NM**2 / RATE_HZ]),
-    delay_s=3e-4,
-    tool_inertia_kg_m2=1e-5,
+    plant=replace(beam_estimates.ESTIMATE.plant, delay_s=3e-4, tool_inertia_kg_m2=1e-5),
 )
 
 
@@ -29,33 +28,17 @@ def moved(angle, estimate):
     n = angle.size
     decay = np.exp(-7.0 * np.arange(n) / n)
     s = 7.0 * RATE_HZ / n + 2j * np.pi * np.fft.rfftfreq(4 * n, 1 / RATE_HZ)
-    g = transfer(s, estimate.beam, estimate.damping) + estimate.tool_inertia_kg_m2 * s * s
-    spectrum = np.fft.rfft(angle * decay, 4 * n) * g * np.exp(-s * estimate.delay_s)
+    plant = estimate.plant
+    g = transfer(s, plant.beam, plant.damping) + plant.tool_inertia_kg_m2 * s * s
+    spectrum = np.fft.rfft(angle * decay, 4 * n) * g * np.exp(-s * plant.delay_s)
     return np.fft.irfft(spectrum, 4 * n)[:n] / decay
 
 
 def stepped(estimate, name, step):
     """Estimate with one parameter changed; by a factor where its logarithm counts."""
-    beam, damping = estimate.beam, estimate.damping
-    grown = np.exp(step)
-    match name:
-        case "zeta":
-            return replace(estimate, damping=replace(damping, zeta=damping.zeta * grown))
-        case "alpha":
-            return replace(estimate, damping=replace(damping, alpha=damping.alpha + step))
-        case "gamma":
-            return replace(estimate, damping=replace(damping, gamma=damping.gamma * grown))
-        case "lambda":
-            return replace(estimate, damping=replace(damping, lambda_=damping.lambda_ + step))
-        case "density_over_stiffness":
-            density = beam.density_kg_per_m * grown
-            return replace(estimate, beam=replace(beam, density_kg_per_m=density))
-        case "bending_stiffness_n_m2":
-            other = Beam(
-                beam.length_m, beam.density_kg_per_m * grown, beam.bending_stiffness_n_m2 * grown
-            )
-            return replace(estimate, beam=other)
-    return replace(estimate, **{name: getattr(estimate, name) + step})
+    value = estimate.values[name]
+    value = value * np.exp(step) if name in LOGARITHMIC_PARAMETERS else value + step
+    return replace(estimate, plant=estimate.plant.with_parameters({name: value}))
 
 
 def scan():
@@ -79,7 +62,7 @@ def test_it_is_the_gram_matrix_of_finite_differences():
     )
     t = np.arange(angle.size) / RATE_HZ
     unknown = [np.ones(t.size), t]
-    for mode in modes(ESTIMATE.beam, ESTIMATE.damping, 3):
+    for mode in modes(LINK, ESTIMATE.plant.damping, 3):
         decay = np.exp(mode.poles_rad_s[0] * t)
         unknown += [decay.real, decay.imag]
     left = rows - (np.linalg.lstsq(np.array(unknown).T, rows.T)[0].T @ np.array(unknown))
@@ -92,13 +75,14 @@ def test_it_is_the_gram_matrix_of_finite_differences():
 
 def test_a_steady_sine_tells_of_the_stiffness_in_closed_form():
     """Far from the modes: half the squared amplitude over the noise's density, per second."""
-    alone = replace(ESTIMATE, names=("bending_stiffness_n_m2",), delay_s=0.0)
+    alone = replace(ESTIMATE, names=("bending_stiffness_n_m2",))
+    alone = replace(alone, plant=replace(alone.plant, delay_s=0.0))
     t = np.arange(30_000) / RATE_HZ
     ramp = np.minimum(1.0, t / 5.0)
     angle = 0.02 * ramp * np.sin(2 * np.pi * 8.0 * t)
     s = 2j * np.pi * 8.0
     # The stiffness, at the same density over stiffness, scales what the beam does.
-    size = abs(transfer(np.array([s]), alone.beam, alone.damping)[0]) * 0.02
+    size = abs(transfer(np.array([s]), alone.plant.beam, alone.plant.damping)[0]) * 0.02
     per_s = size**2 / alone.noise_nm2_per_hz[0]
     longer, shorter = (
         information(angle[: round(end * RATE_HZ)], alone, RATE_HZ)[0, 0] for end in (28.0, 18.0)
@@ -142,9 +126,9 @@ DOCUMENT = {
 
 def test_an_estimate_is_read_from_json():
     estimate = BeamEstimate.from_dict(json.loads(json.dumps(DOCUMENT)))
-    assert estimate.beam == Beam(0.98, 4.7e-3, 0.09)
+    assert estimate.plant.beam == Beam(0.98, 4.7e-3, 0.09)
     assert estimate.names == ("zeta", "alpha", "density_over_stiffness")
-    assert estimate.delay_s == 1e-3
+    assert estimate.plant.delay_s == 1e-3
     assert len(estimate.modes()) == 3
 
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from rigd import excitation
-from rigd.beam import PARAMETERS, Beam, transfer_and_gradient
+from rigd.beam import GRADIENT_NAMES, Beam, transfer_and_gradient
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 from rigd.excitation._narrow_sweeps import Band, FoundMode, first_order_damping, time_fractions
@@ -148,7 +148,7 @@ def test_the_split_is_the_best_there_is(rig):
                 for z in (1.8751040687, 4.6940911330, 7.8547574382)
             ),
         )
-        g, gradient = transfer_and_gradient(2j * np.pi * f, tuned, damping, PARAMETERS)
+        g, gradient = transfer_and_gradient(2j * np.pi * f, tuned, damping, GRADIENT_NAMES)
         rows = np.stack([*gradient, f * g * 2j * np.pi, (2 * np.pi * f) ** 2 + 0j])
         rows *= rig.tracking(f)
         rates.append((rows.conj() @ rows.T).real / f.size)

@@ -167,7 +167,7 @@ def test_a_model_with_an_effect_that_its_use_does_not_take_is_refused(
 def test_the_poles_of_a_move_are_those_of_the_beam_as_identified(profile, analysed, effect):
     plant = RigPreview(profile).move_plant(analysed(**effect), MOVE)
     assert plant.model is not None
-    locked = plant.model.loaded_beam.poles(clamped_free_eigenvalues(3))[:, 0]
+    locked = plant.model.plant.poles(clamped_free_eigenvalues(3))[:, 0]
     assert plant.poles_rad_s[:3] == pytest.approx(locked, rel=5e-3)
     made = excitation_for(profile, "move", {"by_rad": 0.1, "path": analysed(**effect)})
     path = made.reference_rad[slice(made.segments["sweep"][0] - 1, made.segments["sweep"][1])]

@@ -34,7 +34,7 @@ def ring_down_nm(profile):
     def ring(reference_rad, seconds=2.0, beam=profile.rig.beam):
         held = np.full(round(seconds * RATE_HZ), reference_rad[-1])
         angle = (
-            close_loop(replace(loop.model, beam=beam))
+            close_loop(replace(loop.model, plant=replace(loop.model.plant, beam=beam)))
             .simulate(np.concatenate([[0.0], reference_rad, held]))
             .angle_rad
         )

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Measurement, Plant
+from analysis.identify import Comparison, Measurement
 from analysis.identify.drag_torque import DragError, DragLaw, DragResponse
-from analysis.identify.free_decay import mode_poles
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 
 pytestmark = pytest.mark.fit
 
@@ -108,7 +107,7 @@ def test_derivatives_by_the_beam_go_through_its_poles(short, name, value, step, 
     plants = [plant(**{name: value + sign * step}) for sign in (1, -1)]
     above, below = (response(short, p).torque(LAW).torque_nm for p in plants)
     here = response(short, plant()).torque(LAW, (1, 2, 3))
-    poles = [mode_poles(p, 3, ()) for p in plants]
+    poles = [p.mode_poles(3, ()) for p in plants]
     foreseen = np.zeros(above.size)
     for one, other in zip(*poles, strict=True):
         apart = one.at_rad_s - other.at_rad_s
@@ -142,7 +141,7 @@ def test_the_torque_that_was_taken_out_comes_back_beside_the_beam(short, here, t
     with_drag = short.remove_drag_torque(here, LAW)
     assert with_drag.drag is not None
     names = ("gamma",)
-    poles = mode_poles(there, 3, names)
+    poles = there.mode_poles(3, names)
     change, _ = with_drag.drag.change_to(there, poles, names, np.eye(1))
     linear = with_drag.spectrum(short.prediction.torque(there)[0])
     taken = with_drag.spectrum((short.torque_nm - with_drag.torque_nm)[short.retained])

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from cauchy_residues import modal_constants
 
-from analysis.identify import ModalEstimate, ModalModel, Plant
+from analysis.identify import ModalEstimate, ModalModel
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import StiffnessStep
 from analysis.identify.uniform_beam import uniform_beam_test
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 LAW = Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Measurement, Plant, fit_record, select
+from analysis.identify import Comparison, Measurement, fit_record, select
 from analysis.identify._instrument import reference_coherent_part
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues, transfer
+from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, transfer
 
 RATE_HZ = 1000.0
 NOISE_NM = 1e-2
@@ -165,7 +165,7 @@ def test_a_hum_on_a_mode_that_moves_the_motor_is_no_response(controlled, hum):
 @pytest.fixture(scope="module")
 def in_narrow_bands():
     """Beam with a mass at its tip, which moves the motor as it rings, driven at its modes alone."""
-    loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
+    loaded = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     n = 30_000
     t = np.arange(n) / RATE_HZ
     reference = np.zeros(n)
@@ -195,7 +195,7 @@ def test_a_first_wrong_beam_does_not_decide_what_followed_no_reference(in_narrow
     """What rings turns the motor in far narrower bands than its following is smoothed over."""
     found = select(in_narrow_bands)
     assert found.verdict.adequate
-    poles = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4).poles(clamped_free_eigenvalues(3))[:, 0]
+    poles = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4).poles(clamped_free_eigenvalues(3))[:, 0]
     for mode, pole in zip(found.headline.modes, poles, strict=True):
         frequency, ratio = mode.frequency_hz, mode.damping_ratio
         assert abs(frequency.value - pole.imag / (2 * np.pi)) < 4 * frequency.std
@@ -226,7 +226,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
 
 @pytest.mark.fit
 def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narrow_bands):
-    loaded = LoadedBeam(LINK, DAMPED, tip_mass_kg=1.8e-4)
+    loaded = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     plant = Plant(LINK, DAMPED, tip_mass_kg=1.8e-4)
     first = Comparison.of(in_narrow_bands, (0.0, 50.0)).use_reference_coherent_angle(plant)
     noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise

@@ -4,12 +4,12 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, Plant, fit_record
+from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, fit_record
 from analysis.identify.parametrization import Steps, Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
-from rigd.beam import Beam, Damping, modes
+from rigd.beam import Beam, Damping, Plant, modes
 
 pytestmark = pytest.mark.fit
 

@@ -1,9 +1,8 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Plant
-from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, Pole, mode_poles
-from rigd.beam import Beam, Damping, poles
+from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra
+from rigd.beam import Beam, Damping, Plant, Pole, poles
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 NAMES = ("zeta", "alpha", "gamma", "lambda", "ln_density_over_stiffness", "ln_stiffness")
@@ -22,7 +21,7 @@ def test_poles_and_their_derivatives(damping):
     values = np.array(
         [*values, np.log(BEAM.density_over_stiffness), np.log(BEAM.bending_stiffness_n_m2)]
     )
-    found = mode_poles(at(values), 3, NAMES)
+    found = at(values).mode_poles(3, NAMES)
     expected = poles(BEAM, damping, 3)
     flat = [p for pair in expected for p in (pair[:1] if pair[0].imag else pair)]
     assert [pole.at_rad_s for pole in found] == pytest.approx(flat)
@@ -31,7 +30,7 @@ def test_poles_and_their_derivatives(damping):
             continue  # beside order 1 the real poles are no longer such
         step = np.zeros(6)
         step[i] = 1e-6 * (abs(values[i]) or 1.0)
-        after, before = (mode_poles(at(values + s), 3, ()) for s in (step, -step))
+        after, before = (at(values + s).mode_poles(3, ()) for s in (step, -step))
         for pole, p, q in zip(found, after, before, strict=True):
             slope = (p.at_rad_s - q.at_rad_s) / (2 * step[i])
             assert pole.derivative[i] == pytest.approx(slope, rel=1e-4, abs=1e-6)
@@ -40,8 +39,8 @@ def test_poles_and_their_derivatives(damping):
 
 
 def test_an_offset_moves_its_own_mode():
-    loose = mode_poles(Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05)), 3, ())
-    uniform = mode_poles(Plant(BEAM, FRACTIONAL), 3, ())
+    loose = Plant(BEAM, FRACTIONAL, stiffness_offsets=(0.03, -0.05)).mode_poles(3, ())
+    uniform = Plant(BEAM, FRACTIONAL).mode_poles(3, ())
     ratio = [abs(p.at_rad_s) / abs(q.at_rad_s) for p, q in zip(loose, uniform, strict=True)]
     assert ratio == pytest.approx([1, 1.03**0.5, 0.95**0.5], rel=1e-3)
 
@@ -104,7 +103,7 @@ def test_spectra_of_decays_that_begin_within_a_filtered_record(decimation):
 def test_no_mode_no_column():
     spectra = DecaySpectra(100, 125.0, np.array([1.0, 2.0]))
     assert spectra.columns(()).shape == (0, 2)
-    assert mode_poles(Plant(BEAM, FRACTIONAL), 0, NAMES) == ()
+    assert Plant(BEAM, FRACTIONAL).mode_poles(0, NAMES) == ()
 
 
 @pytest.mark.parametrize(
@@ -120,7 +119,7 @@ def test_no_mode_no_column():
     ],
 )
 def test_where_the_poles_are_expected_changes_none_of_them(plant):
-    found = mode_poles(plant, 3, ("zeta",))
+    found = plant.mode_poles(3, ("zeta",))
     first, second, third = (pole.at_rad_s for pole in found)
     expectations = {
         "close by": (first * (1.01 + 0.01j), second * 0.99, third * (1 - 0.02j)),
@@ -131,7 +130,7 @@ def test_where_the_poles_are_expected_changes_none_of_them(plant):
         "too few": (first, second),
     }
     for name, near in expectations.items():
-        again = mode_poles(plant, 3, ("zeta",), near)
+        again = plant.mode_poles(3, ("zeta",), near)
         assert [pole.mode for pole in again] == [1, 2, 3], name
         for one, other in zip(again, found, strict=True):
             assert one.at_rad_s == pytest.approx(other.at_rad_s, rel=1e-10), name

@@ -9,12 +9,11 @@ import numpy as np
 import pytest
 from cases import further
 
-from analysis.identify import Comparison, Plant, fit_record
+from analysis.identify import Comparison, fit_record
 from analysis.identify._hum import find_hum_near_modes
-from analysis.identify.free_decay import Pole
 from analysis.identify.noise import estimate_noise
 from analysis.models import STRUCTURES
-from rigd.beam import Damping
+from rigd.beam import Damping, Plant, Pole
 
 pytestmark = pytest.mark.fit
 

@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Comparison, Measurement, Plant
+from analysis.identify import Comparison, Measurement
 from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
+from rigd.beam import Plant
 
 pytestmark = pytest.mark.fit
 

@@ -3,10 +3,10 @@ import math
 import numpy as np
 import pytest
 
-from analysis.identify import LOGARITHMIC_PARAMETERS, SETTINGS, Plant
+from analysis.identify import SETTINGS
 from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping, undamped_frequencies_rad_s
+from rigd.beam import LOGARITHMIC_PARAMETERS, Beam, Damping, Plant, undamped_frequencies_rad_s
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping(), 1e-4, 1e-5)
 SIZES = {"zeta": -2.0, "alpha": 0.7, "gamma": -1.0, "lambda": 1.3}

@@ -7,10 +7,10 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from analysis.identify import SETTINGS, Plant
+from analysis.identify import SETTINGS
 from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 
 NOMINAL = Plant(Beam(0.98, 4.7e-3, 0.090275), Damping())
 UNKNOWNS = Unknowns.of(STRUCTURES["VI"], NOMINAL, SETTINGS)

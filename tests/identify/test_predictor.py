@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from analysis.identify import Comparison, Plant, TorquePredictor
-from rigd.beam import PARAMETERS, Beam, Damping
+from analysis.identify import Comparison, TorquePredictor
+from rigd.beam import GRADIENT_NAMES, Beam, Damping, Plant
 
 OFFSETS = (0.03, -0.05)
-WRT = (*PARAMETERS, "delay_s", "tool_inertia_kg_m2")
+WRT = (*GRADIENT_NAMES, "delay_s", "tool_inertia_kg_m2")
 
 
 @pytest.fixture(scope="module")

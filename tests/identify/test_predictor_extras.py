@@ -5,11 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Plant, TorquePredictor
-from analysis.identify.free_decay import mode_poles
+from analysis.identify import SETTINGS, TorquePredictor
 from analysis.identify.parametrization import Unknowns
 from analysis.models import STRUCTURES
-from rigd.beam import PARAMETERS, Beam, Damping
+from rigd.beam import GRADIENT_NAMES, Beam, Damping, Plant
 
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 BARE = Plant(BEAM, Damping(7.1e-5, 0.996, 5.5e-2, 0.594), 3e-4, 1e-5)
@@ -20,7 +19,7 @@ ALL = replace(
     filter_time_constant_s=5e-4,
     second_order_filter_time_constant_s=3e-4,
 )
-WRT = (*PARAMETERS, "delay_s", "tool_inertia_kg_m2")
+WRT = (*GRADIENT_NAMES, "delay_s", "tool_inertia_kg_m2")
 STEPS = {
     "zeta": 1e-9,
     "tool_inertia_kg_m2": 1e-8,
@@ -57,11 +56,11 @@ def test_derivatives(plant, name):
 
 @pytest.mark.parametrize("plant", [BARE, ALL], ids=["bare", "all"])
 def test_poles_move_as_differences_say(plant):
-    for i, pole in enumerate(mode_poles(plant, 3, WRT)):
+    for i, pole in enumerate(plant.mode_poles(3, WRT)):
         for name, derivative in zip(WRT, pole.derivative, strict=True):
             step = STEPS.get(name, 1e-7)
             after, before = (
-                mode_poles(moved(plant, name, s), 3, WRT)[i].at_rad_s for s in (step, -step)
+                moved(plant, name, s).mode_poles(3, WRT)[i].at_rad_s for s in (step, -step)
             )
             assert derivative == pytest.approx((after - before) / (2 * step), rel=1e-4, abs=1e-5)
 

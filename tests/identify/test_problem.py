@@ -1,12 +1,12 @@
 import numpy as np
 import pytest
 
-from analysis.identify import SETTINGS, Comparison, Objective, Plant
+from analysis.identify import SETTINGS, Comparison, Objective
 from analysis.identify._refit import Refit
 from analysis.identify.noise import NoiseSpectrum
 from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 
 pytestmark = pytest.mark.fit
 

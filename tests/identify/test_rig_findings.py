@@ -16,7 +16,7 @@ from analysis.identify._channel_checks import (
 from analysis.identify._leakage import repetition_period_s
 from analysis.identify._time_varying import find_temporal_changes
 from analysis.identify.headline import CONTRADICTED_FILE_REASON
-from rigd.beam import Beam, Damping, LoadedBeam, clamped_free_eigenvalues
+from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues
 
 pytestmark = pytest.mark.fit
 
@@ -64,7 +64,7 @@ def record(factor=1.0, filter_hz=np.inf, clock=0.0, **ends):
 
 def assert_modes(headline, **ends):
     """Without a flag, and where those of the rig with these ends are."""
-    loaded = LoadedBeam(LINK, Damping(ZETA, 1.0, GAMMA, 1.0), **ends)
+    loaded = Plant(LINK, Damping(ZETA, 1.0, GAMMA, 1.0), **ends)
     poles = loaded.poles(clamped_free_eigenvalues(3))[:, 0]
     for mode, pole in zip(headline.modes, poles, strict=True):
         for quantity, value in (

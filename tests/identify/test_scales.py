@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from analysis.identify import Plant, ResponseGrid, fit_record
+from analysis.identify import fit_record
 from analysis.identify.drag_torque import DragLaw, DragResponse
 from analysis.identify.headline import ReportedValue
 from analysis.identify.scales import (
@@ -15,7 +15,7 @@ from analysis.identify.scales import (
     with_scale_uncertainty,
 )
 from analysis.models import STRUCTURES
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant, ResponseGrid
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 DAMPING = Damping(zeta=7.1e-5, alpha=0.9, gamma=5.5e-2, lambda_=0.594)

@@ -9,7 +9,7 @@ from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
 from analysis.identify.verdict import BIC_TIE, SECOND_DAMPING_REASON
 from analysis.models import STRUCTURES, Structure
-from rigd.beam import Beam, LoadedBeam, clamped_free_eigenvalues
+from rigd.beam import Beam, Plant, clamped_free_eigenvalues
 from rigd.session import Validity
 
 pytestmark = pytest.mark.fit
@@ -264,7 +264,7 @@ def test_a_beam_that_is_not_uniform_is_no_fractional_order(sessions, link, plant
     assert verdict.adequate
     assert kinds(verdict) <= {"rival explanations"}
     assert "fractional" not in (verdict.alpha.status, verdict.lambda_.status)
-    loaded = LoadedBeam(link, plants["III"], stiffness_offsets=offsets)
+    loaded = Plant(link, plants["III"], stiffness_offsets=offsets)
     poles = loaded.poles(clamped_free_eigenvalues(3))[:, 0]
     for mode, pole in zip(told.modes, poles, strict=True):
         for quantity, value in (

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 from rigd.excitation import BeamEstimate
 
 UNIFORM = (
@@ -10,8 +10,10 @@ UNIFORM = (
     "delay_s", "tool_inertia_kg_m2",
 )  # fmt: skip
 ESTIMATE = BeamEstimate(
-    beam=Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),
-    damping=Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
+    plant=Plant(
+        Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275),
+        Damping(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594),
+    ),
     names=UNIFORM,
     noise_frequency_hz=np.array([1.0]),
     noise_nm2_per_hz=np.array([5e-8]),

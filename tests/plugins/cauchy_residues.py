@@ -5,8 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from analysis.identify import MODE_CONSTANT_NAMES, Plant, ResponseGrid
-from analysis.identify.free_decay import mode_poles
+from analysis.identify import MODE_CONSTANT_NAMES
+from rigd.beam import Plant, ResponseGrid
 
 _CIRCLE = np.exp(2j * np.pi * np.arange(8) / 8)
 _RADIUS = 0.2
@@ -24,7 +24,7 @@ def modal_constants(plant: Plant, modes: Sequence[int]) -> NDArray[np.float64]:
     plant : Plant
     modes : sequence of int
     """
-    found = {pole.mode: pole.at_rad_s for pole in mode_poles(plant, max(modes), ())}
+    found = {pole.mode: pole.at_rad_s for pole in plant.mode_poles(max(modes), ())}
     if not all(mode in found and found[mode].imag > 0 for mode in modes):
         return np.full(len(MODE_CONSTANT_NAMES) * len(modes), np.nan)
     poles = np.array([found[mode] for mode in modes])

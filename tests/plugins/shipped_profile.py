@@ -31,7 +31,7 @@ def loop_model(profile: Profile) -> LoopModel:
 
 @pytest.fixture(scope="session")
 def motor_alone(loop_model: LoopModel) -> LoopModel:
-    return replace(loop_model, beam=None, actuation_delay_s=0.0)
+    return replace(loop_model, plant=None, actuation_delay_s=0.0)
 
 
 def table3() -> dict[str, Damping]:

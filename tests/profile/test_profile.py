@@ -49,12 +49,14 @@ def test_the_loop_is_made_of_the_rigs_own_values(profile):
         2e-4,
         3e-4,
     )
-    assert model.tool_inertia_kg_m2 == 1e-5
+    assert model.plant.tool_inertia_kg_m2 == 1e-5
     assert (model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad) == (
         rig.motor.inertia_kg_m2,
         rig.motor.viscous_nm_s_per_rad,
     )
-    assert (model.rate_hz, model.beam, model.damping) == (rig.rate_hz, rig.beam, rig.damping)
+    assert model.rate_hz == rig.rate_hz
+    assert (model.plant.beam, model.plant.damping) == (rig.beam, rig.damping)
+    assert model.plant.delay_s == 3e-4 - 2e-4
     assert model.settings is profile.control
 
 

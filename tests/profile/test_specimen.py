@@ -52,7 +52,7 @@ def test_its_beam_takes_the_place_of_the_profiles(write):
     path = write(BEAM)
     profile = load_profile("sim")
     mounted = with_specimen(profile, " antenna 4 ")
-    assert mounted.rig.beam == mounted.loop_model().beam == Beam(0.95, 4.7e-3, 0.0903)
+    assert mounted.rig.beam == mounted.loop_model().plant.beam == Beam(0.95, 4.7e-3, 0.0903)
     assert mounted.rig.damping == profile.rig.damping
     assert mounted.specimen.text == path.read_text()
     words = mounted.specimen_in_words
@@ -63,7 +63,7 @@ def test_its_beam_takes_the_place_of_the_profiles(write):
     assert profile.specimen is None
     write(BEAM + DAMPING)
     mounted = with_specimen(profile, "antenna 4")
-    assert mounted.loop_model().damping == Damping(8e-5, 1.0, 5e-2, 0.6)
+    assert mounted.loop_model().plant.damping == Damping(8e-5, 1.0, 5e-2, 0.6)
     assert "nominal damping of its own" in mounted.specimen_in_words
 
 

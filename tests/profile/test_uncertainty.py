@@ -99,7 +99,7 @@ def test_the_loop_is_predicted_with_the_tip_mass(loaded):
     text = with_examples("sim").replace("value = 1.0e-4", "value = 2.0e-3")
     profile = loaded(text)
     assert profile.rig.beam == load_profile("sim").rig.beam
-    assert profile.loop_model() == replace(load_profile("sim").loop_model(), tip_mass_kg=2e-3)
+    assert profile.plant == replace(load_profile("sim").plant, tip_mass_kg=2e-3)
 
 
 @pytest.mark.parametrize(

@@ -10,13 +10,14 @@ from rerun_files import batches
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
-from analysis.identify import ResponseGrid, fast_length
+from analysis.identify import fast_length
 from analysis.models import WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record
 from analysis.report import write_rerun_file
 from analysis.report.folder import OutputError
 from analysis.results import RecordResult
+from rigd.beam import ResponseGrid
 from rigd.cli.app import app as rigd
 from rigd.session import read_session
 from rigd.spectral import fft_response

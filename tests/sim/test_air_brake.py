@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from analysis.identify import Comparison, Measurement, Plant
+from analysis.identify import Comparison, Measurement
 from analysis.identify.drag_torque import DragLaw, DragResponse
-from rigd.beam import Damping, PointForceGrid
+from rigd.beam import Damping, Plant, PointForceGrid
 from rigd.sim import SimulatedPlant
 
 DRAG_M = 2.3e-3

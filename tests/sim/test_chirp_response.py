@@ -22,7 +22,7 @@ import pytest
 from cases import further
 from paper_table import table_3
 
-from rigd.beam import Beam, Damping, TransferGrid, modes
+from rigd.beam import Beam, Damping, Plant, TransferGrid, modes
 from rigd.beam.realisation import couple, propagator, realise
 from rigd.devices.parameters import (
     Actuation,
@@ -175,7 +175,7 @@ def relative_rms_error(torque, exact, rate_hz):
 
 def simulate(damping, tool_inertia=0.0, substeps=1):
     model = couple(
-        realise(BEAM, damping),
+        realise(Plant(BEAM, damping)),
         motor_inertia_kg_m2=MOTOR.inertia_kg_m2,
         viscous_nm_s_per_rad=MOTOR.viscous_nm_s_per_rad,
         tool_inertia_kg_m2=tool_inertia,

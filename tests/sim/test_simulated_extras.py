@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.beam import LoadedBeam, PointForceGrid
+from rigd.beam import Plant, PointForceGrid
 from rigd.sim import SimulatedPlant
 
 TICKS = 12_000
@@ -60,11 +60,11 @@ def test_torque_and_shear_are_those_of_the_exact_response(rig, more):
         density_kg_per_m=more.get("density_ratio", 1.0) * rig.beam.density_kg_per_m,
         bending_stiffness_n_m2=more.get("stiffness_ratio", 1.0) * rig.beam.bending_stiffness_n_m2,
     )
-    beam = LoadedBeam(
+    beam = Plant(
         own,
         rig.damping,
-        more.get("tip_mass_kg", 0.0),
-        more.get("clamp_compliance_rad_per_nm", 0.0),
+        tip_mass_kg=more.get("tip_mass_kg", 0.0),
+        root_compliance_rad_per_nm=more.get("clamp_compliance_rad_per_nm", 0.0),
     )
     seen = np.fft.rfft(angle * decay, 4 * TICKS)
     if "torque_filter_hz" in more:
@@ -88,9 +88,9 @@ def test_shear_is_what_accelerates_the_beam_and_its_tip_mass(rig):
     tip = grid.per_angle(length) / (1 + mass_kg * s**2 * grid.per_force(length, length))
     pushed = grid.per_force(x, length) * (-mass_kg * s**2 * tip)[:, None]
     momentum = load * ((grid.per_angle(x) + pushed) @ weight) * length / 2 + mass_kg * s**2 * tip
-    clamped = LoadedBeam(rig.beam, rig.damping, mass_kg)
+    clamped = Plant(rig.beam, rig.damping, tip_mass_kg=mass_kg)
     assert clamped.shear(s) == pytest.approx(momentum, rel=1e-9)
-    soft = LoadedBeam(rig.beam, rig.damping, mass_kg, compliance)
+    soft = replace(clamped, root_compliance_rad_per_nm=compliance)
     turned = 1 / (1 + compliance * clamped.transfer(s))
     assert soft.shear(s) == pytest.approx(momentum * turned, rel=1e-9)
 

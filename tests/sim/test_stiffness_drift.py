@@ -126,10 +126,10 @@ def test_it_counts_from_the_first_enabling(rig):
 
 
 def test_a_drift_that_cannot_be_realised_is_refused(rig, monkeypatch):
-    def realised(beam, *args, **more):
-        if beam.bending_stiffness_n_m2 < 0.97 * rig.beam.bending_stiffness_n_m2:
+    def realised(plant, **more):
+        if plant.beam.bending_stiffness_n_m2 < 0.97 * rig.beam.bending_stiffness_n_m2:
             raise RealisationError("Too soft.")
-        return realise(beam, *args, **more)
+        return realise(plant, **more)
 
     monkeypatch.setattr("rigd.sim._step.realise", realised)
     plant_of(rig, stiffness_drift_per_s=FASTEST)

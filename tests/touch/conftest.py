@@ -4,6 +4,7 @@ import pytest
 from struck_beam import ALIKE, MISTAKEN, OBSTACLES
 from touch_records import DAMPED, LINK, Slew, simulate
 
+from rigd.beam import Plant
 from rigd.touch import TouchEstimator, TouchModel
 
 
@@ -47,8 +48,7 @@ def alike():
 def model():
     """The beam of the records, known well but not exactly."""
     return TouchModel(
-        LINK,
-        DAMPED,
+        Plant(LINK, DAMPED),
         std={
             "bending_stiffness_n_m2": 5e-4 * LINK.bending_stiffness_n_m2,
             "density_over_stiffness": 2e-4 * LINK.density_over_stiffness,

@@ -11,7 +11,7 @@ from rigd.touch import FreeBeam
 def motions(model, struck):
     """Of one record, at many places, and at three of them alone."""
     record = cut(struck["middle"], 50)
-    x_m = np.linspace(0.1, 1.0, 128) * model.beam.length_m
+    x_m = np.linspace(0.1, 1.0, 128) * model.plant.beam.length_m
     beam = FreeBeam(model, x_m, record.rate_hz, record.angle_rad.size)
     some = [0, 70, -1]
     quiet = record.detected - 13

@@ -1,13 +1,15 @@
 """Models of the beam: from an analysis, from a profile, and changed in one parameter."""
 
 import json
+from dataclasses import replace
 
 import pytest
 
-from rigd.beam import Beam, Damping
+from rigd.beam import Beam, Damping, Plant
 from rigd.touch import TouchModel
 
 LENGTH_M = 0.98
+STATED = Plant(Beam(LENGTH_M, 4.7e-3, 0.09), Damping(zeta=7e-5, gamma=0.05))
 
 
 def quantity(value, std=None, interval=None):
@@ -40,11 +42,11 @@ def written(tmp_path):
 
 def test_an_analysis_is_read(written):
     path = written({"file": "a.mcap", "parameters": PARAMETERS})
-    model = TouchModel.from_analysis(path, length_m=LENGTH_M, angle_delay_s=1e-4)
-    assert model.beam == Beam(LENGTH_M, 0.052 * 0.09, 0.09)
-    assert model.damping == Damping(zeta=7e-5, alpha=0.99, gamma=0.05, lambda_=0.6)
-    assert model.tool_inertia_kg_m2 == 1e-5
-    assert model.torque_delay_s == pytest.approx(3e-4)  # older than the angle, by delay_s
+    model = TouchModel.from_analysis(path, STATED, angle_delay_s=1e-4)
+    assert model.plant.beam == Beam(LENGTH_M, 0.052 * 0.09, 0.09)
+    assert model.plant.damping == Damping(zeta=7e-5, alpha=0.99, gamma=0.05, lambda_=0.6)
+    assert model.plant.tool_inertia_kg_m2 == 1e-5
+    assert model.wrench_delay_s == pytest.approx(3e-4)  # older than the angle, by delay_s
     assert model.source == str(path)
     assert model.std["bending_stiffness_n_m2"] == pytest.approx(4e-4 / 3.919928)
     assert model.std["alpha"] == 0.01
@@ -56,27 +58,27 @@ def test_what_a_structure_does_not_have_is_absent(written):
     few = {name: PARAMETERS[name] for name in ("density_over_stiffness", "bending_stiffness_n_m2")}
     model = TouchModel.from_analysis(
         written({"file": "a.mcap", "parameters": few}),
-        length_m=LENGTH_M,
-        torque_delay_s=5e-4,
-        tool_inertia_kg_m2=2e-5,
+        replace(STATED, delay_s=5e-4, tool_inertia_kg_m2=2e-5),
     )
-    assert model.damping == Damping()
-    assert (model.torque_delay_s, model.tool_inertia_kg_m2) == (5e-4, 2e-5)
+    assert model.plant.damping == Damping()
+    assert (model.wrench_delay_s, model.plant.tool_inertia_kg_m2) == (5e-4, 2e-5)
 
 
 def test_changes_leave_the_rest():
-    model = TouchModel.assumed(Beam(LENGTH_M, 4.7e-3, 0.09), Damping(zeta=7e-5, gamma=0.05))
+    model = TouchModel.assumed(STATED)
     stiffer = model.with_changed_parameter("bending_stiffness_n_m2", 0.009)
-    assert stiffer.beam.bending_stiffness_n_m2 == pytest.approx(0.099)
-    assert stiffer.beam.density_over_stiffness == pytest.approx(model.beam.density_over_stiffness)
-    heavier = model.with_changed_parameter(
-        "density_over_stiffness", 0.01 * model.beam.density_over_stiffness
+    assert stiffer.plant.beam.bending_stiffness_n_m2 == pytest.approx(0.099)
+    assert stiffer.plant.beam.density_over_stiffness == pytest.approx(
+        model.plant.beam.density_over_stiffness
     )
-    assert heavier.beam.density_kg_per_m == pytest.approx(1.01 * 4.7e-3)
-    assert heavier.beam.bending_stiffness_n_m2 == 0.09
-    assert model.with_changed_parameter("zeta", -1.0).damping.zeta == 0.0
-    assert model.with_changed_parameter("alpha", 0.2).damping.alpha == pytest.approx(1.2)
-    assert model.with_changed_parameter("delay_s", 1e-4).torque_delay_s == pytest.approx(1e-4)
+    heavier = model.with_changed_parameter(
+        "density_over_stiffness", 0.01 * model.plant.beam.density_over_stiffness
+    )
+    assert heavier.plant.beam.density_kg_per_m == pytest.approx(1.01 * 4.7e-3)
+    assert heavier.plant.beam.bending_stiffness_n_m2 == 0.09
+    assert model.with_changed_parameter("zeta", -1.0).plant.damping.zeta == 0.0
+    assert model.with_changed_parameter("alpha", 0.2).plant.damping.alpha == pytest.approx(1.2)
+    assert model.with_changed_parameter("delay_s", 1e-4).wrench_delay_s == pytest.approx(1e-4)
     assert set(model.std) == {"bending_stiffness_n_m2", "density_over_stiffness", "zeta", "gamma"}
-    with pytest.raises(ValueError, match="is not one of"):
+    with pytest.raises(ValueError, match="is not a parameter"):
         model.with_changed_parameter("length", 0.1)

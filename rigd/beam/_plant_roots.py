@@ -1,0 +1,156 @@
+"""Poles of a plant, and Newton's search for its poles and zeros."""
+
+import math
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from rigd.beam._modes import poles_for_eigenvalues
+
+if TYPE_CHECKING:
+    from rigd.beam._plant import Plant
+
+Real = NDArray[np.float64]
+Complex = NDArray[np.complex128]
+
+_MAX_HOMOTOPY_STEPS = 12
+"""Largest number of steps in which the tip mass and the clamp's compliance grow from zero."""
+_CHANGE_PER_STEP = 0.02
+"""Growth of tip mass and compliance in one step while poles are followed.
+
+It is relative to the mass and the compliance of the beam itself."""
+_MAX_NEWTON_STEPS = 60
+"""Largest number of Newton's iterations."""
+_NEWTON_TOLERANCE = 1e-10
+"""Relative length of Newton's last step: the error is of the order of its square."""
+CLOSE_START_TOLERANCE = 1e-6
+"""Relative length of Newton's last step from a start close to the root.
+
+Convergence is quadratic there from the first step on."""
+_INTERMEDIATE_TOLERANCE = 1e-4
+"""Relative length of Newton's last step before tip mass and compliance have their full size."""
+_MAX_ROOT_TO_START_RATIO = 10.0
+"""Largest ratio of a root to the start of Newton's method that is accepted."""
+_START_POLE_DISTANCE = 1e-7
+"""Relative distance of the first starts from the poles, where G of an undamped beam is infinite."""
+
+
+@dataclass(frozen=True, slots=True)
+class Pole:
+    """One pole of one mode: the upper one of a conjugate pair, or a real one."""
+
+    mode: int
+    """Number of the mode, from 1."""
+    at_rad_s: complex
+    """Position of the pole."""
+    derivative: Complex
+    """Derivatives of the position by the requested parameters, shape (k,)."""
+
+    @property
+    def oscillates(self) -> bool:
+        """Whether the decay of this pole oscillates. Then it has two spectra instead of one."""
+        return self.at_rad_s.imag != 0
+
+    @property
+    def frequency_hz(self) -> float:
+        """Frequency of the free decay in Hz."""
+        return self.at_rad_s.imag / (2 * math.pi)
+
+    @property
+    def damping_ratio(self) -> float:
+        """Damping ratio, as a fraction of critical damping."""
+        return -self.at_rad_s.real / abs(self.at_rad_s)
+
+    @property
+    def frequency_derivative_hz(self) -> Real:
+        """Derivatives of the frequency in Hz by the parameters, shape (k,)."""
+        return np.asarray(self.derivative.imag / (2 * math.pi), dtype=np.float64)
+
+    @property
+    def damping_ratio_derivative(self) -> Real:
+        """Derivatives of the damping ratio by the parameters, shape (k,)."""
+        p, pole_magnitude = self.at_rad_s, abs(self.at_rad_s)
+        magnitude_derivative = (p.conjugate() * self.derivative).real / pole_magnitude
+        damping_derivatives = (
+            -self.derivative.real / pole_magnitude
+            - self.damping_ratio * magnitude_derivative / pole_magnitude
+        )
+        return np.asarray(damping_derivatives, dtype=np.float64)
+
+
+def followed_roots(plant: "Plant", z: Real, *, zeros: bool) -> Complex:
+    """Return poles or zeros, followed from those of the uniform beam on a rigid clamp.
+
+    A row is NaN if the path was lost.
+    """
+    stiffness_offsets = np.array(plant.stiffness_offsets)
+    if not zeros and stiffness_offsets.size:
+        # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
+        z = z.copy()
+        z[1 : 1 + stiffness_offsets.size] *= (1 + stiffness_offsets[: z.size - 1]) ** 0.25
+    roots = poles_for_eigenvalues(z, plant.beam, plant.damping).astype(np.complex128)
+    is_rigid = plant.tip_mass_kg == 0 and plant.root_compliance_rad_per_nm == 0
+    if is_rigid and not (zeros and stiffness_offsets.any()):
+        return roots
+    has_root = ~np.isnan(roots[:, 0])
+    # One of a conjugate pair suffices; without oscillation both have to be found.
+    oscillating = roots[has_root][:, 0].imag != 0
+    second_real_poles = roots[has_root][~oscillating][:, 1]
+    current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
+    current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
+    # Relative to the beam's own values: a change that moves the poles little needs few steps.
+    relative_change = plant.tip_mass_kg / (plant.beam.density_kg_per_m * plant.beam.length_m)
+    stiffness_nm_per_rad = plant.beam.bending_stiffness_n_m2 / plant.beam.length_m
+    relative_change = max(relative_change, plant.root_compliance_rad_per_nm * stiffness_nm_per_rad)
+    if zeros:
+        relative_change = max(relative_change, float(np.abs(stiffness_offsets).max(initial=0.0)))
+    step_count = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
+    previous_roots = current_roots
+    for step_number in range(1, step_count + 1):
+        fraction = step_number / step_count
+        partial_plant = replace(
+            plant,
+            tip_mass_kg=fraction * plant.tip_mass_kg,
+            root_compliance_rad_per_nm=fraction * plant.root_compliance_rad_per_nm,
+            stiffness_offsets=tuple((fraction if zeros else 1.0) * stiffness_offsets),
+        )
+        is_last_step = step_number == step_count
+        start_roots = 2 * current_roots - previous_roots if step_number > 1 else current_roots
+        previous_roots, current_roots = (
+            current_roots,
+            newton_roots(
+                partial_plant,
+                start_roots,
+                _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
+                zeros=zeros,
+            ),
+        )
+    first_roots = current_roots[: oscillating.size]
+    second_roots = first_roots.conj()
+    second_roots[~oscillating] = current_roots[oscillating.size :]
+    roots[has_root] = np.column_stack([first_roots, second_roots])
+    return roots
+
+
+def newton_roots(plant: "Plant", s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
+    """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
+
+    `s` has the start values; `step_tolerance` is the relative length of the last step. The
+    result is NaN where no root is found near its start.
+    """
+    start_roots = s
+    with np.errstate(all="ignore"):
+        for _ in range(_MAX_NEWTON_STEPS):
+            at = plant.rigid_clamp_response(s)
+            newton_step = at.response / plant.derivative_by_s(s, at)
+            newton_step *= -1 if zeros else 1 + plant.root_compliance_rad_per_nm * at.response
+            s = s + newton_step
+            if not np.nanmax(np.abs(newton_step / s), initial=0.0) > step_tolerance:
+                break
+        # Far from any root every step is short, too.
+        has_converged = (np.abs(newton_step) < max(step_tolerance, 1e-9) * np.abs(s)) & (
+            np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start_roots)
+        )
+        return np.where(has_converged, s, np.nan + 0j)
