@@ -37,10 +37,28 @@ def use_one_thread() -> None:
     os.environ.update(SINGLE_THREADED)
 
 
-def prefer_oom_kill() -> None:
-    """Make Linux end this process and its children first if memory runs out (OOM killer)."""
+RUN_PROGRAM: Final = (*OWN_PYTHON, "-c", "from rigd.runtime import run_program; run_program()")
+"""First words of a command line that becomes another program. The process id of its parent follows,
+with which the system ends the program, and then the program's own command line."""
+
+
+def run_program() -> None:
+    """Become the program of the command line (`RUN_PROGRAM`); it ends with its parent."""
+    die_with_parent(int(sys.argv[1]))
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
+    os.execv(sys.argv[2], sys.argv[2:])
+
+
+def prefer_oom_kill(pid: int) -> None:
+    """Make Linux end a process and its children first if memory runs out (OOM killer).
+
+    Parameters
+    ----------
+    pid
+        Process id.
+    """
     with suppress(OSError):  # not on Linux
-        Path("/proc/self/oom_score_adj").write_text("1000")
+        Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
 
 
 def give_way(pid: int = 0) -> None:
@@ -114,6 +132,6 @@ def begin_background(parser: "ArgumentParser") -> "Namespace":
     arguments = parser.parse_args()
     if arguments.parent is not None:
         die_with_parent(arguments.parent)
-    prefer_oom_kill()
+    prefer_oom_kill(os.getpid())
     use_one_thread()
     return arguments
