@@ -134,6 +134,8 @@ FIT: Final = Worker(
     hung_after_s=15.0,
     end_s=1.0,
     for_one_session=True,
+    niceness=5,  # a third of a processor in competition with another program
+    ended_for_memory=True,
 )
 SUPERVISOR: Final = Worker(
     name="supervisor",
@@ -188,7 +190,10 @@ PLAN: Final = Worker(
 )
 
 
-# Programs of the analyser
+# Programs and other parts of the analyser
+
+ONLINE_ESTIMATOR: Final = "analysis.online:OnlineEstimator"
+"""Class with which the process `FIT` makes its estimates, as ``module:name``."""
 
 QUICK_LOOK: Final = Worker(
     name="quick look",

@@ -3,7 +3,6 @@ from . import processes as processes
 from ._background import OWN_PYTHON as OWN_PYTHON
 from ._background import RUN_PROGRAM as RUN_PROGRAM
 from ._background import SINGLE_THREADED as SINGLE_THREADED
-from ._background import begin_background as begin_background
 from ._background import die_with_parent as die_with_parent
 from ._background import give_way as give_way
 from ._background import prefer_oom_kill as prefer_oom_kill

@@ -5,12 +5,9 @@ import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from rigd.runtime._stop_signals import signal_when_orphaned
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 SINGLE_THREADED: Final = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
@@ -110,28 +107,3 @@ def die_with_parent(parent_pid: int) -> None:
     signal_when_orphaned(signal.SIGKILL)
     if os.getppid() != parent_pid:
         sys.exit(1)
-
-
-def begin_background(parser: "ArgumentParser") -> "Namespace":
-    """Set up a background program with one thread, and return its parsed options.
-
-    If memory runs out, the system ends it first.
-
-    Parameters
-    ----------
-    parser
-        Command line of the program. The option ``--parent`` is added, which states the process id
-        of a process with which the program ends.
-
-    Returns
-    -------
-    argparse.Namespace
-        The parsed options.
-    """
-    parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    arguments = parser.parse_args()
-    if arguments.parent is not None:
-        die_with_parent(arguments.parent)
-    prefer_oom_kill(os.getpid())
-    use_one_thread()
-    return arguments
