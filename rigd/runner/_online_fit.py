@@ -92,9 +92,6 @@ class FitSupervisor(SessionWorker):
         self._send(RecordEnded(ticks))
         stopped_by_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
 
-        def is_complete() -> bool:
-            return self._last_report is not None and self._last_report.final
-
         def is_worth_waiting() -> bool:
             call_while_waiting()
             if self._shared_state[StateField.STOP] == Stop.NO or time.monotonic() <= stopped_by_s:
@@ -102,7 +99,9 @@ class FitSupervisor(SessionWorker):
             self._skip_reason = "A stop skipped the fit of the whole record."
             return False
 
-        if self._has_begun and not self._wait(is_complete, _FINAL_FIT_TIMEOUT_S, is_worth_waiting):
+        if self._has_begun and not self._wait(
+            lambda: self._is_done, _FINAL_FIT_TIMEOUT_S, is_worth_waiting
+        ):
             self._give_up("The fit of the whole record took too long.")
         last_estimate = {} if self._last_report is None else self._last_report.document
         fit_document = {key: last_estimate[key] for key in _STORED_KEYS if key in last_estimate}
@@ -177,8 +176,8 @@ class FitSupervisor(SessionWorker):
     def _process_message(self, message: object) -> None:
         """Process one message of the fit process."""
         match message:
-            case FitReport(document):
-                self._last_report = message
+            case FitReport(document, is_final):
+                self._last_report, self._is_done = message, is_final
                 self._new_estimates.append(document)
                 self._events += [
                     LogEvent(0, "info", text_line, notable=True) for text_line in document["text"]

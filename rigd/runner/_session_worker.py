@@ -35,7 +35,7 @@ class SessionWorker(ABC):
     def __init__(self, group: "ProcessGroup") -> None:
         self.failure = ""
         self._group = group
-        self._is_ready = False
+        self._is_ready = self._is_done = False
         self._restart_count = 0
         self._events: list[LogEvent] = []
 
@@ -71,7 +71,7 @@ class SessionWorker(ABC):
 
     def process_messages(self, timeout_s: float) -> bool:
         """Process messages, waiting up to `timeout_s` seconds; return whether it is still used."""
-        if not self.failure:
+        if not (self.failure or self._is_done):
             try:
                 for message in self._group[self.worker].messages(timeout_s):
                     self._is_ready |= type(message).__name__ == self.worker.sends[0]
@@ -79,9 +79,11 @@ class SessionWorker(ABC):
                         self._process_failure(message.reason)
                     else:
                         self._process_message(message)
+                    if self._is_done:  # the worker may end now
+                        break
             except ChildError as error:
                 self._lose(str(error))
-        return not self.failure
+        return not (self.failure or self._is_done)
 
     def _start(self, *messages: object) -> None:
         """Start a process, or take one that waits for its job, and send it the first messages."""
