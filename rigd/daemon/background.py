@@ -185,7 +185,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
     except ChildError as error:
         raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
-        child.start(job)
+        await asyncio.to_thread(child.start, job)
         performed = await asyncio.wait_for(child.receive(), _JOB_TIMEOUT_S)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None

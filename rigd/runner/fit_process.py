@@ -178,7 +178,7 @@ class EstimatorThread:
                     self._results.put(_estimate_document(estimator, next_input))
                 else:
                     estimator.feed(next_input)
-        except Exception as error:
+        except Exception as error:  # whatever fails in the analyser ends the fits only
             self._results.put(error)
 
 
