@@ -117,10 +117,16 @@ class EstimatorThread:
         segments: Mapping[str, tuple[int, int]],
         interval_s: float | None,
     ) -> None:
-        """Start the thread for a session with this metadata, and its planned segments.
+        """Start the thread for a session.
 
-        `interval_s` is the time between two estimates without a request, or None for requested
-        estimates only.
+        Parameters
+        ----------
+        metadata
+            Metadata of the session.
+        segments
+            First tick and end of the planned segments, by name.
+        interval_s
+            Time between two estimates without a request, or None for requested estimates only.
         """
         threading.Thread(
             target=self._run, args=(metadata, segments, interval_s), daemon=True
