@@ -1,31 +1,26 @@
 """Online fit: the estimate of a session that still runs, from the samples recorded so far.
 
 `OnlineEstimator` receives samples and fits them on request, by the functions of `analyze`, so that
-the last estimate of a session equals that of its file. As a program, ``python -m analysis.online``,
-it takes the samples on standard input, as `rigd.session.online_fit` writes them, and answers on
-standard output, one line of JSON per estimate (docs/online_fit.md).
+the last estimate of a session equals that of its file. The fit process of rigd uses it in a session
+(docs/online_fit.md).
 """
 
 from __future__ import annotations
 
-import argparse
-import json
-import os
-import queue
-import sys
-import threading
 import time
+<<<<<<< HEAD
 from contextlib import suppress
 from dataclasses import dataclass, field
+=======
+from dataclasses import asdict, dataclass, field
+>>>>>>> part-workers
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.runtime import begin_background, give_way, ignore
 from rigd.session import Session, SessionError, Validity, segments_until
-from rigd.session.online_fit import EstimateRequest, read_frames, read_start
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Mapping
+    from collections.abc import Mapping
 
     import numpy as np
     from numpy.typing import NDArray
@@ -34,15 +29,14 @@ if TYPE_CHECKING:
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict
     from analysis.record import Record
+<<<<<<< HEAD
     from rigd.beam import Plant
     from rigd.session.online_fit import StreamStart
+=======
+>>>>>>> part-workers
 
 _NOISE_POINTS: Final = 40
 """Number of frequencies at which the noise spectrum is reported."""
-_NICENESS: Final = 5
-"""Niceness of the program while its estimates are awaited. Its priority is below that of the rig's
-processes; it receives a third of a processor in competition with another program."""
-
 _FINDINGS_WITHOUT_MODES: Final = frozenset(
     {"sign", "unit", "clipping", "stop", "hum", "sensor drift"}
 )
@@ -361,101 +355,3 @@ class OnlineEstimator:
             problem="" if has_modes else "No mode has been excited enough yet.",
             validity=record_validity(record.metadata, record.angle_rad, record.rate_hz, plant),
         )
-
-
-# The program
-
-
-def serve(stream_start: StreamStart, frames: Iterator[NDArray[np.void] | EstimateRequest]) -> None:
-    """Fit a session's samples from a stream, and write the estimates to standard output.
-
-    Parameters
-    ----------
-    stream_start : StreamStart
-        Metadata and segments of the session, and the interval of estimates.
-    frames : iterator
-        Samples and requests, from `rigd.session.online_fit.read_frames`.
-
-    Raises
-    ------
-    SessionError
-        The stream is broken.
-    """
-    online_estimator = OnlineEstimator(stream_start.metadata, stream_start.segments)
-    frame_queue: queue.SimpleQueue[NDArray[np.void] | EstimateRequest | SessionError | None]
-    frame_queue = queue.SimpleQueue()
-
-    def receive_frames() -> None:
-        """Put all frames of the stream into the queue, then an error or None."""
-        # This runs in a thread of its own, so that the sender never waits for the fit.
-        end = None
-        try:
-            for stream_frame in frames:
-                frame_queue.put(stream_frame)
-        except SessionError as error:
-            end = error
-        frame_queue.put(end)
-
-    threading.Thread(target=receive_frames, daemon=True).start()
-    due_s = None if stream_start.every_s is None else time.monotonic() + stream_start.every_s
-    estimate_count = 0
-    while True:
-        try:
-            stream_frame = frame_queue.get(
-                timeout=None if due_s is None else max(due_s - time.monotonic(), 0)
-            )
-        except queue.Empty:
-            # All samples received so far are in the estimate.
-            assert stream_start.every_s is not None
-            due_s = time.monotonic() + stream_start.every_s
-            _write_estimate(
-                online_estimator, EstimateRequest(estimate_count, _TICK_BEYOND_ALL, whole=False)
-            )
-            estimate_count += 1
-            continue
-        if stream_frame is None:
-            return
-        if isinstance(stream_frame, SessionError):
-            raise stream_frame
-        if isinstance(stream_frame, EstimateRequest):
-            _write_estimate(online_estimator, stream_frame)
-        else:
-            online_estimator.feed(stream_frame)
-
-
-_TICK_BEYOND_ALL: Final = 1 << 32
-"""Tick beyond all ticks of a session, for an estimate from all samples."""
-
-
-def _write_estimate(online_estimator: OnlineEstimator, request: EstimateRequest) -> None:
-    """Write the requested estimate as a line of JSON to standard output."""
-    online_estimate = online_estimator.estimate(
-        request.tick, whole=request.whole, from_last=request.from_last
-    )
-    json_line = json.dumps({"id": request.id, **online_estimate.as_json()}, allow_nan=False)
-    sys.stdout.write(json_line + "\n")
-    sys.stdout.flush()
-
-
-def main() -> None:
-    """Read a session's samples from standard input, and write estimates to standard output."""
-    # Ctrl-C stops the session safely. This program ends with the stream.
-    ignore()
-    argument_parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)
-    begin_background(argument_parser)
-    try:
-        # With `sys.stdin`, the interpreter would wait for the reading thread at its end, and abort.
-        sample_stream = open(0, "rb", closefd=False)  # noqa: SIM115
-        stream_start = read_start(sample_stream)
-        if stream_start.every_s is None:
-            os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
-        else:
-            give_way()  # estimates at intervals are not awaited
-        with suppress(BrokenPipeError):  # the reader of the estimates has ended
-            serve(stream_start, read_frames(sample_stream))
-    except SessionError as error:
-        sys.exit(f"Error: {error}")
-
-
-if __name__ == "__main__":
-    main()

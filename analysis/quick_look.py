@@ -2,7 +2,8 @@
 
 As a program, ``python -m analysis.quick_look FILE``, it writes the quick look into the folder of
 the session file, as ``STEM.look.json``, and prints its text. `rigd run` and the daemon start it
-after each session, at a low priority. The report of `analyze` is more complete and takes longer.
+after each session, at a low priority (`rigd.engine.workers`). The report of `analyze` is more
+complete and takes longer.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any, Final
 
 from rigd.library.trend import change_between
 from rigd.printable import listed
-from rigd.runtime import begin_background, raise_on_signals
+from rigd.runtime import raise_on_signals, use_one_thread
 from rigd.session import SessionError, Validity
 from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import (
@@ -59,9 +60,6 @@ _HAMMING_WIDTH_BINS: Final = 1.30
 
 _MODE_QUANTITIES: Final = ("frequency_hz", "damping_ratio")
 """Quantities of a mode that are compared between sessions."""
-
-_NICENESS: Final = 10
-"""Niceness of the program, which gives it a tenth of the processor time of an ordinary one."""
 
 
 class QuickLookError(ValueError):
@@ -574,10 +572,8 @@ def main() -> None:
     argument_parser.add_argument(
         "--last", type=Path, metavar="FILE", help="Session to compare with (default: the last one)."
     )
-    parsed_arguments = begin_background(argument_parser)
-    # The priority is not the lowest one, because other programs may never pause.
-    with suppress(OSError):
-        os.nice(_NICENESS)
+    parsed_arguments = argument_parser.parse_args()
+    use_one_thread()
     try:
         quick_look_document = make_quick_look(parsed_arguments.file, parsed_arguments.last)
         write_quick_look(quick_look_document, parsed_arguments.file)

@@ -17,8 +17,8 @@ from pathlib import Path
 
 from rigd.bench import _loops as loops
 from rigd.bench.measure import LoopMeasurement, percentiles, record_measurement
-from rigd.engine.processes import LIVE
 from rigd.engine.shared_state import Phase
+from rigd.engine.workers import LIVE
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
 from rigd.runner.request import Order

@@ -70,7 +70,7 @@ def start_processes(
 
     The processes import their modules while the command line imports others and plans.
     """
-    from rigd.engine.processes import FIT, TOUCH
+    from rigd.engine.workers import FIT, TOUCH
     from rigd.runner import ProcessGroup
     from rigd.runtime import StopRequest
 

@@ -4,22 +4,21 @@ The page accepts commands only with a token from the daemon. While the daemon is
 this user's runtime folder contains the address and the token.
 """
 
-import json
 import logging
 import os
 import secrets
-import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable
-from contextlib import suppress
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import LOGGER_NAME
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signals_blocked
+from rigd.engine.messages import Failed, PageAddress
+from rigd.engine.processes import Child, ChildError
+from rigd.engine.workers import PAGE
 from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
 
 if TYPE_CHECKING:
@@ -27,16 +26,10 @@ if TYPE_CHECKING:
 
 PAGE_PORT: Final = 8720
 """Default port of the page on the loopback interface."""
-_PAGE_SERVER_ARGUMENTS: Final = ("-m", "rigd.web")
-"""Arguments of Python that run the server of the page."""
-_MAX_SHORT_STARTS: Final = 5
-"""Maximum number of consecutive starts after each of which the process ended soon."""
 _SUCCESSFUL_RUN_S: Final = 60.0
 """Run time in seconds from which a start counts as successful."""
 _RESTART_PAUSE_S: Final = 1.0
 """Pause in seconds before the process is started again."""
-_END_TIMEOUT_S: Final = 3.0
-"""Time in seconds that the process has to end before it is killed."""
 
 _log = logging.getLogger(LOGGER_NAME)
 
@@ -78,34 +71,30 @@ class PageProcess:
         self._address_path = _address_path(profile.name)
         self._on_address = on_address
         self._is_closing = threading.Event()
-        self._process: subprocess.Popen[bytes] | None = None
+        self._child: Child | None = None
         self._thread = threading.Thread(target=self._restart_repeatedly, name="page", daemon=True)
         self._thread.start()
 
     def close(self) -> None:
         """End the process of the page, and kill it if it does not end by itself."""
         self._is_closing.set()
-        process = self._process
-        if process is not None:
-            assert process.stdin is not None
-            process.stdin.close()
-            try:
-                process.wait(_END_TIMEOUT_S)
-            except subprocess.TimeoutExpired:
-                process.kill()
-        self._thread.join(_END_TIMEOUT_S)
+        if self._child is not None:
+            self._child.close_input()
+            self._thread.join(PAGE.end_s)
+            self._child.kill()
+        self._thread.join(PAGE.end_s)
         self._address_path.unlink(missing_ok=True)
 
     def _restart_repeatedly(self) -> None:
         """Start the process again whenever it ends, up to a number of times; run in a thread."""
         short_starts = 0
-        while short_starts < _MAX_SHORT_STARTS:
+        while short_starts <= PAGE.restarts:
             short_starts += 1
             began_s = time.monotonic()
             try:
                 self._run_process()
-            except OSError as error:
-                _log.warning("page: its process cannot be started (%s)", error.strerror)
+            except ChildError as error:
+                _log.warning("page: its process cannot be started (%s)", error.system_reason)
             if time.monotonic() - began_s >= _SUCCESSFUL_RUN_S:
                 short_starts = 0
             self._on_address(None)
@@ -115,31 +104,23 @@ class PageProcess:
 
     def _run_process(self) -> None:
         """Start the process of the page, announce its address, and wait for its end."""
-        with signals_blocked():
-            page_process = subprocess.Popen(
-                [*OWN_PYTHON, *_PAGE_SERVER_ARGUMENTS],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=os.environ | SINGLE_THREADED,
-            )
-        self._process = page_process
+        self._child = page_process = Child(PAGE)
         if self._is_closing.is_set():
             page_process.kill()
-        assert page_process.stdin is not None
-        assert page_process.stdout is not None
-        port_report = {}
-        with page_process:
-            with suppress(OSError, ValueError):
-                page_process.stdin.write(json.dumps(self._job).encode() + b"\n")
-                page_process.stdin.flush()
-                for output_line in page_process.stdout:
-                    port_report = json.loads(output_line)
-                    if "port" in port_report:
-                        self._announce(port_report["port"])
-            exit_code = page_process.wait()
+        failure_text = ""
+        try:
+            page_process.start(self._job)
+            while True:
+                match page_process.poll(None):
+                    case PageAddress(port):
+                        self._announce(port)
+                    case Failed(failure_text):
+                        pass
+        except (ChildError, ValueError):  # it has ended, or its input was closed
+            page_process.stop()
         if not self._is_closing.is_set():
             _log.warning(
-                "page: its process ended with code %s: %s", exit_code, port_report.get("error", "")
+                "page: its process ended with code %s: %s", page_process.exit_code, failure_text
             )
 
     def _announce(self, port: int) -> None:

@@ -12,8 +12,8 @@ from enum import StrEnum
 from math import isfinite
 from typing import Any
 
-from rigd.engine.processes import PROCESSES
 from rigd.engine.shared_state import Phase
+from rigd.engine.workers import PROCESSES
 from rigd.live.address import LiveAddress
 from rigd.runner.signal_blocks import SignalBlock
 from rigd.runner.status import ProcessStatus, RigStatus

@@ -1,17 +1,11 @@
 """Background jobs of the daemon (predictions, checks, heavy plans), each in a process of its own.
 
 Any client may request a prediction while a session is running. In the daemon's own process such a
-job would block the interpreter that supervises the session. The job's own process has the lowest
-priority of an ordinary program, and is limited to a fraction of the free memory.
+job would block the interpreter that supervises the session.
 """
 
 import asyncio
 import json
-import os
-import pickle
-import resource
-import subprocess
-import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -19,26 +13,19 @@ from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from rigd.checks import check_on_paper
 from rigd.daemon._protocol import CommandError, StartRequest
+from rigd.engine.messages import Performed
+from rigd.engine.processes import Child, ChildError, Parent
+from rigd.engine.workers import PLAN, PREDICTION, Worker
 from rigd.errors import RigdError
 from rigd.excitation import Value
 from rigd.profile import Profile, with_specimen
 from rigd.runner import Series, with_tip_slope
 from rigd.runner.planning import excitation_for, largest_amplitude, plan_document, predict_session
 from rigd.runner.request import NoRoomError
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, prefer_oom_kill
+from rigd.runtime import ignore as ignore_signals
 
 _JOB_TIMEOUT_S: Final = 50.0
 """Maximum time in seconds for a job, below the client's timeout so that the client gets a reply."""
-_MAX_MEMORY_BYTES: Final = 4 << 30
-"""Maximum memory of a job in bytes."""
-_MIN_MEMORY_BYTES: Final = 256 << 20
-"""Memory in bytes that a job may use in any case. A session of two minutes needs 180 MiB, of which
-120 MiB are the program."""
-_MEMORY_FRACTION: Final = 0.25
-"""Fraction of the available memory that a job may use. It is limited because, apart from the
-control process of a session, the memory of no process is locked."""
-_LOWEST_PRIORITY: Final = 19
-"""Niceness with the lowest priority."""
 _LIGHT_RECORD_S: Final = 300.0
 """Longest duration of a record in seconds whose planning takes half a second and 100 MB."""
 
@@ -49,8 +36,8 @@ Result_co = TypeVar("Result_co", covariant=True)
 class BackgroundJob(Protocol[Result_co]):
     """Job of the daemon that is performed in a process of its own."""
 
-    during_sessions: ClassVar[bool]
-    """Whether the job may run during a session, with the lowest priority."""
+    worker: ClassVar[Worker]
+    """Process that performs the job: only a `PREDICTION` may run during a session."""
 
     def perform(self) -> Result_co:
         """Perform the job and return its result; a RigdError is reported to the client."""
@@ -60,7 +47,7 @@ class BackgroundJob(Protocol[Result_co]):
 class PredictionJob:
     """Job that predicts a session by `rigd.runner.planning.predict_session`."""
 
-    during_sessions: ClassVar[bool] = True
+    worker: ClassVar[Worker] = PREDICTION
 
     profile: Profile
     """Profile of the rig."""
@@ -95,7 +82,7 @@ class PredictionJob:
 class CheckJob:
     """Job that checks a rig by `rigd.checks.check_without_devices`, while the daemon uses it."""
 
-    during_sessions: ClassVar[bool] = True
+    worker: ClassVar[Worker] = PREDICTION
     profile: Profile
     """Profile of the rig."""
     calibration: Mapping[str, Any] | None
@@ -125,7 +112,7 @@ class CheckJob:
 class PlanJob:
     """Job that plans a series of sessions, a `rigd.runner.Series`."""
 
-    during_sessions: ClassVar[bool] = False
+    worker: ClassVar[Worker] = PLAN
 
     profile: Profile
     """Profile of the rig."""
@@ -194,46 +181,32 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         If the job is refused, fails, or takes longer than 50 s.
     """
     try:
-        job_process = await asyncio.create_subprocess_exec(
-            *(*OWN_PYTHON, "-m", "rigd.daemon.background"),
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.DEVNULL,
-            env=os.environ | SINGLE_THREADED,
-        )
-    except OSError as error:
-        raise CommandError(f"No process can be started for it ({error.strerror}).") from None
+        child = Child(job.worker)
+    except ChildError as error:
+        raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
-        process_output, _ = await asyncio.wait_for(
-            job_process.communicate(pickle.dumps(job)), _JOB_TIMEOUT_S
-        )
-        result_or_error = pickle.loads(process_output)
+        await asyncio.to_thread(child.start, job)
+        performed = await asyncio.wait_for(child.receive(), _JOB_TIMEOUT_S)
     except TimeoutError:
         raise CommandError(f"It takes longer than {_JOB_TIMEOUT_S:g} s; check CPU load.") from None
-    except (EOFError, pickle.UnpicklingError):
-        raise CommandError(f"Its process ended with exit code {job_process.returncode}.") from None
+    except ChildError:
+        await asyncio.to_thread(child.stop)
+        raise CommandError(f"Its process ended with exit code {child.exit_code}.") from None
     finally:
-        if job_process.returncode is None:
-            job_process.kill()
-            await job_process.wait()
-    if isinstance(result_or_error, CommandError):
-        raise result_or_error
-    job_result: Result = result_or_error
+        await asyncio.to_thread(child.stop)
+    assert isinstance(performed, Performed)
+    if isinstance(performed.result, CommandError):
+        raise performed.result
+    job_result: Result = performed.result
     return job_result
 
 
 def main() -> None:
-    """Perform the pickled job from standard input, and write the pickled result to standard output.
-
-    An error is written in place of the result. Unpickling is safe, because this program has written
-    the data itself.
-    """
-    prefer_oom_kill()
-    max_bytes = _memory_limit()
-    resource.setrlimit(resource.RLIMIT_AS, (max_bytes, max_bytes))
-    job = pickle.load(sys.stdin.buffer)
-    if job.during_sessions:
-        os.setpriority(os.PRIO_PROCESS, 0, _LOWEST_PRIORITY)
+    """Perform a job of the daemon, and send its result, or an error in place of the result."""
+    ignore_signals()
+    daemon = Parent()
+    job: BackgroundJob[object] = daemon.receive_job()
+    result_or_error: object
     try:
         result_or_error = job.perform()
     except RigdError as error:
@@ -246,14 +219,7 @@ def main() -> None:
         )
     if isinstance(result_or_error, dict):
         json.dumps(result_or_error, allow_nan=False)  # raises if the reply is not JSON
-    pickle.dump(result_or_error, sys.stdout.buffer)
-
-
-def _memory_limit(meminfo: Path = Path("/proc/meminfo")) -> int:
-    """Return the maximum address space of a job in bytes, from the memory available now."""
-    meminfo_text = meminfo.read_text()
-    available_bytes = int(meminfo_text.partition("MemAvailable:")[2].split()[0]) * 1024
-    return int(min(max(_MEMORY_FRACTION * available_bytes, _MIN_MEMORY_BYTES), _MAX_MEMORY_BYTES))
+    daemon.send(Performed(result_or_error))
 
 
 if __name__ == "__main__":

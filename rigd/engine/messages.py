@@ -1,22 +1,24 @@
 """Messages between the processes of a rig, and their encoding.
 
-The supervisor sends jobs and orders, the other processes answer:
+The supervisor sends jobs and orders, the other processes answer (`rigd.engine.workers` names the
+messages that each sends):
 
-============  =============================================  ================================
-process       receives                                       sends
-============  =============================================  ================================
-control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Ready, Finished;
-                                                             Measured or Refused; last Ended
-recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
-live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
-touch         TouchJob                                       TouchReady, then TouchReport
-fit           FitJob, FileHeader, RecordEnded                FitReady, then FitReport,
-                                                             PlannedSegment, SearchEnded; or Failed
-============  =============================================  ================================
+============  =============================================
+process       receives
+============  =============================================
+control       ControlJob, then SessionJob, Tare, Zero, Probe
+recorder      RecorderJob, FileHeader, Close
+live          LiveJob, LiveSession, LiveEnd of `rigd.live`
+touch         TouchJob
+fit           FitJob, FileHeader, RecordEnded
+page          the data that it shows, as a JSON document
+prediction    a job of `rigd.daemon.background`; so does plan
+============  =============================================
 
-A message is its length followed by one of these objects, pickled. Each is short enough for a pipe's
-buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is not used,
-because it would wait for the remainder of a message of which a hung child has written half.
+A message is its length followed by one of these objects, pickled. In a session each is short enough
+for a pipe's buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is
+not used, because it would wait for the remainder of a message of which a hung child has written
+half.
 """
 
 import os
@@ -39,7 +41,7 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
 
 _LENGTH_HEADER: Final = struct.Struct("=I")
 """Binary format of the length in bytes that precedes each message."""
-_MAX_MESSAGE_BYTES: Final = 1 << 24
+_MAX_MESSAGE_BYTES: Final = 1 << 28
 """Largest length of a message in bytes. A larger length means that the pipe contains something
 else, such as text."""
 
@@ -257,7 +259,7 @@ class Closed:
 
 @dataclass(frozen=True, slots=True)
 class Failed:
-    """Message that a recorder, live publisher or fit process has failed and ends."""
+    """Message that a recorder, live publisher, fit process or page has failed and ends."""
 
     reason: str
     """Description of the failure, for the operator."""
@@ -373,6 +375,25 @@ class SearchEnded:
     """Reason for the end, a sentence for the operator."""
     segments: Mapping[str, tuple[int, int]]
     """First tick and end of the scan and of each segment, by name."""
+
+
+# Daemon
+
+
+@dataclass(frozen=True, slots=True)
+class PageAddress:
+    """Message that the operator's page is served."""
+
+    port: int
+    """Port on the loopback interface."""
+
+
+@dataclass(frozen=True, slots=True)
+class Performed:
+    """Message with the result of a prediction, a check or a plan."""
+
+    result: Any
+    """Result of the job, or the error with which its request is refused."""
 
 
 # Encoding

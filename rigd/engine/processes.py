@@ -1,29 +1,38 @@
-"""The processes of a rig: their table, their start, and both ends of their pipes.
+"""Both ends of a child process: its client, and its connection to the process that started it.
 
-The table `PROCESSES` defines how each process is started, watched and ended. Every process counts
-up its heartbeat in the `SharedState` several times a second. The supervisor notices a dead process
-at once and a hung process by its heartbeat. The table states the consequence.
-
-A child is ``python -m MODULE``. It receives its job and then messages on standard input, whose end
-means that the supervisor is gone. It sends its answers on standard output (`messages`).
+`Child` starts the process that a row of `rigd.engine.workers` describes, and is the client of its
+messages; it suspends, resumes and ends it. A worker that sends messages is ``python -m MODULE PID``
+with the process id of its supervisor. It receives its job and then messages on standard input,
+whose end means that the supervisor is gone, and sends its answers on standard output (`messages`);
+its end of the pipes is a `Parent`. Any other worker is a program with arguments, which the system
+kills when its supervisor ends.
 """
 
 import contextlib
 import os
+import resource
 import select
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Collection, Iterator, Sequence
-from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from rigd.engine._control_names import CONTROL_MODULE
+from rigd.engine._ring import shared_memory_fd
 from rigd.engine.messages import MessageReader, encode, is_ready
-from rigd.engine.shared_state import StateField
+from rigd.engine.workers import Worker
 from rigd.errors import FailureError
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, signal_when_orphaned, signals_blocked
+from rigd.runtime import (
+    OWN_PYTHON,
+    RUN_PROGRAM,
+    SINGLE_THREADED,
+    give_way,
+    prefer_oom_kill,
+    signal_when_orphaned,
+    signals_blocked,
+)
 
 _WRITE_PATIENCE_S = 5.0
 """Longest time in s that a child may take to read a message."""
@@ -31,29 +40,32 @@ _EXIT_GRACE_S = 1.0
 """Longest time in s from the end of a child's output to the end of its process."""
 _KILLED_GRACE_S = 2.0
 """Longest time in s to wait for a killed child to end."""
-
-
-# Both ends
+_MAX_ERROR_BYTES = 65_536
+"""Number of bytes at the end of a child's standard error that are read."""
 
 
 class ChildError(FailureError):
     """Error of a child process: it cannot be started, has ended or sent no valid message."""
 
+    system_reason = ""
+    """Reason of the system why the process cannot be started."""
+
 
 class Child:
-    """Child process that the supervisor starts, with the supervisor's end of its pipes.
+    """Child process of a supervisor: its start, its messages, and its end.
 
     Parameters
     ----------
-    name
-        Name of the process in messages to the operator.
-    module
-        Module that is run as ``python -m module``. It starts its imports at once and waits for its
-        job.
+    worker
+        Description of the process.
+    arguments
+        Arguments of a program.
     descriptors
         Descriptors that the child inherits.
     cores
         Cores that the child may use; empty: those of this process.
+    folder
+        Working folder of the child; None: that of this process.
 
     Raises
     ------
@@ -62,29 +74,63 @@ class Child:
     """
 
     def __init__(
-        self, name: str, module: str, descriptors: Sequence[int], cores: Collection[int] = ()
+        self,
+        worker: Worker,
+        *arguments: str,
+        descriptors: Sequence[int] = (),
+        cores: Collection[int] = (),
+        folder: Path | None = None,
     ) -> None:
-        self.name = name
+        self._worker = worker
+        is_program = not worker.sends
+        command = [*OWN_PYTHON, "-m", worker.module, *arguments]
+        own_pid = str(os.getpid())
+        self._errors_fd: int | None = None
         try:
-            with signals_blocked():
+            if worker.errors_hidden:
+                self._errors_fd = shared_memory_fd()  # a pipe would have to be read meanwhile
+            # A program has its own group, which is suspended and killed with its workers.
+            with contextlib.nullcontext() if is_program else signals_blocked():
                 self._process = subprocess.Popen(
-                    [*OWN_PYTHON, "-m", module, str(os.getpid())],
+                    [*RUN_PROGRAM, own_pid, *command] if is_program else [*command, own_pid],
                     bufsize=0,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
+                    stdin=subprocess.DEVNULL if is_program else subprocess.PIPE,
+                    stdout=subprocess.DEVNULL if is_program else subprocess.PIPE,
+                    stderr=self._errors_fd,
+                    cwd=folder,
                     pass_fds=descriptors,
                     env=os.environ | SINGLE_THREADED,
+                    process_group=0 if is_program else None,
                 )
         except OSError as error:
-            raise ChildError(
-                f"The {name} process cannot be started ({error.strerror}); check the load of this "
-                "computer and its limits (ulimit -a)."
-            ) from None
-        if cores:
-            with contextlib.suppress(OSError):  # it has ended already, which poll() reports
-                os.sched_setaffinity(self._process.pid, cores)
-        os.set_blocking(self._stdin_fd, False)
-        self._messages = MessageReader(self._stdout_fd)
+            self._close_errors()
+            child_error = ChildError(
+                f"The {worker.name} process cannot be started ({error.strerror}); check the load "
+                "of this computer and its limits (ulimit -a)."
+            )
+            child_error.system_reason = str(error.strerror)
+            raise child_error from None
+        self._restrict(cores)
+        if not is_program:
+            os.set_blocking(self._stdin_fd, False)
+            self._messages = MessageReader(self._stdout_fd)
+
+    def _restrict(self, cores: Collection[int]) -> None:
+        """Give the new process its cores, its priority, and its limit of memory."""
+        worker, pid = self._worker, self.pid
+        with contextlib.suppress(OSError):  # it has ended already, which poll() reports
+            if cores:
+                os.sched_setaffinity(pid, cores)
+            if worker.memory is not None:
+                limit_bytes = worker.memory.bytes_now()
+                resource.prlimit(pid, resource.RLIMIT_AS, (limit_bytes, limit_bytes))
+            if worker.niceness:
+                raised_niceness = os.getpriority(os.PRIO_PROCESS, pid) + worker.niceness
+                os.setpriority(os.PRIO_PROCESS, pid, raised_niceness)
+        if worker.niceness is None:
+            give_way(pid)
+        if worker.ended_for_memory:
+            prefer_oom_kill(pid)
 
     def start(self, job: object) -> None:
         """Send the child its job, which is the first message."""
@@ -110,18 +156,26 @@ class Child:
     @property
     def running(self) -> bool:
         """Whether the child process still runs."""
-        return self._process.poll() is None
+        return self.exit_code is None
 
-    def poll(self, timeout_s: float) -> object | None:
+    @property
+    def exit_code(self) -> int | None:
+        """Exit code of the child, or minus the signal that ended it; None while it runs."""
+        return self._process.poll()
+
+    def poll(self, timeout_s: float | None) -> object | None:
         """Return the child's next message, or None if none arrives within `timeout_s`.
+
+        A timeout of None waits forever.
 
         Raises
         ------
         ChildError
-            If the child has ended, or sent something that is no message.
+            If the child has ended, or sent something that is no message of it.
         """
+        process_text = f"The {self._worker.name} process"
         try:
-            return self._messages.next(timeout_s)
+            message = self._messages.next(timeout_s)
         except EOFError:
             exit_code = self._process.wait()
             end_text = (
@@ -129,9 +183,12 @@ class Child:
                 if exit_code < 0
                 else f"ended with exit code {exit_code}"
             )
-            raise ChildError(f"The {self.name} process was {end_text}.") from None
+            raise ChildError(f"{process_text} was {end_text}.") from None
         except ValueError as error:
-            raise ChildError(f"The {self.name} process sent {error}.") from None
+            raise ChildError(f"{process_text} sent {error}.") from None
+        if message is not None and type(message).__name__ not in self._worker.sends:
+            raise ChildError(f"{process_text} sent {message}.")
+        return message
 
     def messages(self, timeout_s: float) -> Iterator[object]:
         """Yield the child's available messages; wait up to `timeout_s` for the first message only.
@@ -145,36 +202,89 @@ class Child:
             yield message
             timeout_s = 0.0
 
-    def wake(self) -> None:
+    async def receive(self) -> object:
+        """Wait for the child's next message, and return it; other tasks run meanwhile.
+
+        Raises
+        ------
+        ChildError
+            If the child has ended, or sent something that is no message of it.
+        """
+        import asyncio  # late: the processes of a rig do not need it
+
+        event_loop, readable = asyncio.get_running_loop(), asyncio.Event()
+        event_loop.add_reader(self._stdout_fd, readable.set)
+        try:
+            while (message := self.poll(0.0)) is None:
+                readable.clear()
+                await readable.wait()
+        finally:
+            event_loop.remove_reader(self._stdout_fd)
+        return message
+
+    def error_text(self) -> str:
+        """Return the end of the child's standard error, which is not shown to the operator."""
+        assert self._errors_fd is not None
+        start = max(0, os.fstat(self._errors_fd).st_size - _MAX_ERROR_BYTES)
+        return os.pread(self._errors_fd, _MAX_ERROR_BYTES, start).decode(errors="replace").strip()
+
+    def suspend(self) -> None:
+        """Suspend the child until it is resumed."""
+        self._signal(signal.SIGSTOP)
+
+    def resume(self) -> None:
         """Resume the child if it is suspended, so that it can finish its work."""
-        self._process.send_signal(signal.SIGCONT)
+        self._signal(signal.SIGCONT)
 
     def kill(self) -> None:
         """Kill the child process at once; the next :meth:`poll` then raises `ChildError`."""
-        self._process.kill()
+        self._signal(signal.SIGKILL)
 
-    def stop(self, grace_s: float) -> None:
-        """End the child: close its input, terminate it after `grace_s` seconds, then kill it.
+    def _signal(self, signal_number: signal.Signals) -> None:
+        """Send a signal to the child, and to the processes that a program has started."""
+        if self._worker.sends:
+            self._process.send_signal(signal_number)
+        elif self.running:
+            with contextlib.suppress(ProcessLookupError):
+                os.killpg(self.pid, signal_number)
 
-        Calling this again has no effect.
-        """
-        if self._process.stdout is None or self._process.stdout.closed:
-            return
+    def close_input(self) -> None:
+        """Request the child to end, by the end of its input."""
         if self._process.stdin is not None and not self._process.stdin.closed:
             with contextlib.suppress(BrokenPipeError):  # it had ended already
                 self._process.stdin.close()
-        self.wake()
-        for terminate_or_kill in (self._process.terminate, self._process.kill):
-            try:
-                self._process.wait(_EXIT_GRACE_S if self._wait_for_output_end(grace_s) else 0.0)
-                break
-            except subprocess.TimeoutExpired:
-                terminate_or_kill()
-        with contextlib.suppress(
-            subprocess.TimeoutExpired
-        ):  # stuck in a call, on a disk that hangs
-            self._process.wait(_KILLED_GRACE_S)
-        self._process.stdout.close()
+
+    def stop(self) -> None:
+        """End the child: close its input, terminate it after its time to end, then kill it.
+
+        A program is killed at once. Calling this again has no effect.
+        """
+        if self._process.stdout is None:
+            self.kill()
+            with contextlib.suppress(subprocess.TimeoutExpired):  # it ends late at low priority
+                self._process.wait(self._worker.end_s)
+        elif not self._process.stdout.closed:
+            self.close_input()
+            self.resume()
+            for terminate_or_kill in (self._process.terminate, self._process.kill):
+                has_ended = self._wait_for_output_end(self._worker.end_s)
+                try:
+                    self._process.wait(_EXIT_GRACE_S if has_ended else 0.0)
+                    break
+                except subprocess.TimeoutExpired:
+                    terminate_or_kill()
+            with contextlib.suppress(
+                subprocess.TimeoutExpired
+            ):  # stuck in a call, on a disk that hangs
+                self._process.wait(_KILLED_GRACE_S)
+            self._process.stdout.close()
+        self._close_errors()
+
+    def _close_errors(self) -> None:
+        """Close the file with the child's standard error, if there is one."""
+        if self._errors_fd is not None:
+            os.close(self._errors_fd)
+            self._errors_fd = None
 
     def _wait_for_output_end(self, patience_s: float) -> bool:
         """Wait until the child's output ends, and return whether it ends within `patience_s`."""
@@ -205,7 +315,7 @@ class Child:
         while unsent_bytes:
             patience_s = max(0.0, deadline_s - time.monotonic())
             if not is_ready(self._stdin_fd, select.POLLOUT, patience_s):
-                raise ChildError(f"The {self.name} process does not listen.")
+                raise ChildError(f"The {self._worker.name} process does not listen.")
             try:
                 unsent_bytes = unsent_bytes[os.write(self._stdin_fd, unsent_bytes) :]
             except BrokenPipeError:
@@ -250,99 +360,15 @@ class Parent:
         return self._messages.next(timeout_s)
 
     def send(self, message: object) -> None:
-        """Send one short message to the supervisor; nothing happens if the supervisor has ended."""
+        """Send one message to the supervisor; nothing happens if the supervisor has ended."""
+        unsent_bytes = memoryview(encode(message))
         with contextlib.suppress(BrokenPipeError):
-            os.write(self._messages_fd, encode(message))
+            while unsent_bytes:
+                unsent_bytes = unsent_bytes[os.write(self._messages_fd, unsent_bytes) :]
 
     def alive(self) -> bool:
         """Return whether the supervisor still runs, fast enough for use in the control loop."""
         return os.getppid() == self._pid
-
-
-# Table of processes
-
-
-@dataclass(frozen=True, slots=True)
-class Process:
-    """Description of one process of a rig: how it is started, watched and ended."""
-
-    name: str
-    """Name of the process in messages to the operator."""
-    module: str
-    """Module that is run as ``python -m module``; empty for the supervisor."""
-    beat: StateField
-    """Field of the process's heartbeat in the shared state."""
-    hung_after_s: float | None
-    """Longest time in s without a heartbeat; None: the process's results are checked instead."""
-    grace_s: float
-    """Time in s in which the process must end on request, before it is terminated, then killed."""
-    for_one_session: bool
-    """Whether each session starts a new process of this kind."""
-    loss: str
-    """Consequence if the process dies or hangs, for the operator."""
-
-
-CONTROL = Process(
-    "control",
-    CONTROL_MODULE,
-    StateField.CONTROL_BEAT,
-    hung_after_s=3.0,
-    grace_s=5.0,
-    for_one_session=False,
-    loss="the drive's watchdog switches it off, the session ends as a fault",
-)
-RECORDER = Process(
-    "recorder",
-    "rigd.engine.recorder",
-    StateField.RECORDER_BEAT,
-    # A disk may stall for seconds; the number of waiting samples is checked instead.
-    hung_after_s=None,
-    grace_s=5.0,
-    for_one_session=True,
-    loss="the session ends as a fault",
-)
-LIVE = Process(
-    "live",
-    "rigd.live.publisher",
-    StateField.LIVE_BEAT,
-    hung_after_s=5.0,
-    grace_s=2.0,
-    for_one_session=False,
-    loss="it is restarted, the session continues",
-)
-TOUCH = Process(
-    "touch",
-    "rigd.engine.touch_estimator",
-    StateField.TOUCH_BEAT,
-    # An estimate may take long; a missing estimate is reported as such.
-    hung_after_s=None,
-    grace_s=1.0,
-    for_one_session=True,
-    loss="touches are detected but not estimated, the session continues",
-)
-FIT = Process(
-    "fit",
-    "rigd.runner.fit_process",
-    StateField.FIT_BEAT,
-    # A decision may take long on a busy computer; the loop holds the angle meanwhile.
-    hung_after_s=15.0,
-    grace_s=1.0,
-    for_one_session=True,
-    loss="a session that plans itself ends with what was recorded, any other continues",
-)
-SUPERVISOR = Process(
-    "supervisor",
-    "",
-    StateField.SUPERVISOR_BEAT,
-    hung_after_s=2.0,
-    grace_s=0.0,
-    for_one_session=False,
-    loss="the control process ends the session as a fault",
-)
-
-PROCESSES = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
-"""All processes of a rig in the order in which they are ended: first the control process, which
-switches the torque off."""
 
 
 class Heartbeat:

@@ -1,21 +1,19 @@
-"""Live view of a rig: start, supervision and restart of the publisher process."""
+"""Live view of a rig: the publisher process, and what it shows of a session."""
 
 import math
-import time
 import uuid
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from rigd.beam import undamped_frequencies_rad_s
-from rigd.engine.messages import Failed
-from rigd.engine.processes import LIVE, ChildError, Heartbeat
-from rigd.engine.shared_state import Level, LogEvent, StateField
+from rigd.engine.workers import LIVE
 from rigd.live.address import LiveAddress
 from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
+from rigd.runner._session_worker import SessionWorker
 from rigd.runner.request import Order
 from rigd.runtime import StopRequest
 from rigd.sweep_response import sweep_ticks
@@ -24,39 +22,38 @@ from rigd.view.plots import BUS_PLOT_COMPONENTS, REAL_TIME_PLOT_COMPONENTS
 
 _ADDRESS_TIMEOUT_S = 10.0
 """Maximum time in seconds for which a session waits for the start of the live view."""
-_START_TIMEOUT_S = 60.0
-"""Time in seconds without a heartbeat after which a starting publisher counts as hung."""
 _SHOW_TIMEOUT_S = 1.0
 """Maximum time in seconds for which a session waits until the live view shows it."""
 _DEFAULT_FIT_BAND_HZ = 50.0
 """Upper frequency in Hz that is assumed for an excitation without start and stop frequencies."""
 _MAX_FIT_MODES = 4
 """Maximum number of modes whose fits are plotted; more plots would be too small to read."""
-_MAX_RESTARTS = 3
-"""Maximum number of restarts of the publisher in one session."""
 
 
-class LiveView:
-    """Supervisor of the publisher process, without which a session continues if it fails."""
+class LiveView(SessionWorker):
+    """Client of the publisher process."""
+
+    worker = LIVE
 
     def __init__(self, group: ProcessGroup, rig: str, *, fast: bool = False) -> None:
+        super().__init__(group)
         self._fast = fast
         self.address: LiveAddress | None = None
-        self._group = group
         self._job = LiveJob(rig, group.channels.specs)
         self._session: LiveSession | None = None
-        self._unreported: list[LogEvent] = []
-        self._restarts = 0
-        self._failure = ""
         self._is_session_shown = False
-        self._start()
+        self._restart()
 
     def show(self, order: Order, stop: StopRequest) -> str:
         """Prepare the view for the next session; return text with its address, or why none."""
-        self._restarts = 0
-        if self._failure:  # a new attempt for the new session
-            self._start()
-        self._process_messages_until(lambda: self._has_address, _ADDRESS_TIMEOUT_S, stop)
+
+        def is_not_stopped() -> bool:
+            return not stop.requested
+
+        self._restart_count = 0
+        if self.failure:  # a new attempt for the new session
+            self._restart()
+        self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
         start_positions = tuple(ring.written for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast),
@@ -67,25 +64,12 @@ class LiveView:
         self._is_session_shown = False
         self._send(self._session)
         # The view then has all samples from the first one; the session does not depend on it.
-        self._process_messages_until(lambda: self._is_session_shown, _SHOW_TIMEOUT_S, stop)
-        if self._failure:
-            return f"No live view: {self._failure} The session continues without it."
+        self._wait(lambda: self._is_session_shown, _SHOW_TIMEOUT_S, is_not_stopped)
+        if self.failure:
+            return f"No live view: {self.failure} The session continues without it."
         if self.address is None:
             return "The live view is still starting; open it with rigd live."
         return f"Live view: {self.address.viewer_url}"
-
-    def check(self) -> None:
-        """Restart the publisher if it has ended or hangs."""
-        if not self._failure:
-            self._process_message_for(0.0)
-        if not self._failure:
-            self._check_heartbeat()
-
-    def poll(self) -> list[LogEvent]:
-        """Restart the publisher if necessary, and return new events for the operator."""
-        self.check()
-        events, self._unreported = self._unreported, []
-        return events
 
     def show_touches(self, touches: Sequence[Mapping[str, Any]]) -> None:
         """Show estimated touches of the session, given as in JSON documents."""
@@ -104,93 +88,33 @@ class LiveView:
             end_positions = tuple(ring.written for ring in self._group.channels.rings)
             self._send(LiveEnd(end_positions, outcome, reason))
 
-    def _process_messages_until(
-        self, is_condition_met: Callable[[], bool], timeout_s: float, stop: StopRequest
-    ) -> None:
-        """Process messages until a condition is met, the publisher fails, or time has run out."""
-        deadline_s = time.monotonic() + timeout_s
-        while (
-            not (is_condition_met() or self._failure or stop.requested)
-            and time.monotonic() < deadline_s
-        ):
-            self._process_message_for(0.1)
-
-    def _start(self) -> None:
+    def _restart(self) -> None:
         """Start a publisher process, and send it the rig and the current session."""
-        self._has_address = False
-        self._failure = ""
-        self._heartbeat = Heartbeat()
-        try:
-            self._group.idle_process(LIVE)
-        except ChildError as error:
-            self._failure, self.address = str(error), None
-            return
-        self._send(self._job)
-        if self._session is not None:
-            self._send(self._session)
-
-    def _send(self, message: object) -> None:
-        """Send a message to the publisher, which is restarted if it has ended."""
-        if self._failure:
-            return
-        try:
-            self._group[LIVE].send(message)
-        except ChildError as error:
-            self._restart(str(error))
-
-    def _process_message_for(self, timeout_s: float) -> None:
-        """Process a message of the publisher, waiting up to `timeout_s` seconds for it."""
-        try:
-            message = self._group[LIVE].poll(timeout_s)
-        except ChildError as error:
-            self._restart(str(error))
-        else:
-            if message is not None:
-                self._process_message(message)
+        self._start(self._job, *([] if self._session is None else [self._session]))
 
     def _process_message(self, message: object) -> None:
-        """Process a message of the publisher: its address, its readiness, or its failure."""
+        """Process a message of the publisher: its address, or that it shows the session."""
         match message:
             case LiveShown():
                 self._is_session_shown = True
             case LiveAddress():
                 previous_address, self.address = self.address, message
-                self._has_address = True
                 if (
                     previous_address is not None
                     and previous_address.viewer_url != message.viewer_url
                 ):
                     self._add_event("info", f"Live view: {message.viewer_url}")
-            case _:
-                self._failure = message.reason if isinstance(message, Failed) else str(message)
-                self.address = None
-                if self._session is not None:
-                    self._add_event(
-                        "warning", f"No live view: {self._failure} The session continues."
-                    )
 
-    def _check_heartbeat(self) -> None:
-        """Restart the publisher if its last heartbeat is too long ago."""
-        assert LIVE.hung_after_s is not None
-        timeout_s = LIVE.hung_after_s if self._has_address else _START_TIMEOUT_S
-        heartbeat_count = self._group.channels.shared_state[StateField.LIVE_BEAT]
-        if self._heartbeat.stalled_for(heartbeat_count, time.monotonic()) > timeout_s:
-            self._restart(f"The live process was killed: no response for {timeout_s:g} s.")
+    def _process_failure(self, reason: str) -> None:
+        """Continue without the view; the next session is a new chance."""
+        self.failure, self.address = reason, None
+        if self._session is not None:
+            self._add_event("warning", f"No live view: {reason} The session continues.")
 
-    def _restart(self, reason: str) -> None:
-        """Replace the publisher by a new one, up to the maximum number of restarts."""
-        self._restarts += 1
-        if self._restarts > _MAX_RESTARTS:
-            self._failure, self.address = reason, None
-            self._add_event("warning", f"{reason} It is not restarted; the session continues.")
-            return
-        self._add_event("warning", f"{reason} It is restarted; the session continues.")
-        self._group[LIVE].kill()
-        self._start()
-
-    def _add_event(self, level: Level, message: str) -> None:
-        """Add an event for the operator."""
-        self._unreported.append(LogEvent(0, level, message))
+    def _give_up(self, reason: str) -> None:
+        """Continue without a view after the last restart, and add an event that states why."""
+        super()._give_up(reason)
+        self.address = None
 
 
 def subject_of(order: Order, *, fast: bool = False) -> Subject:

@@ -1,28 +1,26 @@
-"""Fits during a session: supervision of the fit process, and use of its estimates."""
+"""Fits during a session: client of the fit process, and use of its estimates."""
 
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.engine.messages import (
-    Failed,
     FileHeader,
     FitJob,
-    FitReady,
     FitReport,
     PlannedSegment,
     RecordEnded,
     SearchEnded,
 )
-from rigd.engine.processes import FIT, ChildError, Heartbeat
 from rigd.engine.shared_state import LogEvent, StateField, Stop
+from rigd.engine.workers import FIT
 from rigd.runner._precision_search import (
     TargetEstimate,
     estimates_text,
     target_estimates,
     targets_json,
 )
-from rigd.runner._process_group import await_ready
+from rigd.runner._session_worker import SessionWorker
 
 if TYPE_CHECKING:
     from rigd.engine.reference import ReferenceSpec
@@ -34,7 +32,6 @@ _FINAL_FIT_TIMEOUT_S: Final = 60.0
 """Maximum time in seconds for the fit of the whole record, while the torque is off."""
 _STOPPED_FIT_TIMEOUT_S: Final = 5.0
 """Maximum time in seconds for the fit of the whole record after the operator has stopped."""
-_POLL_S: Final = 0.05
 _STORED_KEYS: Final = (
     "tick", "duration_s", "whole", "problem", "doubt", "warnings", "findings", "type", "validity",
     "modes", "parameters",
@@ -42,14 +39,16 @@ _STORED_KEYS: Final = (
 """Keys of the last estimate that are stored in the session file."""
 
 
-class FitSupervisor:
-    """Supervisor of the fit process of one session, which collects the estimates.
+class FitSupervisor(SessionWorker):
+    """Client of the fit process of one session, which collects the estimates.
 
     If the session lasts until a precision is reached, it ends with its last planned segment after
     the process has reported the end of the search or has failed. `segments` contains the planned
     segments after that. `unmet_reason` states why the whole record does not have the requested
     precision, or why this is unknown. It is empty if the record has the precision.
     """
+
+    worker = FIT
 
     def __init__(
         self,
@@ -59,65 +58,26 @@ class FitSupervisor:
         search: "PrecisionSearch | None",
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
-        self._group = group
+        super().__init__(group)
         self._shared_state = group.channels.shared_state
         self._search = search
-        self._events: list[LogEvent] = []
         self._new_estimates: list[Mapping[str, Any]] = []
         self._planned_segments: list[Mapping[str, Any]] = []
         self._last_report: FitReport | None = None
         self._search_end: SearchEnded | None = None
-        self._is_ready = self._has_begun = False
-        self._failure = ""
+        self._has_begun = False
         self._skip_reason = ""
-        self._heartbeat = Heartbeat()
         self.segments: Mapping[str, tuple[int, int]] = {}
         self.unmet_reason = ""
         first_position = group.channels.samples.written
-        job = FitJob(group.channels.specs, first_position, profile, reference, search, realtime)
-        try:
-            group.idle_process(FIT).start(job)
-        except ChildError as error:
-            self._continue_without_process(str(error))
-
-    def await_ready(self, call_while_waiting: Callable[[], bool]) -> str:
-        """Wait until the fit process is ready; return why it is not, or an empty text.
-
-        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
-        """
-        delay_text = await_ready(
-            lambda: self._is_ready or bool(self._failure),
-            self._process_messages,
-            call_while_waiting,
+        self._start(
+            FitJob(group.channels.specs, first_position, profile, reference, search, realtime)
         )
-        if delay_text:
-            self._continue_without_process(f"The fit process was {delay_text}.")
-        return self._failure
 
     def begin(self, header: FileHeader) -> None:
         """Send the header of the session file to the fit process before the record begins."""
         self._has_begun = True
         self._send(header)
-
-    def poll(self) -> list[LogEvent]:
-        """Process the received messages, and return the new events for the operator."""
-        self._process_messages(0.0)
-        if self._is_ready and not self._failure:
-            self._check_heartbeat()
-        events, self._events = self._events, []
-        return events
-
-    def _check_heartbeat(self) -> None:
-        """Kill the fit process if its last heartbeat is too long ago."""
-        assert FIT.hung_after_s is not None
-        stalled_s = self._heartbeat.stalled_for(
-            self._shared_state[StateField.FIT_BEAT], time.monotonic()
-        )
-        if stalled_s > FIT.hung_after_s:
-            self._group[FIT].kill()
-            self._continue_without_process(
-                f"The fit process hung for {FIT.hung_after_s:g} s and was ended."
-            )
 
     def take_new_estimates(self) -> list[Mapping[str, Any]]:
         """Return the estimates that were received since the last call."""
@@ -130,20 +90,19 @@ class FitSupervisor:
         `ticks` is the length of the record. `call_while_waiting` is called repeatedly meanwhile.
         """
         self._send(RecordEnded(ticks))
-        began_s = time.monotonic()
-        while self._has_begun and not (
-            self._failure or (self._last_report is not None and self._last_report.final)
-        ):
-            self._process_messages(_POLL_S)
+        stopped_by_s = time.monotonic() + _STOPPED_FIT_TIMEOUT_S
+
+        def is_worth_waiting() -> bool:
             call_while_waiting()
-            if (
-                self._shared_state[StateField.STOP] != Stop.NO
-                and time.monotonic() > began_s + _STOPPED_FIT_TIMEOUT_S
-            ):
-                self._skip_reason = "A stop skipped the fit of the whole record."
-                break
-            if time.monotonic() > began_s + _FINAL_FIT_TIMEOUT_S:
-                self._continue_without_process("The fit of the whole record took too long.")
+            if self._shared_state[StateField.STOP] == Stop.NO or time.monotonic() <= stopped_by_s:
+                return True
+            self._skip_reason = "A stop skipped the fit of the whole record."
+            return False
+
+        if self._has_begun and not self._wait(
+            lambda: self._is_done, _FINAL_FIT_TIMEOUT_S, is_worth_waiting
+        ):
+            self._give_up("The fit of the whole record took too long.")
         last_estimate = {} if self._last_report is None else self._last_report.document
         fit_document = {key: last_estimate[key] for key in _STORED_KEYS if key in last_estimate}
         if self._search is not None:
@@ -164,7 +123,7 @@ class FitSupervisor:
     @property
     def _end_reason(self) -> str:
         """Sentence that states why the search ended; empty if the operator stopped the session."""
-        return self._search_end.reason if self._search_end is not None else self._failure
+        return self._search_end.reason if self._search_end is not None else self.failure
 
     @property
     def _success_sentence(self) -> str:
@@ -183,9 +142,7 @@ class FitSupervisor:
         was_reached_before = search_end is not None and search_end.reached
         unknown_reason = "" if report is None else str(report.document.get("problem") or "")
         if report is None or not report.final:
-            unknown_reason = (
-                self._failure or self._skip_reason or "The whole record was not fitted."
-            )
+            unknown_reason = self.failure or self._skip_reason or "The whole record was not fitted."
         elif not unknown_reason and not estimates:
             unknown_reason = "Its fit has no modes."
         if unknown_reason:
@@ -203,40 +160,24 @@ class FitSupervisor:
             return True, ""
         unmet_text = self._end_reason
         if was_reached_before:
-            unmet_text = self._failure or "Reached on the way, but not by the whole record."
+            unmet_text = self.failure or "Reached on the way, but not by the whole record."
         return False, f"{unmet_text} So far: {estimates_text(imprecise_estimates)}.".strip()
 
     @property
-    def failure(self) -> str:
+    def search_failure(self) -> str:
         """Sentence that states why the process failed during its search; empty if it did not."""
-        return self._failure if self._search is not None and self._search_end is None else ""
+        return self.failure if self._is_searching else ""
 
-    def _send(self, fit_message: object) -> None:
-        """Send a message to the fit process, unless it has failed."""
-        if self._failure:
-            return
-        try:
-            self._group[FIT].send(fit_message)
-        except ChildError as error:
-            self._continue_without_process(str(error))
-
-    def _process_messages(self, timeout_s: float) -> None:
-        """Process messages of the fit process, waiting up to `timeout_s` seconds for them."""
-        if self._failure:
-            return
-        try:
-            for message in self._group[FIT].messages(timeout_s):
-                self._process_message(message)
-        except ChildError as error:
-            self._continue_without_process(str(error))
+    @property
+    def _is_searching(self) -> bool:
+        """Whether the process may still append a segment to the reference."""
+        return self._search is not None and self._search_end is None
 
     def _process_message(self, message: object) -> None:
         """Process one message of the fit process."""
         match message:
-            case FitReady():
-                self._is_ready = True
-            case FitReport(document):
-                self._last_report = message
+            case FitReport(document, is_final):
+                self._last_report, self._is_done = message, is_final
                 self._new_estimates.append(document)
                 self._events += [
                     LogEvent(0, "info", text_line, notable=True) for text_line in document["text"]
@@ -248,14 +189,16 @@ class FitSupervisor:
                 self._search_end, self.segments = message, segments
                 self._shared_state[StateField.LAST_SEGMENT] = 1
                 self._events.append(LogEvent(0, "info", reason, notable=True))
-            case Failed(reason):
-                self._continue_without_process(reason)
 
-    def _continue_without_process(self, reason: str) -> None:
+    def _give_up(self, reason: str) -> None:
         """Continue the session without the fit process, or end it with the last planned segment."""
-        self._failure = reason
-        consequence = "The session continues without fits."
-        if self._search is not None and self._search_end is None:
+        super()._give_up(reason)
+        if self._is_searching:
             self._shared_state[StateField.LAST_SEGMENT] = 1
-            consequence = "The session ends with what is planned."
-        self._events.append(LogEvent(0, "warning", f"{reason} {consequence}"))
+
+    @property
+    def _consequence(self) -> str:
+        """Sentence that states what follows the loss of the fit process."""
+        if self._is_searching:
+            return "The session ends with what is planned."
+        return super()._consequence

@@ -87,7 +87,7 @@ class TargetEstimate:
 def target_estimates(
     document: Mapping[str, Any], targets: Sequence[Target]
 ) -> list[TargetEstimate]:
-    """Return the estimates of all requested quantities from a document of the fit program.
+    """Return the estimates of all requested quantities from a document of the estimator.
 
     docs/online_fit.md describes the document. A modal target without a mode number applies to each
     mode in the excited frequency band.
@@ -143,7 +143,7 @@ def _estimate_of_entry(target: Target, entry: Mapping[str, Any] | None) -> Targe
 def beam_estimate(
     document: Mapping[str, Any], targets: Sequence[Target], uniformity: float
 ) -> BeamEstimate:
-    """Return the beam estimate, for the design of excitation, from the fit program's document.
+    """Return the beam estimate, for the design of excitation, from the estimator's document.
 
     `uniformity` is the relative standard deviation of each mode's frequency from the frequency of a
     uniform beam. If all targets are modal, the parameters are those of the modal model.

@@ -7,41 +7,19 @@ while the supervisor reads the profile and plans the session.
 import contextlib
 import os
 import time
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
 from rigd.engine import shared_memory_fd
-from rigd.engine.processes import CONTROL, LIVE, PROCESSES, RECORDER, Child, ChildError, Process
+from rigd.engine.processes import Child, ChildError, Heartbeat
+from rigd.engine.workers import CONTROL, LIVE, PROCESSES, RECORDER, Worker
 
 if TYPE_CHECKING:
     from rigd.engine.channels import Channels
 
 _SHARED_MEMORY_FILES = 6
 """Number of shared memory files."""
-_READY_TIMEOUT_S = 20.0
-"""Maximum time in seconds for a process to become ready on a busy computer, before any motion."""
-_POLL_S = 0.05
-"""Time in seconds to wait for a message at once."""
-
-
-def await_ready(
-    is_settled: Callable[[], bool],
-    process_messages_for: Callable[[float], None],
-    call_while_waiting: Callable[[], bool],
-) -> str:
-    """Wait until a process is ready or has failed; return text if it takes too long, else "".
-
-    `is_settled` returns whether the process is ready or has failed. `process_messages_for`
-    processes its messages for a time in seconds. `call_while_waiting` is called repeatedly, and the
-    wait ends early if it returns False.
-    """
-    deadline_s = time.monotonic() + _READY_TIMEOUT_S
-    while not is_settled() and call_while_waiting():
-        process_messages_for(_POLL_S)
-        if not is_settled() and time.monotonic() > deadline_s:
-            return f"not ready within {_READY_TIMEOUT_S:g} s"
-    return ""
 
 
 class ProcessGroup:
@@ -71,14 +49,15 @@ class ProcessGroup:
         Processor cores for processes that are started later, or empty for those of this process.
     """
 
-    def __init__(self, *, live: bool, extra_processes: Collection[Process] = ()) -> None:
+    def __init__(self, *, live: bool, extra_processes: Collection[Worker] = ()) -> None:
         self.live = live
         self._also = frozenset(extra_processes)
         self.cores: frozenset[int] = frozenset()
         self._fds: list[int] = []
         self._channels: Channels | None = None
-        self._processes_with_job: set[Process] = set()
-        self._children: dict[Process, Child] = {}
+        self._processes_with_job: set[Worker] = set()
+        self._children: dict[Worker, Child] = {}
+        self._heartbeats: dict[Worker, Heartbeat] = {}
         try:
             while len(self._fds) < _SHARED_MEMORY_FILES:
                 self._fds.append(shared_memory_fd())
@@ -89,10 +68,10 @@ class ProcessGroup:
             self.end()
             raise
 
-    def __getitem__(self, process: Process) -> Child:
+    def __getitem__(self, process: Worker) -> Child:
         return self._children[process]
 
-    def __contains__(self, process: Process) -> bool:
+    def __contains__(self, process: Worker) -> bool:
         return process in self._children
 
     @property
@@ -105,7 +84,7 @@ class ProcessGroup:
         """Recorder process, which writes the session file."""
         return self._children[RECORDER]
 
-    def idle_process(self, process: Process) -> Child:
+    def idle_process(self, process: Worker) -> Child:
         """Return a started process without a job; replace it if it already received one.
 
         Raises
@@ -115,12 +94,19 @@ class ProcessGroup:
         """
         if process in self._processes_with_job or process not in self._children:
             if process in self._children:  # the previous one may not have been started
-                self._children.pop(process).stop(process.grace_s)
+                self._children.pop(process).stop()
             self._start(process)
         self._processes_with_job.add(process)
+        self._heartbeats[process] = Heartbeat()
         return self._children[process]
 
-    def has_job(self, process: Process) -> bool:
+    def stalled_s(self, process: Worker) -> float:
+        """Return the time in s since the last heartbeat of a process; call this repeatedly."""
+        assert process.beat is not None
+        beat_count = self.channels.shared_state[process.beat]
+        return self._heartbeats[process].stalled_for(beat_count, time.monotonic())
+
+    def has_job(self, process: Worker) -> bool:
         """Return whether a process has already received a job."""
         return process in self._processes_with_job
 
@@ -162,9 +148,9 @@ class ProcessGroup:
         buffered_s = VIRTUAL_BUFFERED_S if is_faster_than_observers else RECORDER_BUFFER_S
         self._channels = create_channels(rate_hz, self._fds, buffered_s)
 
-    def _start(self, process: Process) -> None:
+    def _start(self, process: Worker) -> None:
         """Start a process, which waits for its job."""
-        self._children[process] = Child(process.name, process.module, self._fds, self.cores)
+        self._children[process] = Child(process, descriptors=self._fds, cores=self.cores)
         self._processes_with_job.discard(process)
 
     def __enter__(self) -> Self:
@@ -185,7 +171,7 @@ class ProcessGroup:
         with contextlib.ExitStack() as ending_children:  # continues after an error of one process
             for process in reversed(PROCESSES):
                 if process in self._children:
-                    ending_children.callback(self._children.pop(process).stop, process.grace_s)
+                    ending_children.callback(self._children.pop(process).stop)
         if self._channels is not None:
             self._channels.close()
             self._channels = None

@@ -11,9 +11,10 @@ from typing import Any
 from rigd.devices import ActuationTarget, describe_unknown_values
 from rigd.devices.contracts import DeviceError
 from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
-from rigd.engine.processes import CONTROL, LIVE, ChildError, Heartbeat
+from rigd.engine.processes import ChildError
 from rigd.engine.realtime import Precedence
 from rigd.engine.shared_state import SharedState, StateField, Stop
+from rigd.engine.workers import CONTROL, LIVE
 from rigd.errors import FailureError
 from rigd.profile import Profile
 from rigd.runner._live_view import LiveView
@@ -87,7 +88,6 @@ class Rig:
         self._connection: Connected | None = None
         self._view: LiveView | None = None
         self._is_zero_set = False
-        self._heartbeat = Heartbeat()
         self._precedence: Precedence | None = None
         self._status_lock = threading.Lock()
         self._status_reader = StatusReader(profile.rig.rate_hz)
@@ -331,7 +331,7 @@ class Rig:
 
         A hung control process is killed.
         """
-        shared_state, heartbeat = group.channels.shared_state, Heartbeat()
+        shared_state = group.channels.shared_state
         assert CONTROL.hung_after_s is not None
         hung_after_s = (
             _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
@@ -347,8 +347,7 @@ class Rig:
             if probe_reply is not None:
                 return probe_reply
             now_s = time.monotonic()
-            stalled_s = heartbeat.stalled_for(shared_state[StateField.CONTROL_BEAT], now_s)
-            if stalled_s > hung_after_s or now_s > deadline_s:
+            if group.stalled_s(CONTROL) > hung_after_s or now_s > deadline_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -374,9 +373,7 @@ class Rig:
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
-        stalled_s = self._heartbeat.stalled_for(
-            shared_state[StateField.CONTROL_BEAT], time.monotonic()
-        )
+        stalled_s = group.stalled_s(CONTROL)
         if control_message is None and stalled_s > CONTROL.hung_after_s:
             group.control.kill()
             control_message = Ended(

@@ -1,10 +1,9 @@
-"""Search for an obstacle: settings of the touch detector, and supervision of the touch process.
+"""Search for an obstacle: settings of the touch detector, and client of the touch process.
 
 The control loop detects a touch and reacts to it. Meanwhile the touch process estimates position
 and force. A session continues without the touch process if that fails.
 """
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import sqrt
@@ -13,12 +12,12 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rigd.devices.parameters import RigParameters
-from rigd.engine.messages import TouchJob, TouchOrder, TouchReady, TouchReport
-from rigd.engine.processes import TOUCH, ChildError
+from rigd.engine.messages import TouchJob, TouchOrder, TouchReport
 from rigd.engine.shared_state import LogEvent
+from rigd.engine.workers import TOUCH
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.runner._process_group import await_ready
+from rigd.runner._session_worker import SessionWorker
 from rigd.session.touches import packed_touches, touch_line
 
 if TYPE_CHECKING:
@@ -30,7 +29,6 @@ _ROUNDING_STD_PER_STEP: Final = 1 / sqrt(12)
 """Standard deviation of the rounding error, as a fraction of the quantisation step."""
 _FINAL_ESTIMATES_TIMEOUT_S: Final = 30.0
 """Maximum time in seconds for the last estimates after the end of a record."""
-_POLL_S: Final = 0.05
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +102,10 @@ def _reading_noise(profile: Profile) -> "ChannelNoise":
     )
 
 
-class TouchEstimates:
-    """Supervisor of the touch process of one session, which collects the estimates."""
+class TouchEstimates(SessionWorker):
+    """Client of the touch process of one session, which collects the estimates."""
+
+    worker = TOUCH
 
     def __init__(
         self,
@@ -114,49 +114,20 @@ class TouchEstimates:
         rate_hz: float,
         realtime: "RealtimeSettings | None" = None,
     ) -> None:
-        self._group = group
+        super().__init__(group)
         self._rate_hz = rate_hz
-        self._events: list[LogEvent] = []
         self._new_estimates: list[dict[str, Any]] = []
-        self._failure = ""
-        self._is_ready = False
         self._reports: dict[int, TouchReport] = {}
-        job = TouchJob(
-            group.channels.specs,
-            group.channels.samples.written,
-            rate_hz,
-            search.model,
-            search.order.shear_projection,
-            realtime,
+        self._start(
+            TouchJob(
+                group.channels.specs,
+                group.channels.samples.written,
+                rate_hz,
+                search.model,
+                search.order.shear_projection,
+                realtime,
+            )
         )
-        try:
-            group.idle_process(TOUCH).start(job)
-        except ChildError as error:
-            self._continue_without_process(str(error))
-
-    def await_ready(self, call_while_waiting: Callable[[], bool]) -> None:
-        """Wait until the touch process is ready or has failed.
-
-        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
-        """
-        delay_text = await_ready(
-            lambda: self._is_ready or bool(self._failure),
-            self._process_messages,
-            call_while_waiting,
-        )
-        if delay_text:
-            self._continue_without_process(f"The touch process was {delay_text}.")
-
-    def process_messages(self, timeout_s: float) -> bool:
-        """Wait for messages of the touch process; return whether it is still running."""
-        self._process_messages(timeout_s)
-        return not self._failure
-
-    def poll(self) -> list[LogEvent]:
-        """Process the received messages, and return the new events for the operator."""
-        self._process_messages(0.0)
-        events, self._events = self._events, []
-        return events
 
     def finish(
         self, touch_count: int, call_while_waiting: Callable[[], None]
@@ -166,21 +137,12 @@ class TouchEstimates:
         `touch_count` is the number of detected touches. A touch without an estimate has its number
         only. ``final_reports`` is false if there is only the first, less accurate estimate.
         """
-        deadline_s = time.monotonic() + _FINAL_ESTIMATES_TIMEOUT_S
 
-        def is_estimate_missing() -> bool:
-            final_reports = [
-                touch_report for touch_report in self._reports.values() if touch_report.final
-            ]
-            return (
-                len(final_reports) < touch_count
-                and not self._failure
-                and time.monotonic() < deadline_s
-            )
+        def are_final() -> bool:
+            final_count = sum(touch_report.final for touch_report in self._reports.values())
+            return final_count >= touch_count
 
-        while is_estimate_missing():
-            self._process_messages(_POLL_S)
-            call_while_waiting()
+        self._wait(are_final, _FINAL_ESTIMATES_TIMEOUT_S, call_while_waiting)
         return [
             _touch_document(touch_number, self._reports.get(touch_number))
             for touch_number in range(1, touch_count + 1)
@@ -199,31 +161,13 @@ class TouchEstimates:
         estimates, self._new_estimates = self._new_estimates, []
         return estimates
 
-    def _process_messages(self, timeout_s: float) -> None:
-        """Process messages of the touch process, waiting up to `timeout_s` seconds for them."""
-        if self._failure:
-            return
-        try:
-            for message in self._group[TOUCH].messages(timeout_s):
-                if isinstance(message, TouchReady):
-                    self._is_ready = True
-                elif isinstance(message, TouchReport):
-                    self._reports[message.number] = message
-                    self._add_estimate(message)
-        except ChildError as error:
-            self._continue_without_process(str(error))
-
-    def _add_estimate(self, report: TouchReport) -> None:
-        """Add an estimate to those for the live view and to the events for the operator."""
-        touch_document = _touch_document(report.number, report)
-        self._new_estimates.append(touch_document)
-        self._events.append(LogEvent(0, "info", touch_line(touch_document), notable=True))
-
-    def _continue_without_process(self, reason: str) -> None:
-        """Continue the session without the touch process, and add an event that states why."""
-        self._failure = reason
-        event_text = f"{reason} Touches are detected but not estimated; the session continues."
-        self._events.append(LogEvent(0, "warning", event_text))
+    def _process_message(self, message: object) -> None:
+        """Process one message of the touch process: add an estimate, for the view and as event."""
+        if isinstance(message, TouchReport):
+            self._reports[message.number] = message
+            touch_document = _touch_document(message.number, message)
+            self._new_estimates.append(touch_document)
+            self._events.append(LogEvent(0, "info", touch_line(touch_document), notable=True))
 
 
 def _touch_document(number: int, report: TouchReport | None) -> dict[str, Any]:

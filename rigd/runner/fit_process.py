@@ -1,19 +1,24 @@
 """The fit process, which fits the record of a running session and plans the next excitation.
 
 The process reads the ring buffer of samples like the live publisher, so that it neither delays the
-control loop nor takes samples from the recorder. It passes the samples to the analyser's fit
-program (``python -m analysis.online``), and the program's estimates to the supervisor. If the
+control loop nor takes samples from the recorder. The analyser's `OnlineEstimator` makes the
+estimates in a thread, so that samples are read meanwhile, and the supervisor receives them. If the
 session lasts until a precision is reached, each estimate is also used to plan the next segment of
 the reference (`ExcitationPlanner`).
 """
 
-import contextlib
 import json
 import os
+import pkgutil
 import queue
-import subprocess
 import threading
-from typing import Any, BinaryIO, Final, Self, cast
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Final, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
 
 from rigd.engine import Observer
 from rigd.engine.channels import Channels, attach_channels
@@ -22,34 +27,61 @@ from rigd.engine.processes import Parent
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.reference import ReferenceWriter
 from rigd.engine.shared_state import StateField
+from rigd.engine.workers import ONLINE_ESTIMATOR
 from rigd.runner._precision_search import ExcitationPlanner
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED
 from rigd.runtime import ignore as ignore_signals
-from rigd.session.layout import SAMPLE_SIZE, decode_samples
-from rigd.session.online_fit import (
-    EstimateRequest,
-    StreamStart,
-    estimate_lines,
-    write_request,
-    write_samples,
-    write_start,
-)
+from rigd.session.layout import decode_samples
+from rigd.session.online_fit import estimate_lines
 
-_FIT_MODULE: Final = "analysis.online"
 _MAX_BLOCK_SAMPLES: Final = 500
-"""Maximum number of samples that are passed to the fit program at once."""
+"""Maximum number of samples that are read from the ring at once."""
 _IDLE_WAIT_S: Final = 0.005
 """Time in seconds to wait for a message if there are no new samples."""
 _FIT_INTERVAL_S: Final = 1.0
 """Time in seconds between two fits of a session whose excitation is planned before its start."""
-_END_TIMEOUT_S: Final = 1.0
-"""Time in seconds that the fit program has to end before it is killed."""
+_PERIODIC_NICENESS: Final = 19
+"""Niceness of estimates that nobody waits for. In the class SCHED_IDLE, a computer that is busy
+with other programs would stop the whole process for want of the interpreter's lock."""
+_TICK_BEYOND_ALL: Final = 1 << 32
+"""Tick beyond all ticks of a session, for an estimate from all samples."""
 _FIRST_REQUEST_ID: Final = 1_000_000_000
 """First identification number of requested estimates; those of periodic estimates start at 0."""
 
 
-class FitProgramError(Exception):
-    """Raised if the fit program ended unexpectedly; the message states how it ended."""
+class EstimationError(Exception):
+    """Raised if the analyser's estimator has failed; the message states the reason."""
+
+
+@dataclass(frozen=True, slots=True)
+class EstimateRequest:
+    """Request to estimate the beam's parameters from the samples read so far."""
+
+    id: int
+    """Identification number, which the estimate repeats."""
+    tick: int
+    """First tick whose sample is not used for the estimate."""
+    whole: bool
+    """Whether all damping structures are fitted, as by `analyze`, or only the one with the most
+    parameters."""
+    from_last: bool = False
+    """Whether the fit may start from the previous estimate, which takes a third of the time."""
+
+
+class _OnlineEstimate(Protocol):
+    """Estimate of the analyser from the samples of a running session."""
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the estimate as a JSON document (docs/online_fit.md)."""
+
+
+class _OnlineEstimator(Protocol):
+    """The analyser's estimator of a running session."""
+
+    def feed(self, new_samples: NDArray[np.void]) -> None:
+        """Append the next samples of the session."""
+
+    def estimate(self, up_to_tick: int | None, *, whole: bool, from_last: bool) -> _OnlineEstimate:
+        """Return the estimate from the samples before a tick."""
 
 
 def main() -> None:
@@ -59,93 +91,119 @@ def main() -> None:
     job: FitJob = parent.receive_job()
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)
+    exit_code = 0
     try:
-        with FitProgram() as program:
-            session_fit = _SessionFit(job, parent, program, attach_channels(job.channels))
-            try:
-                session_fit.run()
-            except BrokenPipeError:
-                raise program.end_error() from None
-    except FitProgramError as error:
+        _SessionFit(job, parent, attach_channels(job.channels)).run()
+    except EstimationError as error:
         parent.send(Failed(str(error)))
-        raise SystemExit(1) from None
+        exit_code = 1
+    # Without the interpreter's clean-up, which would wait for a running fit.
+    os._exit(exit_code)
 
 
-class FitProgram:
-    """The analyser's fit program, run in a child process that ends with the context."""
+class EstimatorThread:
+    """Thread that fits the samples of a session, on request or at intervals.
+
+    Samples may be passed before the session is known.
+    """
 
     def __init__(self) -> None:
-        try:
-            self._process = subprocess.Popen(
-                [*OWN_PYTHON, "-m", _FIT_MODULE, "--parent", str(os.getpid())],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                env=os.environ | SINGLE_THREADED,
-            )
-        except OSError as error:
-            raise FitProgramError(
-                f"The fit program cannot be started ({error.strerror})."
-            ) from None
-        self.input = cast("BinaryIO", self._process.stdin)
-        """Standard input of the program, in the format of `rigd.session.online_fit`."""
-        self._estimates: queue.SimpleQueue[dict[str, Any] | None] = queue.SimpleQueue()
-        threading.Thread(target=self._read_estimates, daemon=True).start()
+        self._inputs: queue.SimpleQueue[NDArray[np.void] | EstimateRequest] = queue.SimpleQueue()
+        self._results: queue.SimpleQueue[dict[str, Any] | Exception] = queue.SimpleQueue()
+
+    def begin(
+        self,
+        metadata: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]],
+        interval_s: float | None,
+    ) -> None:
+        """Start the thread for a session.
+
+        Parameters
+        ----------
+        metadata
+            Metadata of the session.
+        segments
+            First tick and end of the planned segments, by name.
+        interval_s
+            Time between two estimates without a request, or None for requested estimates only.
+        """
+        threading.Thread(
+            target=self._run, args=(metadata, segments, interval_s), daemon=True
+        ).start()
+
+    def feed(self, new_samples: NDArray[np.void]) -> None:
+        """Pass the next samples of the session to the estimator."""
+        self._inputs.put(new_samples)
+
+    def request(self, request: EstimateRequest) -> None:
+        """Request an estimate from the samples that were passed so far."""
+        self._inputs.put(request)
 
     def next_estimate(self) -> dict[str, Any] | None:
-        """Return the program's next estimate, or None if there is no new one.
+        """Return the next estimate as a JSON document, or None if there is no new one.
 
         Raises
         ------
-        FitProgramError
-            If the program has ended.
+        EstimationError
+            If the estimator has failed.
         """
         try:
-            estimate = self._estimates.get_nowait()
+            result = self._results.get_nowait()
         except queue.Empty:
             return None
-        if estimate is None:
-            raise self.end_error()
-        return estimate
+        if isinstance(result, Exception):
+            raise EstimationError(f"The fit has failed ({result!r}).") from result
+        return result
 
-    def end_error(self) -> FitProgramError:
-        """Return the error that states how the program ended, after waiting for its end."""
-        exit_code = self._process.wait()
-        end_text = (
-            f"was killed by signal {-exit_code}"
-            if exit_code < 0
-            else f"ended with exit code {exit_code}"
-        )
-        return FitProgramError(f"The fit program {end_text}.")
-
-    def _read_estimates(self) -> None:
-        """Read the program's estimates into a queue until it ends; run in a thread."""
-        assert self._process.stdout is not None
-        with contextlib.suppress(ValueError):  # incomplete line: the program ended while writing
-            for output_line in self._process.stdout:
-                self._estimates.put(json.loads(output_line))
-        self._estimates.put(None)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        with contextlib.suppress(OSError):
-            self.input.close()
+    def _run(
+        self,
+        metadata: Mapping[str, str],
+        segments: Mapping[str, tuple[int, int]],
+        interval_s: float | None,
+    ) -> None:
+        """Make estimates until the process ends; an error is passed on in place of an estimate."""
         try:
-            self._process.wait(_END_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()
-            self._process.wait()
+            if interval_s is not None:
+                os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _PERIODIC_NICENESS)
+            estimator: _OnlineEstimator = pkgutil.resolve_name(ONLINE_ESTIMATOR)(metadata, segments)
+            due_s = None if interval_s is None else time.monotonic() + interval_s
+            periodic_count = 0
+            while True:
+                try:
+                    next_input = self._inputs.get(
+                        timeout=None if due_s is None else max(due_s - time.monotonic(), 0)
+                    )
+                except queue.Empty:
+                    # All samples read so far are in the estimate.
+                    assert interval_s is not None
+                    due_s = time.monotonic() + interval_s
+                    next_input = EstimateRequest(periodic_count, _TICK_BEYOND_ALL, whole=False)
+                    periodic_count += 1
+                if isinstance(next_input, EstimateRequest):
+                    self._results.put(_estimate_document(estimator, next_input))
+                else:
+                    estimator.feed(next_input)
+        except Exception as error:  # whatever fails in the analyser ends the fits only
+            self._results.put(error)
+
+
+def _estimate_document(estimator: _OnlineEstimator, request: EstimateRequest) -> dict[str, Any]:
+    """Return the requested estimate as a JSON document that needs no library of the analyser."""
+    online_estimate = estimator.estimate(
+        request.tick, whole=request.whole, from_last=request.from_last
+    )
+    document = {"id": request.id, **online_estimate.as_json()}
+    plain_document: dict[str, Any] = json.loads(json.dumps(document, allow_nan=False))
+    return plain_document
 
 
 class _SessionFit:
-    """Passes the samples of one session to the fit program, and its estimates to the supervisor."""
+    """Passes the samples of one session to the estimator, and its estimates to the supervisor."""
 
-    def __init__(
-        self, job: FitJob, parent: Parent, program: FitProgram, channels: Channels
-    ) -> None:
+    def __init__(self, job: FitJob, parent: Parent, channels: Channels) -> None:
         self._parent = parent
-        self._program = program
+        self._estimator = EstimatorThread()
         self._shared_state = channels.shared_state
         self._reader = Observer(channels.samples, job.first)
         self._job = job
@@ -162,7 +220,7 @@ class _SessionFit:
         while True:
             self._shared_state.beat(StateField.FIT_BEAT)
             has_passed_samples = self._pass_samples()
-            estimate = self._program.next_estimate()
+            estimate = self._estimator.next_estimate()
             if estimate is not None and self._process_estimate(estimate):
                 return
             self._request_if_possible(is_drained=not has_passed_samples)
@@ -185,7 +243,7 @@ class _SessionFit:
                         )
 
     def _start_fits(self, header: FileHeader) -> None:
-        """Send the header of the session file to the fit program, and prepare the planning."""
+        """Start the estimates of a session with this header of its file, and the planning."""
         job = self._job
         if job.search is not None:
             reference_writer = ReferenceWriter(job.reference, self._shared_state)
@@ -194,20 +252,20 @@ class _SessionFit:
                 job.search, job.profile, reference_writer, start_rad=start_rad
             )
         fit_interval_s = _FIT_INTERVAL_S if job.search is None else None
-        stream_start = StreamStart(dict(header.metadata), dict(header.segments), fit_interval_s)
-        write_start(self._program.input, stream_start)
+        self._estimator.begin(header.metadata, header.segments, fit_interval_s)
 
     def _pass_samples(self) -> bool:
-        """Pass new samples to the fit program; return whether there were any."""
+        """Pass new samples to the estimator; return whether there were any."""
         sample_bytes = self._reader.take(_MAX_BLOCK_SAMPLES)
         if not sample_bytes:
             return False
-        write_samples(self._program.input, sample_bytes)
-        self._passed_ticks = int(decode_samples(sample_bytes[-SAMPLE_SIZE:])["tick"][0]) + 1
+        new_samples = decode_samples(sample_bytes)
+        self._estimator.feed(new_samples)
+        self._passed_ticks = int(new_samples["tick"][-1]) + 1
         return True
 
     def _request_if_possible(self, *, is_drained: bool) -> None:
-        """Request the next estimate if the samples for it have been passed to the fit program.
+        """Request the next estimate if the samples for it have been passed to the estimator.
 
         `is_drained` states that all samples in the ring buffer have been passed.
         """
@@ -236,7 +294,7 @@ class _SessionFit:
         self._pending = EstimateRequest(
             _FIRST_REQUEST_ID + self._request_count, tick, whole, from_last
         )
-        write_request(self._program.input, self._pending)
+        self._estimator.request(self._pending)
 
     def _process_estimate(self, estimate: dict[str, Any]) -> bool:
         """Report an estimate or plan the next segment with it.

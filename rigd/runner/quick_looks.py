@@ -1,14 +1,12 @@
 """Quick looks, the short reports that a separate program makes of each session after its end.
 
-The program is ``python -m analysis.quick_look``, run at low priority. One program runs at a time.
-It is suspended during a session. It is killed if it takes too long, where time in which it waits
-for a processor does not count. It ends with the process that started it.
+One program runs at a time. It is suspended during a session. It is killed if it takes too long,
+where time in which it waits for a processor does not count. It ends with the process that started
+it.
 """
 
 import contextlib
-import os
 import signal
-import subprocess
 import threading
 import time
 from collections import deque
@@ -17,16 +15,15 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
+from rigd.engine.processes import Child, ChildError
+from rigd.engine.workers import QUICK_LOOK
 from rigd.printable import printable
 from rigd.runner.session import RunResult
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, processor_use
+from rigd.runtime import processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
-_QUICK_LOOK_MODULE: Final = "analysis.quick_look"
 _MAX_RUN_TIME_S: Final = 60.0
 """Maximum run time of a quick look in seconds, without suspensions and waits for a processor."""
-_KILL_TIMEOUT_S: Final = 0.5
-"""Maximum time in seconds to wait for a killed quick look at the end of this process."""
 _MAX_WAITING: Final = 3
 """Maximum number of waiting quick looks; beyond it the oldest waiting quick look is skipped."""
 _MAX_ERROR_CHARACTERS: Final = 500
@@ -101,7 +98,7 @@ class QuickLooks:
         self._on_result = on_result
         self._lock = threading.Lock()
         self._waiting_sessions: deque[Path] = deque()
-        self._process: subprocess.Popen[str] | None = None
+        self._process: Child | None = None
         self._session = Path()
         self._is_suspended = False
         self._run_time_s = 0.0
@@ -138,14 +135,16 @@ class QuickLooks:
         """Suspend the process of the running quick look within the context, during a session."""
         with self._lock:
             self._is_suspended = True
-            self._send_signal(signal.SIGSTOP)
+            if self._process is not None:
+                self._process.suspend()
         try:
             yield
         finally:
             with self._lock:
                 self._is_suspended = False
                 self._run_time_updated_s = time.monotonic()
-                self._send_signal(signal.SIGCONT)
+                if self._process is not None:
+                    self._process.resume()
 
     def close(self) -> None:
         """Kill the running quick look and cancel the waiting quick looks."""
@@ -153,9 +152,7 @@ class QuickLooks:
             self._is_suspended = True
             self._waiting_sessions.clear()
             if self._process is not None:
-                self._process.kill()
-                with contextlib.suppress(subprocess.TimeoutExpired):
-                    self._process.communicate(timeout=_KILL_TIMEOUT_S)
+                self._process.stop()
                 self._process = None
 
     def _ended_quick_look(self) -> Iterator[QuickLook]:
@@ -164,21 +161,20 @@ class QuickLooks:
             return
         self._update_run_time(self._process.pid)
         is_too_slow = self._run_time_s >= _MAX_RUN_TIME_S
-        if self._process.poll() is None:
+        if (exit_code := self._process.exit_code) is None:
             if is_too_slow:
                 # Its end is not awaited, because it may end late at low priority.
                 self._process.kill()
             return
-        error_output = self._process.communicate()[1]
-        exit_code, self._process = self._process.returncode, None
+        error_output = self._process.error_text()
+        self._process.stop()
+        self._process = None
         if is_too_slow and exit_code == -signal.SIGKILL:
             yield QuickLook.failed(self._session, f"it took longer than {_MAX_RUN_TIME_S:g} s.")
         elif exit_code != 0:
-            error_text = (
-                error_output.strip()
-                .rpartition("\n")[2]
-                .removeprefix("Error: ")[:_MAX_ERROR_CHARACTERS]
-            )
+            error_text = error_output.rpartition("\n")[2].removeprefix("Error: ")[
+                :_MAX_ERROR_CHARACTERS
+            ]
             yield QuickLook.failed(
                 self._session, error_text or f"its program ended with exit code {exit_code}."
             )
@@ -207,22 +203,10 @@ class QuickLooks:
         self._session = self._waiting_sessions.popleft()
         self._run_time_s, self._processor_s, self._run_time_updated_s = 0.0, 0.0, time.monotonic()
         try:
-            self._process = subprocess.Popen(
-                [
-                    *(*OWN_PYTHON, "-m", _QUICK_LOOK_MODULE),
-                    *(str(self._session), "--parent", str(os.getpid())),
-                ],
-                stdin=subprocess.DEVNULL,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                text=True,
-                errors="replace",
-                env=os.environ | SINGLE_THREADED,
-                start_new_session=True,  # so that Ctrl-C does not reach it
-            )
-        except OSError as error:
+            self._process = Child(QUICK_LOOK, str(self._session))
+        except ChildError as error:
             yield QuickLook.failed(
-                self._session, f"its program cannot be started ({error.strerror})."
+                self._session, f"its program cannot be started ({error.system_reason})."
             )
 
     def _read_result(self) -> QuickLook:
@@ -232,8 +216,3 @@ class QuickLooks:
         if report_content is None:
             return QuickLook.failed(self._session, f"{report_path} cannot be read.")
         return QuickLook(self._session, report_path, report_content, "")
-
-    def _send_signal(self, signal_number: signal.Signals) -> None:
-        """Send a signal to the running quick look, if there is one."""
-        if self._process is not None:
-            self._process.send_signal(signal_number)

@@ -27,10 +27,11 @@ from rigd.engine.messages import (
     RecorderJob,
     SessionJob,
 )
-from rigd.engine.processes import CONTROL, RECORDER, ChildError, Heartbeat
+from rigd.engine.processes import ChildError
 from rigd.engine.realtime import REFUSED
 from rigd.engine.reference import is_whole, write_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, Stop, read_events
+from rigd.engine.workers import CONTROL, RECORDER
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
 from rigd.runner._online_fit import FitSupervisor
@@ -245,7 +246,6 @@ class SessionRun:
         self._watcher = watcher
         self._can_receive_stop = can_receive_stop
         self._is_virtual_clock = connection.realtime["clock"] == "virtual"
-        self._control_heartbeat = Heartbeat()
         self._recorder_failure: str | None = None
         self._is_control_busy = False
         # The drive is off until it is enabled; afterwards only the control process can confirm it.
@@ -420,9 +420,7 @@ class SessionRun:
                 return self._kill_control(f"did not stop within {timeout_s:g} s")
             assert CONTROL.hung_after_s is not None
             hung_after_s = CONTROL.hung_after_s if is_torque_on else _DRIVE_TIMEOUT_S
-            stalled_s = self._control_heartbeat.stalled_for(
-                self._shared_state[StateField.CONTROL_BEAT], now_s
-            )
+            stalled_s = self._group.stalled_s(CONTROL)
             if control_message is None and stalled_s > hung_after_s:
                 return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
             if control_message is not None:
@@ -585,10 +583,10 @@ class SessionRun:
             outcome_record["fit"] = json.dumps(fit)
             if finished.outcome == "complete" and not finished.reason:
                 outcome_record["reason"] = self._fit.unmet_reason
-            elif self._fit.failure:
+            elif self._fit.search_failure:
                 # This failure ends the session, even if a stop was requested before.
-                outcome_record["reason"] = f"{self._fit.failure} {finished.reason}"
-        self._group.recorder.wake()
+                outcome_record["reason"] = f"{self._fit.search_failure} {finished.reason}"
+        self._group.recorder.resume()
         packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
         self._group.recorder.send(Close(outcome_record, packed_touches, segment_ticks))
         # A disk may stall for as long at the end of a record as during the record.
@@ -612,7 +610,7 @@ class SessionRun:
             stale_wrenches=tick_counts["stale_wrenches"],
             fault=finished.fault
             or outcome_text == "fault"
-            or (self._fit is not None and bool(self._fit.failure)),
+            or (self._fit is not None and bool(self._fit.search_failure)),
             live_dropped=self._shared_state[StateField.LIVE_DROPPED],
             touches=None if touch_documents is None else tuple(touch_documents),
             fit=fit,

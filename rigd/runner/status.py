@@ -13,8 +13,9 @@ import numpy.typing as npt
 
 from rigd.engine import Observer, Ring
 from rigd.engine.channels import TOPICS
-from rigd.engine.processes import PROCESSES, SUPERVISOR, Heartbeat
+from rigd.engine.processes import Heartbeat
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
+from rigd.engine.workers import PROCESSES, SUPERVISOR
 from rigd.live.address import LiveAddress
 from rigd.runner._process_group import ProcessGroup
 from rigd.session.layout import decode_samples
@@ -255,6 +256,7 @@ class StatusReader:
         """Yield the status of each started process, with the time since its last heartbeat."""
         shared_state, now_s = group.channels.shared_state, time.monotonic()
         for process in PROCESSES:
+            assert process.beat is not None
             silent_s = self._heartbeats[process].stalled_for(shared_state[process.beat], now_s)
             if process is SUPERVISOR:
                 yield ProcessStatus(process.name, os.getpid(), "running", silent_s)

@@ -1,12 +1,13 @@
 from . import addresses as addresses
 from . import processes as processes
 from ._background import OWN_PYTHON as OWN_PYTHON
+from ._background import RUN_PROGRAM as RUN_PROGRAM
 from ._background import SINGLE_THREADED as SINGLE_THREADED
-from ._background import begin_background as begin_background
 from ._background import die_with_parent as die_with_parent
 from ._background import give_way as give_way
 from ._background import prefer_oom_kill as prefer_oom_kill
 from ._background import processor_use as processor_use
+from ._background import run_program as run_program
 from ._background import use_one_thread as use_one_thread
 from ._locks import LockFile as LockFile
 from ._locks import LockHeldError as LockHeldError

@@ -5,12 +5,9 @@ import signal
 import sys
 from contextlib import suppress
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import Final
 
 from rigd.runtime._stop_signals import signal_when_orphaned
-
-if TYPE_CHECKING:
-    from argparse import ArgumentParser, Namespace
 
 SINGLE_THREADED: Final = dict.fromkeys(
     ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS"), "1"
@@ -37,10 +34,28 @@ def use_one_thread() -> None:
     os.environ.update(SINGLE_THREADED)
 
 
-def prefer_oom_kill() -> None:
-    """Make Linux end this process and its children first if memory runs out (OOM killer)."""
+RUN_PROGRAM: Final = (*OWN_PYTHON, "-c", "from rigd.runtime import run_program; run_program()")
+"""First words of a command line that becomes another program. The process id of its parent follows,
+with which the system ends the program, and then the program's own command line."""
+
+
+def run_program() -> None:
+    """Become the program of the command line (`RUN_PROGRAM`); it ends with its parent."""
+    die_with_parent(int(sys.argv[1]))
+    signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
+    os.execv(sys.argv[2], sys.argv[2:])
+
+
+def prefer_oom_kill(pid: int) -> None:
+    """Make Linux end a process and its children first if memory runs out (OOM killer).
+
+    Parameters
+    ----------
+    pid
+        Process id.
+    """
     with suppress(OSError):  # not on Linux
-        Path("/proc/self/oom_score_adj").write_text("1000")
+        Path(f"/proc/{pid}/oom_score_adj").write_text("1000")
 
 
 def give_way(pid: int = 0) -> None:
@@ -92,28 +107,3 @@ def die_with_parent(parent_pid: int) -> None:
     signal_when_orphaned(signal.SIGKILL)
     if os.getppid() != parent_pid:
         sys.exit(1)
-
-
-def begin_background(parser: "ArgumentParser") -> "Namespace":
-    """Set up a background program with one thread, and return its parsed options.
-
-    If memory runs out, the system ends it first.
-
-    Parameters
-    ----------
-    parser
-        Command line of the program. The option ``--parent`` is added, which states the process id
-        of a process with which the program ends.
-
-    Returns
-    -------
-    argparse.Namespace
-        The parsed options.
-    """
-    parser.add_argument("--parent", type=int, help="End with the process of this number.")
-    arguments = parser.parse_args()
-    if arguments.parent is not None:
-        die_with_parent(arguments.parent)
-    prefer_oom_kill()
-    use_one_thread()
-    return arguments

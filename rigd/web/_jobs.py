@@ -4,38 +4,23 @@ Jobs are suspended while a session runs, and end with the page's process, howeve
 """
 
 import asyncio
-import os
-import signal
-import subprocess
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.runtime import OWN_PYTHON, SINGLE_THREADED, give_way
+from rigd.engine.processes import Child, ChildError
+from rigd.engine.workers import REPORT
 
 Document = dict[str, Any]
 
 MAX_JOBS: Final = 16
 """Largest number of waiting jobs."""
-_PROGRAM: Final = (*OWN_PYTHON, "-m", "analysis")
-"""Command line of `analyze`."""
-_RUN_AND_DIE_WITH_PAGE: Final = """
-import os, signal, sys
-from rigd.runtime import die_with_parent, prefer_oom_kill
-
-die_with_parent(int(sys.argv[1]))
-prefer_oom_kill()
-signal.signal(signal.SIGHUP, signal.SIG_DFL)  # which the page ignores
-os.execv(sys.argv[2], sys.argv[2:])
-"""
-"""Program that executes another one, which the system kills when the page's process ends.
-
-Its first argument is the id of that process. If memory runs out, the system kills the executed
-program first."""
 _POLL_PERIOD_S: Final = 0.2
-"""Period in seconds in which waiting and running jobs are polled."""
+"""Period in seconds in which waiting jobs are polled."""
+_RUNNING_POLL_PERIOD_S: Final = 0.05
+"""Period in seconds in which the running job is polled."""
 _MAX_STDERR_BYTES: Final = 1000
 """Number of bytes at the end of a failed job's standard error that are reported."""
 _MAX_STDERR_LINES: Final = 3
@@ -164,7 +149,7 @@ class Jobs:
                 try:
                     await self._run_process(job)
                     job.state = "done"
-                except (JobError, OSError) as error:
+                except (JobError, ChildError) as error:
                     job.state, job.error = "failed", str(error)
                 job.done.set()
                 self._publish_state(job)
@@ -177,46 +162,20 @@ class Jobs:
 
     async def _run_process(self, job: AnalysisJob) -> None:
         """Run a job's process to its end, or raise JobError if it is dropped or fails."""
-        process = await asyncio.create_subprocess_exec(
-            *(*OWN_PYTHON, "-c", _RUN_AND_DIE_WITH_PAGE, str(os.getpid())),
-            *(*_PROGRAM, *job.arguments),
-            cwd=self._folder,
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.PIPE,
-            env=os.environ | SINGLE_THREADED,
-            # A group, so that it is suspended and killed together with its workers. In the page's
-            # session, because when the page ends the system resumes and ends (SIGHUP) suspended
-            # groups of the same session only.
-            process_group=0,
-        )
-        give_way(process.pid)
-        output_task = asyncio.create_task(process.communicate())
+        child = Child(REPORT, *job.arguments, folder=self._folder)
         is_suspended = False
         try:
-            while not output_task.done():
+            while child.running:
                 if job.dropped:
                     raise JobError("A session has begun.")
                 if self.paused is not is_suspended:
                     is_suspended = self.paused
-                    _signal_group(process.pid, signal.SIGSTOP if is_suspended else signal.SIGCONT)
-                await asyncio.wait((output_task,), timeout=_POLL_PERIOD_S)
-            _, stderr_bytes = output_task.result()
+                    (child.suspend if is_suspended else child.resume)()
+                await asyncio.sleep(_RUNNING_POLL_PERIOD_S)
+            error_text = child.error_text()
         finally:
-            if process.returncode is None:
-                _signal_group(process.pid, signal.SIGKILL)
-                await asyncio.wait((output_task,))
-        if process.returncode != 0:
-            last_lines = (
-                stderr_bytes.decode(errors="replace")
-                .strip()[-_MAX_STDERR_BYTES:]
-                .splitlines()[-_MAX_STDERR_LINES:]
-            )
-            failure_reason = " ".join(last_lines) or f"exit code {process.returncode}"
+            await asyncio.to_thread(child.stop)
+        if child.exit_code != 0:
+            last_lines = error_text[-_MAX_STDERR_BYTES:].splitlines()[-_MAX_STDERR_LINES:]
+            failure_reason = " ".join(last_lines) or f"exit code {child.exit_code}"
             raise JobError(f"The {job.kind} was not made: {failure_reason}")
-
-
-def _signal_group(process_group: int, signal_number: int) -> None:
-    """Send a signal to a process group, if it exists."""
-    with suppress(ProcessLookupError):
-        os.killpg(process_group, signal_number)

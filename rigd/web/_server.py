@@ -1,11 +1,9 @@
 """HTTP server of the operator's page: its routes, its live messages, and its program."""
 
 import asyncio
-import json
 import logging
 import os
 import re
-import sys
 from collections.abc import Awaitable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
@@ -18,6 +16,8 @@ from aiohttp import web
 
 from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
+from rigd.engine.messages import Failed, PageAddress
+from rigd.engine.processes import Parent
 from rigd.excitation import KINDS, RIG_ARGUMENTS
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
@@ -358,46 +358,37 @@ def _parameter_descriptions(docstring: str) -> dict[str, str]:
 
 
 def run_page() -> None:
-    """Serve the page as a program until standard input ends; its first line is the job.
-
-    A line with the port is written to standard output, and one with the reason if the page fails.
-    """
+    """Serve the page until the daemon ends; called by ``python -m rigd.web``."""
     ignore()
     # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
     # journal.
     logging.disable()
-    job = json.loads(sys.stdin.readline() or "null")
-    if job is not None:
-        asyncio.run(_serve_until_end(job))
+    daemon = Parent()
+    asyncio.run(_serve_until_end(daemon, daemon.receive_job()))
 
 
-async def _serve_until_end(job: Document) -> None:
-    """Serve the page of a job until standard input ends or the server fails."""
+async def _serve_until_end(daemon: Parent, job: Document) -> None:
+    """Serve the page of a job until the daemon ends or the server fails."""
     try:
         page_server, _, listening_server = await open_page(job)
     except OSError as error:
-        _report_to_daemon(error=f"port {job['port']} cannot be had: {error.strerror}")
+        daemon.send(Failed(f"port {job['port']} cannot be had: {error.strerror}"))
         return
-    _report_to_daemon(port=port_of(listening_server))
+    daemon.send(PageAddress(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())
-    input_ended = asyncio.get_running_loop().run_in_executor(None, sys.stdin.read)
-    await asyncio.wait((server_task, input_ended), return_when=asyncio.FIRST_COMPLETED)
+    daemon_ended = asyncio.get_running_loop().run_in_executor(None, daemon.poll, None)
+    await asyncio.wait((server_task, daemon_ended), return_when=asyncio.FIRST_COMPLETED)
     has_failed = server_task.done()
     if has_failed:
-        _report_to_daemon(error=f"unexpected error ({server_task.exception()!r})")
+        daemon.send(Failed(f"unexpected error ({server_task.exception()!r})"))
     # The successor of this process or of the daemon may need the port.
     listening_server.close()
     page_server.end(
         _FAILED_MESSAGE if has_failed else "The daemon has ended; start it with rigd serve."
     )
     await asyncio.sleep(_LAST_MESSAGES_S)
-    # A regular exit would wait for reading clients and for the thread that reads stdin.
+    # A regular exit would wait for reading clients and for the thread that waits for the daemon.
     os._exit(1 if has_failed else 0)
-
-
-def _report_to_daemon(**message: Any) -> None:  # noqa: ANN401 - what JSON has
-    """Send a message to the daemon, which reads standard output."""
-    print(json.dumps(message), flush=True)  # noqa: T201
 
 
 async def open_page(job: Document) -> tuple[OperatorPageServer, web.AppRunner, asyncio.Server]:

@@ -1,30 +1,21 @@
-"""Online fit: the same as the analysis of the file, honest before, and the program."""
+"""Online fit: the same as the analysis of the file, honest before, and in the fit process."""
 
 import json
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
 import pytest
 from cases import further
+from processes import eventually
 
 from analysis.identify import Measurement, fit_freest_alone, select
-from analysis.online import OnlineEstimate, OnlineEstimator, serve
+from analysis.online import OnlineEstimate, OnlineEstimator
 from analysis.record import load_record
 from analysis.results import whole_record
 from analysis.suited import record_band_hz
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, modes
+from rigd.runner.fit_process import EstimateRequest, EstimationError, EstimatorThread
 from rigd.session import read_session
-from rigd.session.layout import encode_samples
-from rigd.session.online_fit import (
-    EstimateRequest,
-    StreamStart,
-    write_request,
-    write_samples,
-    write_start,
-)
 from rigd.testing import PAPER_BEAM, PAPER_DAMPING, chirp_signals
 
 pytestmark = pytest.mark.process
@@ -282,38 +273,24 @@ def test_damping_that_does_not_show_counts_as_uncertainty(session):
     assert mode.interval_95[0] < true < mode.interval_95[1]
 
 
-# The program
+# In the fit process
 
 
-def wire(samples) -> bytes:
-    return encode_samples({name: samples[name] for name in samples.dtype.names})
+def next_estimate(thread):
+    return eventually(thread.next_estimate)
 
 
-@pytest.fixture
-def program():
-    process = subprocess.Popen(
-        [sys.executable, "-P", "-m", "analysis.online"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    )  # fmt: skip
-    yield process
-    process.kill()
-    process.wait()
-    for stream in (process.stdin, process.stdout, process.stderr):
-        stream.close()
-
-
-def test_the_program_answers_to_requests(session, program):
-    write_start(program.stdin, StreamStart(session.metadata, session.segments, None))
-    write_samples(program.stdin, wire(session.samples[:9500]))
+def test_a_thread_answers_to_requests(session):
+    thread = EstimatorThread()
+    thread.feed(session.samples[:9500])
+    thread.begin(session.metadata, session.segments, None)
     for number, (tick, whole) in enumerate([(300, False), (9000, False), (9000, True)]):
-        write_request(program.stdin, EstimateRequest(number, tick, whole))
-    output, errors = program.communicate(timeout=300)
-    assert (program.returncode, errors) == (0, b"")
-    answers = [json.loads(line) for line in output.splitlines()]
+        thread.request(EstimateRequest(number, tick, whole))
+    answers = [next_estimate(thread) for _ in range(3)]
     assert [(each["id"], each["tick"], each["whole"]) for each in answers] == [
         (0, 300, False), (1, 9000, False), (2, 9000, True),
     ]  # fmt: skip
-    expected = fed(session).estimate(9000).as_json()
+    expected = json.loads(json.dumps(fed(session).estimate(9000).as_json()))
     took_s = answers[1].pop("took_s")
     assert 0 < took_s < 30
     assert answers[1] == {"id": 1} | {k: v for k, v in expected.items() if k != "took_s"}
@@ -329,17 +306,25 @@ def test_the_program_answers_to_requests(session, program):
 
 @pytest.mark.parametrize("whole", [False, True])
 @pytest.mark.parametrize("from_last", [False, True])
-def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, capsys, whole, from_last):
+def test_an_estimate_is_made_as_it_is_asked_for(monkeypatch, whole, from_last):
     asked = []
 
     def estimate(_, tick, **how):
         asked.append((tick, how))
+        if len(asked) > 1:
+            raise LookupError("of the second")
         return OnlineEstimate(tick, 1.0, whole, 0.0, problem="None here.")
 
     monkeypatch.setattr(OnlineEstimator, "estimate", estimate)
-    serve(StreamStart({}, {}, None), iter([EstimateRequest(7, 9000, whole, from_last)]))
+    thread = EstimatorThread()
+    thread.begin({}, {}, None)
+    thread.request(EstimateRequest(7, 9000, whole, from_last))
+    assert next_estimate(thread)["id"] == 7
     assert asked == [(9000, {"whole": whole, "from_last": from_last})]
-    assert json.loads(capsys.readouterr().out)["id"] == 7
+    assert thread.next_estimate() is None
+    thread.request(EstimateRequest(8, 9000, whole, from_last))
+    with pytest.raises(EstimationError, match=r"fit has failed .*of the second"):
+        next_estimate(thread)
 
 
 def session_noise_nm2(session) -> float:
@@ -347,22 +332,16 @@ def session_noise_nm2(session) -> float:
     return float(np.var(session.samples["coupling_torque_nm"][:400]))
 
 
-def test_the_program_estimates_unasked(session, program):
-    write_start(program.stdin, StreamStart(session.metadata, session.segments, 0.2))
-    write_samples(program.stdin, wire(session.samples[:5000]))
-    first = json.loads(program.stdout.readline())
-    while first["tick"] < 5000:  # it was quicker than the samples
-        first = json.loads(program.stdout.readline())
-    write_samples(program.stdin, wire(session.samples[5000:9000]))
-    deadline_s = time.monotonic() + 300  # it gives way to everything else
-    while json.loads(program.stdout.readline())["tick"] < 9000:
-        assert time.monotonic() < deadline_s
-    program.communicate(timeout=300)
-    assert program.returncode == 0
+def test_a_thread_estimates_unasked(monkeypatch):
+    fed_ticks = []
 
+    def estimate(_, tick, **how):
+        return OnlineEstimate(sum(fed_ticks), 1.0, how["whole"], 0.0, problem="None here.")
 
-@pytest.mark.parametrize("stream", [b"", b"{}\n", b'{"version": 1}'])
-def test_the_program_refuses_another_stream(program, stream):
-    _, errors = program.communicate(stream, timeout=300)
-    assert program.returncode == 1
-    assert errors.startswith(b"Error: The stream of samples to the online fit is broken")
+    monkeypatch.setattr(OnlineEstimator, "feed", lambda _, ticks: fed_ticks.append(ticks))
+    monkeypatch.setattr(OnlineEstimator, "estimate", estimate)
+    thread = EstimatorThread()
+    thread.begin({}, {}, 0.05)
+    assert [next_estimate(thread)["id"] for _ in range(2)] == [0, 1]
+    thread.feed(5000)
+    assert eventually(lambda: next_estimate(thread)["tick"] == 5000)

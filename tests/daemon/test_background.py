@@ -1,25 +1,20 @@
 """Predictions and checks of the daemon, made in a process of their own, whatever else is done."""
 
 import asyncio
-import pickle
+import os
 import resource
-import subprocess
-import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from operated_daemons import CommandError
-from processes import eventually
 
 from rigd.daemon import background
+from rigd.engine.processes import Child
+from rigd.engine.workers import PREDICTION
 from rigd.runner.planning import excitation_for, plan_session
 
 CHIRP = {"excitation": "chirp", "parameters": {"duration_s": 5.0, "ring_down_s": 1.0}}
-LITTLE_MEMORY = """
-from rigd.daemon import background
-background._memory_limit = lambda: background._MIN_MEMORY_BYTES
-background.main()
-"""
 
 
 def loud(amplitude_rad):
@@ -77,7 +72,8 @@ def test_only_so_many_predictions_wait(operate, monkeypatch):
 
 
 def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
-    monkeypatch.setattr(background, "OWN_PYTHON", ("/bin/true",))
+    silent = replace(PREDICTION, module="keyword")
+    monkeypatch.setattr(background.PredictionJob, "worker", silent)
     told = operate().ask("predict", **CHIRP)
     assert isinstance(told, CommandError)
     assert "exit code 0" in str(told)
@@ -86,7 +82,7 @@ def test_a_process_that_ends_is_a_refusal(operate, monkeypatch):
 def test_of_the_free_memory_a_job_may_have_a_part(tmp_path):
     def limit(available_kib):
         (tmp_path / "meminfo").write_text(f"MemFree: 1 kB\nMemAvailable:   {available_kib} kB\n")
-        return background._memory_limit(tmp_path / "meminfo")
+        return PREDICTION.memory.bytes_now(tmp_path / "meminfo")
 
     assert limit(2_000_000) == 500_000 * 1024
     assert limit(100_000_000) == 4 << 30
@@ -95,29 +91,22 @@ def test_of_the_free_memory_a_job_may_have_a_part(tmp_path):
 
 @pytest.mark.process
 def test_a_job_is_the_first_that_is_killed_for_lack_of_memory():
-    with subprocess.Popen(
-        [sys.executable, "-m", "rigd.daemon.background"],
-        stdin=subprocess.PIPE,
-        stderr=subprocess.DEVNULL,
-    ) as job:
-        score = Path(f"/proc/{job.pid}/oom_score_adj")
-        assert eventually(lambda: score.read_text() == "1000\n", within_s=30.0)
-        assert eventually(lambda: resource.prlimit(job.pid, resource.RLIMIT_AS)[1] <= 4 << 30)
+    job = Child(PREDICTION)
+    assert Path(f"/proc/{job.pid}/oom_score_adj").read_text() == "1000\n"
+    assert resource.prlimit(job.pid, resource.RLIMIT_AS)[1] <= 4 << 30
+    assert os.getpriority(os.PRIO_PROCESS, job.pid) == 19
+    job.stop()
+    assert not job.running
 
 
 @pytest.mark.process
-def test_a_prediction_without_the_memory_is_refused(profile):
+def test_a_prediction_without_the_memory_is_refused(profile, monkeypatch):
+    little = replace(PREDICTION, memory=replace(PREDICTION.memory, fraction=0.0))
+    monkeypatch.setattr(background.PredictionJob, "worker", little)
     job = background.PredictionJob(profile, "chirp", {"duration_s": 2300.0}, False, "")
-    told = subprocess.run(
-        [sys.executable, "-c", LITTLE_MEMORY],
-        input=pickle.dumps(job),
-        capture_output=True,
-        check=True,
-    )
-    answer = pickle.loads(told.stdout)
-    assert isinstance(answer, CommandError)
-    assert "not enough free memory" in str(answer)
-    assert answer.wrong_use
+    with pytest.raises(CommandError, match="not enough free memory") as refused:
+        asyncio.run(background.perform(job))
+    assert refused.value.wrong_use
 
 
 def test_a_check_asks_no_device_and_keeps_a_start_waiting(operated, monkeypatch):

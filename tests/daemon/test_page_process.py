@@ -8,6 +8,7 @@ import stat
 import subprocess
 import sys
 import urllib.request
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -15,6 +16,7 @@ from operated_daemons import shown_status
 from processes import eventually
 
 from rigd.daemon import _page, page_address
+from rigd.engine.workers import PAGE
 from rigd.profile import load_profile
 
 pytestmark = pytest.mark.process
@@ -65,7 +67,7 @@ def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_f
         "daemon": {"profile": "sim", "moving": "m", "pid": 1, "output": "o", "web": url}
     }
     assert shown_status(told)["page"].strip() == address
-    pid = page._process.pid
+    pid = page._child.pid
     command = Path(f"/proc/{pid}/cmdline").read_bytes() + Path(f"/proc/{pid}/environ").read_bytes()
     assert token.encode() not in command
     page.close()
@@ -75,16 +77,16 @@ def test_the_page_is_found_by_its_user_and_ends_with_the_daemon(serve, runtime_f
 
 
 def test_a_page_that_is_killed_comes_back_at_its_place_and_is_given_up_at_last(serve, monkeypatch):
-    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 2)
+    monkeypatch.setattr(_page, "PAGE", replace(PAGE, restarts=1))
     page = serve()
     address = found()
-    first = page._process.pid
+    first = page._child.pid
     os.kill(first, signal.SIGKILL)
-    assert eventually(lambda: page._process.pid != first and len(page.told) == 3, within_s=60.0)
+    assert eventually(lambda: page._child.pid != first and len(page.told) == 3, within_s=60.0)
     assert page.told == [page.told[0], None, page.told[0]]
     assert page_address("sim") == address
     assert answers(address)
-    os.kill(page._process.pid, signal.SIGKILL)
+    os.kill(page._child.pid, signal.SIGKILL)
     page._thread.join(30.0)
     assert not page._thread.is_alive()
     assert page.told[-1] is None
@@ -114,7 +116,7 @@ def test_only_starts_that_do_not_last_are_counted(serve, monkeypatch):
 
 @pytest.mark.further  # as test_page_server.py
 def test_a_port_that_is_taken_is_said_if_it_was_asked_for(serve, monkeypatch, caplog):
-    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 1)
+    monkeypatch.setattr(_page, "PAGE", replace(PAGE, restarts=0))
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         page = serve(port)
@@ -138,9 +140,10 @@ server.run_page()
 """
 
 
-def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog):
-    monkeypatch.setattr(_page, "_MAX_SHORT_STARTS", 1)
-    monkeypatch.setattr(_page, "_PAGE_SERVER_ARGUMENTS", ("-c", FAILING))
+def test_a_page_that_fails_ends_and_its_reason_is_logged(serve, monkeypatch, caplog, tmp_path):
+    (tmp_path / "failing_page.py").write_text(FAILING)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(_page, "PAGE", replace(PAGE, module="failing_page", restarts=0))
     page = serve()
     page._thread.join(60.0)
     assert not page._thread.is_alive()

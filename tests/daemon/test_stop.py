@@ -17,7 +17,7 @@ from stop_scenarios import SITUATIONS, can_isolate, isolated
 from rigd.daemon.address import socket_path
 from rigd.daemon.client import Client
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
-from rigd.engine.processes import CONTROL
+from rigd.engine.workers import CONTROL
 from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import answers
 from rigd.runtime.processes import read_process, read_processes

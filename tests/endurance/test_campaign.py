@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 from shipped_profile import load_shipped
 
-from rigd.engine.processes import CONTROL
+from rigd.engine.workers import CONTROL
 from rigd.excitation import hold
 from rigd.runner import ProcessGroup, Rig
 from rigd.runner.request import Order

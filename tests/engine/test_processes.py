@@ -5,6 +5,7 @@ import errno
 import os
 import subprocess
 import sys
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from rigd.engine import shared_memory_fd
 from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
 from rigd.engine.processes import Child, ChildError
 from rigd.engine.reference import map_reference, write_reference
+from rigd.engine.workers import RECORDER
 from rigd.profile import load_profile
 from rigd.session.limits import MAX_SAMPLES
 
@@ -73,12 +75,12 @@ def test_what_is_no_message_is_not_waited_for(pipe):
 
 @pytest.mark.process
 def test_what_is_no_message_is_told_with_the_name_of_the_process():
-    child = Child("recorder", "this", [])  # prints the Zen of Python
+    child = Child(replace(RECORDER, module="this"))  # prints the Zen of Python
     try:
         with pytest.raises(ChildError, match="recorder process sent no message, but b'The Zen of"):
             child.poll(60.0)
     finally:
-        child.stop(5.0)
+        child.stop()
 
 
 @pytest.mark.process
@@ -99,9 +101,9 @@ def test_what_a_library_prints_does_not_stand_among_the_messages():
 
 @pytest.mark.process
 def test_a_process_may_be_stopped_twice():
-    child = Child("recorder", "rigd.engine.recorder", [])
-    child.stop(5.0)
-    child.stop(5.0)
+    child = Child(RECORDER)
+    child.stop()
+    child.stop()
     assert not child.running
 
 
@@ -112,4 +114,4 @@ def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     with pytest.raises(ChildError, match=r"recorder process cannot be started .*ulimit"):
-        Child("recorder", "rigd.engine.recorder", [])
+        Child(RECORDER)

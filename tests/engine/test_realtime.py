@@ -163,6 +163,7 @@ import json, os, resource, sys, threading
 from pathlib import Path
 from rigd.engine.processes import Child
 from rigd.engine.realtime import Precedence
+from rigd.engine.workers import RECORDER
 {before}
 
 def state(thread=0):
@@ -189,9 +190,9 @@ precedence.cover()
 told["thread"] = state(thread.native_id)
 told["child"] = as_child()
 if os.access(sys.executable, os.X_OK):
-    rig_child = Child("x", "rigd.engine.recorder", [], precedence.cores_before)
+    rig_child = Child(RECORDER, cores=precedence.cores_before)
     told["cores of a process of the rig"] = sorted(os.sched_getaffinity(rig_child.pid))
-    rig_child.stop(1.0)
+    rig_child.stop()
 precedence.release()
 told["after"], told["thread after"] = state(), state(thread.native_id)
 wait.set()

@@ -1,4 +1,4 @@
-"""Fits of a running session, as the fit program answers them and a search adds what is asked."""
+"""Fits of a running session, as the fit answers them and a search adds what is asked."""
 
 
 def quantity(value, std, flag=None):

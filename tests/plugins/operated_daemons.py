@@ -21,7 +21,8 @@ from rigd.devices import ActuationTarget, open_devices
 from rigd.devices.contracts import DeviceError, Devices
 from rigd.engine import control_process as control
 from rigd.engine import recorder
-from rigd.engine.processes import CONTROL, ChildError
+from rigd.engine.processes import ChildError
+from rigd.engine.workers import CONTROL
 from rigd.runner import ProcessGroup, Rig
 from rigd.runner import _rig as rig_module
 from rigd.runtime import StopRequest
@@ -222,7 +223,7 @@ class ThreadChild:
             raise ChildError(f"The {self.name} process was killed by signal 9.")
         return message
 
-    def wake(self):
+    def resume(self):
         pass
 
     def kill(self):
@@ -233,7 +234,7 @@ class ThreadChild:
         if self.thread.ident is not None and self.thread is not threading.current_thread():
             self.thread.join(30.0)
 
-    def stop(self, grace_s):
+    def stop(self):
         if self.thread.ident is not None:
             self.inbox.put(_ENDED)
             self.thread.join(30.0)

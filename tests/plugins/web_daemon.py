@@ -10,6 +10,7 @@ import subprocess
 import sys
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -212,9 +213,8 @@ _PARTS = {
     "most_waiting": (_live, "_MAX_QUEUED_MESSAGES"),
     "list_sessions": (_library, "list_sessions"),
     "response": (_server, "SessionResponse"),
-    "program": (_jobs, "_PROGRAM"),
+    "worker": (_jobs, "REPORT"),
     "poll_s": (_jobs, "_POLL_PERIOD_S"),
-    "give_way": (_jobs, "give_way"),
 }
 """Limits and parts of the page's server that tests replace."""
 
@@ -228,6 +228,18 @@ def replace_in_page(monkeypatch):
             monkeypatch.setattr(*_PARTS[name], value)
 
     return replace
+
+
+@pytest.fixture
+def run_instead(replace_in_page, monkeypatch, tmp_path):
+    """Have jobs run Python code in place of `analyze`: that of their first argument, or the one."""
+
+    def run_instead(code="exec(sys.argv.pop(1))", **parts):
+        (tmp_path / "stand_in.py").write_text(f"import sys\n{code}\n")
+        monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+        replace_in_page(worker=replace(_jobs.REPORT, module="stand_in"), **parts)
+
+    return run_instead
 
 
 @pytest.fixture

@@ -33,7 +33,7 @@ def profile():
 
 
 def answer(profile, tick, share, flag=None):
-    """What the fit program answers where every number has a share of itself as its deviation."""
+    """What the fit answers where every number has a share of itself as its deviation."""
     beam, damping = profile.rig.beam, profile.rig.damping
 
     def quantity(value):

@@ -13,6 +13,8 @@ from pathlib import Path
 import pytest
 from processes import children, eventually, state_of
 
+from rigd.engine.processes import Child
+from rigd.engine.workers import QUICK_LOOK
 from rigd.runner import quick_looks
 from rigd.runner.quick_looks import QuickLook, QuickLooks
 from rigd.runner.session import RunResult
@@ -25,7 +27,6 @@ PROGRAM = """
 import json, pathlib, sys, time
 
 session = pathlib.Path(sys.argv[1])
-assert sys.argv[2] == "--parent"
 name = session.stem
 if name == "fails":
     sys.exit("a hint\\nError: The record is too short.")
@@ -52,7 +53,8 @@ def started():
 def looks(tmp_path, monkeypatch, started):
     (tmp_path / "look_program.py").write_text(PROGRAM)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
-    monkeypatch.setattr(quick_looks, "_QUICK_LOOK_MODULE", "look_program")
+    program = replace(QUICK_LOOK, module="look_program", niceness=0)
+    monkeypatch.setattr(quick_looks, "QUICK_LOOK", program)
     told = []
     looks = QuickLooks(told.append)
     looks.told = told
@@ -159,27 +161,26 @@ def test_what_a_process_does_with_the_processors():
 
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
-    monkeypatch.setattr(quick_looks, "_KILL_TIMEOUT_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
-    monkeypatch.setattr(subprocess.Popen, "kill", lambda _: None)
+    monkeypatch.setattr(Child, "kill", lambda _: None)
     for end in (looks.poll, looks.close):
         looks.begin(tmp_path / "hangs.mcap")
         process = looks._process
-        late = threading.Timer(5.0, process.send_signal, (signal.SIGKILL,))
+        late = threading.Timer(5.0, os.kill, (process.pid, signal.SIGKILL))
         late.start()
         assert eventually(lambda: run_time_s(looks) >= 0.05)
         end()
         assert looks.told == []
-        assert process.poll() is None
+        assert process.running
         late.cancel()
-        process.send_signal(signal.SIGKILL)
+        os.kill(process.pid, signal.SIGKILL)
         if end == looks.poll:
             with looks.suspended():  # nor does a session
                 looks.poll()
             (told,) = done(looks)
             assert told.error == "it took longer than 0.05 s."
             looks.told.clear()
-    process.communicate()
+    assert eventually(lambda: not process.running)
 
 
 def test_of_too_many_the_oldest_are_left_out(looks, tmp_path):

@@ -33,7 +33,7 @@ def close():
         session = SessionRun(
             order, group, connected, None, lambda *_: None, can_always_receive_stop
         )
-        session._fit = MagicMock(failure=failure, unmet_reason=unmet_reason, segments={})
+        session._fit = MagicMock(search_failure=failure, unmet_reason=unmet_reason, segments={})
         session._fit.finish.return_value = {}
         session._fit.poll.return_value = []
 

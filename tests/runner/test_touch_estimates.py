@@ -2,11 +2,13 @@
 
 import json
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
 
 from rigd.engine.messages import TouchReady, TouchReport
+from rigd.engine.workers import TOUCH
 from rigd.runner._touch_search import TouchEstimates
 from rigd.session.touches import touch_line, touches_of
 
@@ -16,7 +18,7 @@ class Group(dict):
 
     def __init__(self, messages):
         self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written=0))
-        self.child = SimpleNamespace(start=lambda _: None, messages=messages)
+        self.child = SimpleNamespace(send=lambda _: None, messages=messages)
 
     def idle_process(self, _):
         return self.child
@@ -43,7 +45,7 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
 def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
-    monkeypatch.setattr("rigd.runner._process_group._READY_TIMEOUT_S", 0.0)
+    monkeypatch.setattr(TouchEstimates, "worker", replace(TOUCH, start_s=0.0))
     touches = estimates(lambda _: messages)
     touches.await_ready(lambda: True)
     told = [event.message for event in touches.poll()]

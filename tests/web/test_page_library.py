@@ -8,11 +8,14 @@ import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 from processes import eventually
 from web_daemon import MAX_JOBS, TOKEN, JobError, Jobs
+
+from rigd.engine.workers import REPORT
 
 ACTING = {
     "Authorization": f"Bearer {TOKEN}",
@@ -25,7 +28,7 @@ ACTING = {
 def two(served, record_briefly, write_quick_look, replace_in_page):
     """Two sessions, of which one has a quick look and a report."""
     # What runs only while nothing else does may not run for minutes beside the other tests.
-    replace_in_page(give_way=lambda _: None)
+    replace_in_page(worker=replace(REPORT, niceness=0))
     for name, specimen in (("first", "antenna"), ("second", "")):
         record_briefly(name, day=float(name == "second"), specimen=specimen).replace(
             served.folder / f"{name}.mcap"
@@ -115,9 +118,9 @@ def test_another_format_is_made_and_sent(served, two):
 
 @pytest.mark.usefixtures("two")
 @pytest.mark.parametrize("begun", [True, False], ids=["running", "behind another job"])
-def test_a_session_ends_the_wait_for_another_format(served, replace_in_page, tmp_path, begun):
+def test_a_session_ends_the_wait_for_another_format(served, run_instead, tmp_path, begun):
     assert eventually(lambda: not served.server._jobs.paused)
-    replace_in_page(program=(sys.executable, "-c", PATIENT, str(tmp_path)))
+    run_instead(PATIENT.format(tmp_path))
     if not begun:
         assert served.ask("POST", "/api/sessions/second/report", ACTING, b"{}")[0] == 202
     try:
@@ -138,8 +141,8 @@ def test_a_session_ends_the_wait_for_another_format(served, replace_in_page, tmp
 
 
 PATIENT = """
-import pathlib, sys, time
-folder = pathlib.Path(sys.argv[1])
+import pathlib, time
+folder = pathlib.Path("{}")
 (folder / "begun").touch()
 while not (folder / "end").exists():
     time.sleep(0.01)
@@ -147,9 +150,9 @@ while not (folder / "end").exists():
 
 
 @pytest.fixture
-def jobs(tmp_path, replace_in_page):
+def jobs(tmp_path, run_instead):
     """Jobs whose program runs the Python code it is given."""
-    replace_in_page(program=(sys.executable, "-c"), poll_s=0.02)
+    run_instead(poll_s=0.02)
     told = []
     jobs = Jobs(tmp_path, told.append)
     jobs.told = told
@@ -209,11 +212,12 @@ def test_a_job_stands_still_while_a_session_runs_and_gives_way(jobs, tmp_path):
 
 PAGE = """
 import asyncio, os, pathlib, sys
+from dataclasses import replace
 from rigd.runtime import ignore
 from rigd.web import _jobs
 
 ignore()
-_jobs._PROGRAM = (sys.executable, "-c")
+_jobs.REPORT = replace(_jobs.REPORT, module="stand_in")
 _jobs._POLL_PERIOD_S = 0.02
 
 async def work():
@@ -242,6 +246,7 @@ time.sleep(600)
 @pytest.mark.process
 @pytest.mark.parametrize("end", ["killed", "ended"])
 @pytest.mark.parametrize("state", ["suspended", "running"])
+@pytest.mark.usefixtures("jobs")
 def test_a_job_ends_with_the_page(tmp_path, state, end):
     page = subprocess.Popen(
         [sys.executable, "-c", PAGE, WORKING, state], cwd=tmp_path, stdin=subprocess.PIPE
@@ -292,10 +297,8 @@ def test_only_so_many_jobs_wait(jobs):
     run(jobs, scenario)
 
 
-def test_a_report_and_a_campaign_are_queued_with_the_token(
-    served, two, monkeypatch, replace_in_page
-):
-    replace_in_page(program=(sys.executable, "-c", "pass"))
+def test_a_report_and_a_campaign_are_queued_with_the_token(served, two, monkeypatch, run_instead):
+    run_instead("pass")
     told = []
     monkeypatch.setattr(served.server._jobs, "_publish", told.append)
     status, _, body = served.ask("POST", "/api/sessions/first/report", ACTING, b"{}")
@@ -309,9 +312,9 @@ BOTH = ["report", "campaign"]
 
 
 @pytest.mark.usefixtures("two")
-def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch, replace_in_page):
-    making = "import os, sys; os.mkdir(sys.argv[-1])"  # at its end, and never over another
-    replace_in_page(program=(sys.executable, "-c", making))
+def test_campaigns_that_wait_get_a_folder_each(served, monkeypatch, run_instead):
+    making = "import os; os.mkdir(sys.argv[-1])"  # at its end, and never over another
+    run_instead(making)
     told = []
     monkeypatch.setattr(served.server._jobs, "_publish", told.append)
     ids = json.dumps({"ids": ["first", "second"]}).encode()

@@ -5,12 +5,11 @@ import base64
 import contextlib
 import json
 import socket
-import subprocess
-import sys
 import threading
 import time
 import weakref
 from collections import deque
+from dataclasses import replace
 
 import aiohttp
 import numpy as np
@@ -18,6 +17,8 @@ import pytest
 from processes import eventually
 from web_daemon import TOKEN
 
+from rigd.engine.processes import Child, ChildError
+from rigd.engine.workers import PAGE
 from rigd.excitation import KINDS
 
 ACTING = {
@@ -504,19 +505,17 @@ def test_a_page_stops_over_its_websocket(served, pages):
 
 @pytest.mark.process
 def test_the_process_writes_no_nonsense_that_it_is_sent_to_its_terminal(served):
-    with subprocess.Popen(
-        [sys.executable, "-m", "rigd.web"],
-        stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
-    ) as process:  # fmt: skip
-        try:
-            process.stdin.write(json.dumps(served._job).encode() + b"\n")
-            process.stdin.flush()
-            port = json.loads(process.stdout.readline())["port"]
-            for nonsense in (bytes(range(256)), b"GET / HTTP/1.1\r\nHost: [\r\nX\r\n\r\n"):
-                with socket.create_connection(("127.0.0.1", port), 30.0) as link:
-                    link.sendall(nonsense)
-                    assert link.recv(100).split()[1] == b"400"
-            process.stdin.close()
-            assert process.stderr.read() == b""
-        finally:
-            process.kill()
+    page = Child(replace(PAGE, errors_hidden=True))
+    try:
+        page.start(served._job)
+        port = page.poll(60.0).port
+        for nonsense in (bytes(range(256)), b"GET / HTTP/1.1\r\nHost: [\r\nX\r\n\r\n"):
+            with socket.create_connection(("127.0.0.1", port), 30.0) as link:
+                link.sendall(nonsense)
+                assert link.recv(100).split()[1] == b"400"
+        page.close_input()
+        with pytest.raises(ChildError, match="page process was ended with exit code 0"):
+            page.poll(60.0)
+        assert page.error_text() == ""
+    finally:
+        page.stop()

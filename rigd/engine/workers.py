@@ -1,0 +1,221 @@
+"""The table of workers: every child process of rigd, how it is started, and what follows its loss.
+
+Each row is a `Worker`; `rigd.engine.processes.Child` starts it, and is the client of its messages.
+The programs of the analyser are named here and nowhere else, since rigd does not import them.
+"""
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Final, Literal
+
+from rigd.engine._control_names import CONTROL_MODULE
+from rigd.engine.shared_state import StateField
+
+
+@dataclass(frozen=True, slots=True)
+class MemoryLimit:
+    """Limit of a worker's address space, as a fraction of the memory that is available."""
+
+    fraction: float
+    """Fraction of the available memory that the worker may use."""
+    least_bytes: int
+    """Memory in bytes that the worker may use in any case."""
+    largest_bytes: int
+    """Maximum memory in bytes, however much is available."""
+
+    def bytes_now(self, meminfo: Path = Path("/proc/meminfo")) -> int:
+        """Return the limit in bytes for a worker that is started now.
+
+        Parameters
+        ----------
+        meminfo
+            File in which the system states the available memory.
+        """
+        available_text = meminfo.read_text().partition("MemAvailable:")[2].split()[0]
+        allowed_bytes = int(self.fraction * int(available_text) * 1024)
+        return min(max(allowed_bytes, self.least_bytes), self.largest_bytes)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Worker:
+    """Description of one child process: how it is started, what it sends, and how it ends."""
+
+    name: str
+    """Name of the process in messages to the operator."""
+    module: str
+    """Module that is run as ``python -m module``; empty for the supervisor."""
+    sends: tuple[str, ...] = ()
+    """Classes of its messages, by name; the first one that a `SessionWorker` sends means that it is
+    ready. Empty for a program, whose results are files and an exit code."""
+    loss: Literal["fault", "warning", "nothing"]
+    """What the operator gets if the process dies or hangs: a fault, a warning, or no message."""
+    consequence: str
+    """Sentence for the operator that states what follows the loss of the process."""
+    restarts: int = 0
+    """Number of times that the process is started again in a session, or in a row for the page."""
+    beat: StateField | None = None
+    """Field of its heartbeat in the shared state; None: the process has no access to it."""
+    start_s: float = 20.0
+    """Longest time in s for the process to become ready on a busy computer."""
+    hung_after_s: float | None = None
+    """Longest time in s without a heartbeat; None: the process's results are checked instead."""
+    end_s: float
+    """Time in s in which the process must end on request, before it is terminated, then killed."""
+    for_one_session: bool = False
+    """Whether each session starts a new process of this kind."""
+    niceness: int | None = 0
+    """Increment of the niceness; None: it runs only while no other process needs the processor."""
+    memory: MemoryLimit | None = None
+    """Limit of its memory; None: no limit."""
+    ended_for_memory: bool = False
+    """Whether the system ends this process first if memory runs out."""
+    errors_hidden: bool = False
+    """Whether its standard error is read by its client instead of being shown to the operator."""
+
+
+# Processes of a rig, which share its memory
+
+CONTROL: Final = Worker(
+    name="control",
+    module=CONTROL_MODULE,
+    # It takes its real-time priority itself, as the profile states.
+    sends=("Connected", "Ready", "Finished", "Measured", "Refused", "Ended"),
+    loss="fault",
+    consequence="The drive's watchdog switches it off; the session ends as a fault.",
+    beat=StateField.CONTROL_BEAT,
+    hung_after_s=3.0,
+    end_s=5.0,
+)
+RECORDER: Final = Worker(
+    name="recorder",
+    module="rigd.engine.recorder",
+    sends=("Opened", "Armed", "Closed", "Failed"),
+    loss="fault",
+    consequence="The session ends as a fault.",
+    beat=StateField.RECORDER_BEAT,
+    # A disk may stall for seconds; the number of waiting samples is checked instead.
+    hung_after_s=None,
+    end_s=5.0,
+    for_one_session=True,
+)
+LIVE: Final = Worker(
+    name="live",
+    module="rigd.live.publisher",
+    sends=("LiveAddress", "LiveShown", "Failed"),
+    loss="warning",
+    consequence="It is not restarted; the session continues.",
+    restarts=3,
+    beat=StateField.LIVE_BEAT,
+    start_s=60.0,
+    hung_after_s=5.0,
+    end_s=2.0,
+)
+TOUCH: Final = Worker(
+    name="touch",
+    module="rigd.engine.touch_estimator",
+    sends=("TouchReady", "TouchReport"),
+    loss="warning",
+    consequence="Touches are detected but not estimated; the session continues.",
+    beat=StateField.TOUCH_BEAT,
+    # An estimate may take long; a missing estimate is reported as such.
+    hung_after_s=None,
+    end_s=1.0,
+    for_one_session=True,
+)
+FIT: Final = Worker(
+    name="fit",
+    module="rigd.runner.fit_process",
+    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "Failed"),
+    loss="warning",
+    # A session that plans itself ends with what is planned instead.
+    consequence="The session continues without fits.",
+    beat=StateField.FIT_BEAT,
+    # A decision may take long on a busy computer; the loop holds the angle meanwhile.
+    hung_after_s=15.0,
+    end_s=1.0,
+    for_one_session=True,
+    niceness=5,  # a third of a processor in competition with another program
+    ended_for_memory=True,
+)
+SUPERVISOR: Final = Worker(
+    name="supervisor",
+    module="",
+    loss="fault",
+    consequence="The control process ends the session as a fault.",
+    beat=StateField.SUPERVISOR_BEAT,
+    hung_after_s=2.0,
+    end_s=0.0,
+)
+
+PROCESSES: Final = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
+"""All processes of a rig in the order in which they are ended: first the control process, which
+switches the torque off."""
+
+
+# Processes of the daemon and of its page
+
+PAGE: Final = Worker(
+    name="page",
+    module="rigd.web",
+    sends=("PageAddress", "Failed"),
+    loss="warning",
+    consequence="It is not started again; the rig does not need it.",
+    restarts=4,
+    end_s=3.0,
+)
+PREDICTION: Final = Worker(
+    name="prediction",
+    module="rigd.daemon.background",
+    sends=("Performed",),
+    loss="nothing",
+    consequence="The client's request is refused.",
+    end_s=0.0,
+    niceness=19,  # it may run during a session
+    # Apart from the control process of a session, the memory of no process is locked. A session of
+    # two minutes needs 180 MiB, of which 120 MiB are the program.
+    memory=MemoryLimit(fraction=0.25, least_bytes=256 << 20, largest_bytes=4 << 30),
+    ended_for_memory=True,
+    errors_hidden=True,
+)
+PLAN: Final = Worker(
+    name="plan",
+    module=PREDICTION.module,
+    sends=PREDICTION.sends,
+    loss="nothing",
+    consequence="The session is not started.",
+    end_s=0.0,
+    memory=PREDICTION.memory,
+    ended_for_memory=True,
+    errors_hidden=True,
+)
+
+
+# Programs and other parts of the analyser
+
+ONLINE_ESTIMATOR: Final = "analysis.online:OnlineEstimator"
+"""Class with which the process `FIT` makes its estimates, as ``module:name``."""
+
+QUICK_LOOK: Final = Worker(
+    name="quick look",
+    module="analysis.quick_look",
+    loss="warning",
+    consequence="The session has no quick look.",
+    end_s=0.5,
+    # Not the lowest priority, because other programs may never pause.
+    niceness=10,
+    ended_for_memory=True,
+    errors_hidden=True,
+)
+REPORT: Final = Worker(
+    name="report",
+    module="analysis",
+    loss="warning",
+    consequence="The report, campaign or export is not made.",
+    end_s=5.0,
+    niceness=None,
+    ended_for_memory=True,
+    errors_hidden=True,
+)
+
+WORKERS: Final = (*PROCESSES, PAGE, PREDICTION, PLAN, QUICK_LOOK, REPORT)
+"""All workers."""

@@ -1,0 +1,155 @@
+"""Client of a process that accompanies sessions: its start, readiness, messages, and loss."""
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Callable
+from typing import TYPE_CHECKING, ClassVar, Final
+
+from rigd.engine.messages import Failed
+from rigd.engine.processes import ChildError
+from rigd.engine.shared_state import Level, LogEvent
+
+if TYPE_CHECKING:
+    from rigd.engine.workers import Worker
+    from rigd.runner._process_group import ProcessGroup
+
+_POLL_S: Final = 0.05
+"""Time in seconds to wait for a message at once."""
+
+
+class SessionWorker(ABC):
+    """Client of a worker without which a session continues.
+
+    A subclass names the worker, sends its job by `_start`, and processes its messages.
+
+    Attributes
+    ----------
+    worker
+        Description of the process.
+    failure
+        Sentence that states why the process was lost; empty while it is used.
+    """
+
+    worker: ClassVar["Worker"]
+
+    def __init__(self, group: "ProcessGroup") -> None:
+        self.failure = ""
+        self._group = group
+        self._is_ready = self._is_done = False
+        self._restart_count = 0
+        self._events: list[LogEvent] = []
+
+    @abstractmethod
+    def _process_message(self, message: object) -> None:
+        """Process one message of the worker."""
+
+    def await_ready(self, call_while_waiting: Callable[[], bool]) -> str:
+        """Wait until the worker is ready; return why it is not, or an empty text.
+
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
+        """
+        start_s = self.worker.start_s
+        if not self._wait(lambda: self._is_ready, start_s, call_while_waiting):
+            self._lose(f"The {self.worker.name} process was not ready within {start_s:g} s.")
+        return self.failure
+
+    def poll(self) -> list[LogEvent]:
+        """Process the received messages, and return the new events for the operator."""
+        self.check()
+        events, self._events = self._events, []
+        return events
+
+    def check(self) -> None:
+        """Process the received messages, and give the worker up or restart it if it hangs."""
+        if self.process_messages(0.0) and self.worker.hung_after_s is not None:
+            limit_s = self.worker.hung_after_s if self._is_ready else self.worker.start_s
+            if self._group.stalled_s(self.worker) > limit_s:
+                self._group[self.worker].kill()
+                self._lose(
+                    f"The {self.worker.name} process was killed: no response for {limit_s:g} s."
+                )
+
+    def process_messages(self, timeout_s: float) -> bool:
+        """Process messages, waiting up to `timeout_s` seconds; return whether it is still used."""
+        if not (self.failure or self._is_done):
+            try:
+                for message in self._group[self.worker].messages(timeout_s):
+                    self._is_ready |= type(message).__name__ == self.worker.sends[0]
+                    if isinstance(message, Failed):
+                        self._process_failure(message.reason)
+                    else:
+                        self._process_message(message)
+                    if self._is_done:  # the worker may end now
+                        break
+            except ChildError as error:
+                self._lose(str(error))
+        return not (self.failure or self._is_done)
+
+    def _start(self, *messages: object) -> None:
+        """Start a process, or take one that waits for its job, and send it the first messages."""
+        self.failure, self._is_ready = "", False
+        try:
+            self._group.idle_process(self.worker)
+        except ChildError as error:
+            self._process_failure(str(error))
+        for message in messages:
+            self._send(message)
+
+    def _send(self, message: object) -> None:
+        """Send a message to the worker, unless it is lost."""
+        if not self.failure:
+            try:
+                self._group[self.worker].send(message)
+            except ChildError as error:
+                self._lose(str(error))
+
+    def _wait(
+        self,
+        is_met: Callable[[], bool],
+        timeout_s: float,
+        call_while_waiting: Callable[[], bool | None],
+    ) -> bool:
+        """Process messages until a condition is met or the worker is lost; return False if late.
+
+        The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
+        """
+        deadline_s = time.monotonic() + timeout_s
+        while not (is_met() or self.failure):
+            self.process_messages(_POLL_S)
+            if call_while_waiting() is False:
+                break
+            if time.monotonic() > deadline_s:
+                return is_met() or bool(self.failure)
+        return True
+
+    def _lose(self, reason: str) -> None:
+        """Restart the lost process, or give it up after its number of restarts."""
+        self._restart_count += 1
+        if self._restart_count > self.worker.restarts:
+            self._give_up(reason)
+            return
+        self._add_event("warning", f"{reason} It is restarted; the session continues.")
+        self._group[self.worker].kill()
+        self._restart()
+
+    def _restart(self) -> None:
+        """Start the process again with its job."""
+        raise NotImplementedError  # unless the table permits restarts
+
+    def _process_failure(self, reason: str) -> None:
+        """Continue without a worker that cannot be started, or reports why it cannot go on."""
+        self._give_up(reason)
+
+    def _give_up(self, reason: str) -> None:
+        """Continue without the worker, and add an event that states why and what follows."""
+        self.failure = reason
+        self._add_event("warning", f"{reason} {self._consequence}")
+
+    @property
+    def _consequence(self) -> str:
+        """Sentence that states what follows the loss of the worker."""
+        return self.worker.consequence
+
+    def _add_event(self, level: Level, message: str) -> None:
+        """Add an event for the operator."""
+        self._events.append(LogEvent(0, level, message))
