@@ -279,8 +279,10 @@ def section_text(kind: DeviceKind) -> str:
         if notes:
             lines.append(f"# {'; '.join(notes)}")
         is_optional = settings_field.default is not MISSING
-        default = settings_field.default if is_optional else "…"
-        value = json.dumps(default, ensure_ascii=False) if is_optional else default
+        if is_optional:
+            value = json.dumps(settings_field.default, ensure_ascii=False)
+        else:
+            value = "…" if is_number(hint) else '"…"'
         entry = f'{{ value = {value}, source = "assumed" }}' if is_number(hint) else value
         lines.append(f"{'# ' if is_optional else ''}{settings_field.name} = {entry}")
     return "\n".join(lines) + "\n"
