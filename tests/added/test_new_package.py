@@ -34,7 +34,7 @@ def test_a_new_package_passes_its_tests_and_joins(tmp_path):
     assert "9 passed" in done.stdout
     code, output, _ = rigd_with(folder, "plugins", "show", "mysensor", cwd=tmp_path)
     assert code == 0
-    assert "# address of the instrument\nhost = "…"\n" in output
+    assert '# address of the instrument\nhost = "…"\n' in output
 
 
 @pytest.mark.parametrize("name", ["Upper", "cia402", "a b", "../x"])
