@@ -25,6 +25,7 @@ T = TypeVar("T")
 
 GROUPS: Final = {
     "rigd.devices": "rigd.profile:check_device_plugin",
+    "rigd.excitations": "rigd.excitation:check_excitation_plugin",
 }
 """Groups of entry points, each with the function that checks an entry point of the group."""
 

@@ -75,7 +75,7 @@ def show(
 
 
 _TEMPLATE = Path(__file__).with_name("plugin_template")
-"""Folder with the files of a new package, in which NAME stands for the name of its device."""
+"""Folder with the files of a new package, in which NAME represents the name of its device."""
 _TEMPLATE_FILES = {
     "pyproject.toml.txt": "pyproject.toml",
     "README.md.txt": "README.md",

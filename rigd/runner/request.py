@@ -31,7 +31,7 @@ from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
 from rigd.engine.messages import Connected, Ending, FileHeader
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, find_excitation
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
@@ -442,7 +442,7 @@ def _session_metadata(
     if rig.acquisition is not None:
         metadata["acquisition_mode"] = rig.acquisition.mode
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
-    metadata = _device_metadata(rig) | metadata
+    metadata = _device_metadata(rig) | _excitation_metadata(order.excitation.kind) | metadata
     if order.profile.tip_mass_kg is not None:
         metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
     if order.profile.axis_tilt_deg is not None:
@@ -454,6 +454,18 @@ def _session_metadata(
         metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
     if rig.devices.drive == "sim" and rig.simulation is not None and rig.simulation.obstacles:
         metadata["simulation_obstacles"] = "; ".join(rig.simulation.obstacles)
+    return metadata
+
+
+def _excitation_metadata(kind: str) -> dict[str, str]:
+    """Return the package that adds an excitation, and its reason against the Welch method."""
+    added = find_excitation(kind)
+    if added is None:
+        return {}
+    declaration, owner = added
+    metadata = {"excitation_package": owner.label}
+    if declaration.welch_exclusion:
+        metadata["welch_exclusion"] = declaration.welch_exclusion
     return metadata
 
 

@@ -29,3 +29,6 @@ def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd")):
 
 DEVICES = Path(__file__).with_name("outside_devices.txt").read_text()
 """Code of a package with a drive and a sensor, both around the simulated rig."""
+
+EXCITATION = Path(__file__).with_name("outside_excitation.txt").read_text()
+"""Code of a package with the excitation ``triangle``."""

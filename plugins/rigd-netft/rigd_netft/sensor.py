@@ -223,7 +223,8 @@ class NetFtSensor:
                 "the rate in the box."
             )
         self.read_wrench()
-        self._offsets_ns = _NEVER_NS, _NEVER_NS  # ticks have not begun
+        if self._on_request is not None:  # its clock is that of the ticks, which have not begun
+            self._offsets_ns = _NEVER_NS, _NEVER_NS
 
     def _send(self, command: int) -> None:
         """Send a request; nothing tells whether it arrives."""
