@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from packages import EXCITATION, install, rigd_with
 
+from analysis.record import load_record
+from analysis.suited import welch_exclusion_reason
 from rigd.excitation import KINDS, ExcitationError, make_excitation
 from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
 from rigd.session import read_session
@@ -104,11 +106,14 @@ def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path):
         "--seed", "1", "--output", tmp_path / "out", cwd=tmp_path,
     )  # fmt: skip
     assert code == 0, output + errors
-    metadata = read_session(next((tmp_path / "out").glob("*-triangle.mcap"))).metadata
+    path = next((tmp_path / "out").glob("*-triangle.mcap"))
+    metadata = read_session(path).metadata
     assert metadata["excitation"] == "triangle"
     assert metadata["excitation_package"] == "lab-signals 0.4"
     assert metadata["welch_exclusion"].startswith("a triangle excites")
     assert float(metadata["amplitude_rad"]) == 0.005
+    # An analysis needs no package.
+    assert welch_exclusion_reason(load_record(path)).startswith("a triangle excites")
     code, _, errors = rigd_with(packages, "run", "triangle", "--amplitude", "3", "--fast")
     assert code == 2
     assert "amplitude_rad = 3.0 rad" in errors
