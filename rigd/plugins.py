@@ -17,7 +17,7 @@ from functools import lru_cache
 from pathlib import Path
 from typing import Final, TypeVar
 
-from rigd.errors import UserError
+from rigd.errors import FailureError, UserError
 from rigd.printable import listed, printable
 
 T = TypeVar("T")
@@ -26,6 +26,7 @@ T = TypeVar("T")
 GROUPS: Final = {
     "rigd.devices": "rigd.profile:check_device_plugin",
     "rigd.excitations": "rigd.excitation:check_excitation_plugin",
+    "analysis.formats": "analysis.exchange:check_format_plugin",
 }
 """Groups of entry points, each with the function that checks an entry point of the group."""
 
@@ -158,18 +159,27 @@ def check_plugin(plugin: Plugin) -> str:
 
 
 @contextlib.contextmanager
-def plugin_errors(plugin: Plugin | None) -> Iterator[None]:
+def plugin_errors(
+    plugin: Plugin | None, passed: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
     """Turn an unexpected exception of a package's code into an error that names the package.
 
     Errors for the operator and of the operating system are passed on. Nothing is changed for a part
-    of rigd itself, which is None.
+    of rigd itself.
+
+    Parameters
+    ----------
+    plugin
+        Part of a package, or None for a part of rigd.
+    passed
+        Further exceptions that are passed on.
     """
     try:
         yield
-    except (UserError, OSError):
+    except (UserError, FailureError, OSError, *passed):
         raise
     except Exception as error:
-        if plugin is None or hasattr(error, "exit_code"):
+        if plugin is None:
             raise
         raise plugin.error(
             f"its code failed ({_described(error)}); report that to the package's author."

@@ -32,3 +32,6 @@ DEVICES = Path(__file__).with_name("outside_devices.txt").read_text()
 
 EXCITATION = Path(__file__).with_name("outside_excitation.txt").read_text()
 """Code of a package with the excitation ``triangle``."""
+
+FORMAT = Path(__file__).with_name("outside_format.txt").read_text()
+"""Code of a package with the import format ``.npz``."""
