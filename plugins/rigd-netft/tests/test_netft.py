@@ -306,7 +306,12 @@ def test_an_independent_client_reads_the_simulated_box():
         try:
             config = pynetft.Config(sensor_host="127.0.0.1", rdt_port=box.port, http_port=http_port)
             client = pynetft.Client(config)
-            assert client is not None
+            client.start()
+            assert client.wait_for_first_sample(20)
+            sample = client.latest_sample()
+            client.stop()
+            assert tuple(sample.force) == pytest.approx(WRENCH[:3])
+            assert tuple(sample.torque) == pytest.approx(WRENCH[3:])
         finally:
             ended.set()
             streaming.join()
