@@ -174,9 +174,10 @@ def plugin_errors(
     passed
         Further exceptions that are passed on.
     """
+    passed_on: tuple[type[Exception], ...] = (UserError, FailureError, OSError, *passed)
     try:
         yield
-    except (UserError, FailureError, OSError, *passed):
+    except passed_on:
         raise
     except Exception as error:
         if plugin is None:
