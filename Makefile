@@ -36,6 +36,7 @@ check: $(VENV)/ready
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
+	$(BIN)/mypy plugins/rigd-netft/rigd_netft
 	$(BIN)/lint-imports
 	$(BIN)/python .ci/check_names.py
 	$(BIN)/python .ci/check_imports.py
@@ -68,11 +69,11 @@ endurance: $(VENV)/ready
 	$(BIN)/python tests/endurance/run_starved.py
 	$(BIN)/python tests/endurance/run_served.py
 
-$(VENV)/ready: pyproject.toml
+$(VENV)/ready: pyproject.toml plugins/rigd-netft/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "rigd needs Python 3.11 or newer; set PYTHON=/path/to/it")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/python -m pip install --quiet --editable . --group dev
+	$(BIN)/python -m pip install --quiet --editable . --editable plugins/rigd-netft --group dev
 	touch $@
 
 clean:

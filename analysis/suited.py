@@ -204,11 +204,13 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
         Requested band, in Hz.
     """
     excitation = record.metadata.get("excitation", "")
-    if excitation in _WELCH_EXCLUSIONS:
+    # A package that adds an excitation states the reason in the session file.
+    exclusion = _WELCH_EXCLUSIONS.get(excitation) or record.metadata.get("welch_exclusion", "")
+    if exclusion:
         paper_segmentation = WelchSettings().segmentation(record.rate_hz)
         is_long_enough = record.sweep_samples >= paper_segmentation.segment_length
         method_options = "--method welch" if is_long_enough else "--method welch --frf fft"
-        return f"{_WELCH_EXCLUSIONS[excitation]} ({method_options} makes them nevertheless)"
+        return f"{exclusion} ({method_options} makes them nevertheless)"
     planned_s = _metadata_number(record, "duration_s")
     swept_s = record.first_sweep_samples / record.rate_hz
     if requested_hz is not None or planned_s is None or swept_s >= _COMPLETE_FRACTION * planned_s:

@@ -8,6 +8,9 @@ from ._import_plan import ImportPlan as ImportPlan
 from ._import_record import import_record as import_record
 from ._import_record import write_session as write_session
 from ._source import ExchangeError as ExchangeError
+from ._source import ImportFormat as ImportFormat
+from ._source import SourceChannel as SourceChannel
 from ._source import TargetError as TargetError
+from ._source import check_format_plugin as check_format_plugin
 from ._source import read_source as read_source
 from ._specimen import read_specimen as read_specimen

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import stat
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from rigd.plugins import (
+    Plugin,
+    PluginError,
+    find_plugin,
+    installed_plugins,
+    load_plugin,
+    plugin_errors,
+)
 from rigd.printable import printable
 from rigd.session.limits import MAX_SAMPLES
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+    from collections.abc import Iterable, Iterator
 
     from numpy.typing import NDArray
 
@@ -82,31 +91,61 @@ class SourceChannel:
     unapplied_scale: str = ""
 
 
+ReadChannels = Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
+"""Function that reads channels of a file, by their names."""
+
+
 @dataclass(frozen=True, slots=True)
-class _Format:
-    """File format, read by the function ``read(path, names)`` of a module of this package."""
+class ImportFormat:
+    """Declaration of a file format that can be imported.
+
+    An installed package adds one by an entry point of the group ``analysis.formats``, whose name is
+    the suffix of the files without the dot.
+
+    Attributes
+    ----------
+    name : str
+        Name of the format, for messages.
+    read : callable
+        Function of a path and names of channels that returns a `SourceChannel` for each name. It
+        raises `ExchangeError` for a channel that the file lacks.
+    max_bytes : int
+        Largest file that is read; its reader needs up to ten times as much memory.
+    """
 
     name: str
-    module: str
+    read: ReadChannels
     max_bytes: int
-    """Largest file that is read; its reader needs up to ten times as much memory."""
+
+
+def _shipped(name: str, module: str, max_bytes: int) -> ImportFormat:
+    """Return a format whose module of this package is imported when a file is read."""
+
+    def read(path: Path, channel_names: Sequence[str]) -> Mapping[str, SourceChannel]:
+        read_format: ReadChannels = import_module(f"analysis.exchange.{module}").read
+        return read_format(path, channel_names)
+
+    return ImportFormat(name, read, max_bytes)
 
 
 _MEGABYTE: Final = 1_000_000
 """Number of bytes in a megabyte."""
 
+FORMAT_GROUP: Final = "analysis.formats"
+"""Group of the entry points by which packages add file formats."""
+
 _FORMATS: Final = {
-    ".csv": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".txt": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".dat": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".tsv": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".asc": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".lvm": _Format("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".mat": _Format("MATLAB", "_matlab_format", 512 * _MEGABYTE),
-    ".tdms": _Format("TDMS", "_tdms_format", 512 * _MEGABYTE),
-    ".uff": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
-    ".unv": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
-    ".uf58": _Format("UFF58", "_uff_format", 128 * _MEGABYTE),
+    ".csv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".txt": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".dat": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".tsv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".asc": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".lvm": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+    ".mat": _shipped("MATLAB", "_matlab_format", 512 * _MEGABYTE),
+    ".tdms": _shipped("TDMS", "_tdms_format", 512 * _MEGABYTE),
+    ".uff": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+    ".unv": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+    ".uf58": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
 }
 """File format by the suffix of the file's name."""
 
@@ -120,7 +159,7 @@ def read_source(
     ----------
     path : Path
         File whose suffix selects the format: .csv, .txt, .dat, .tsv, .asc, .lvm, .mat, .tdms, .uff,
-        .unv or .uf58.
+        .unv or .uf58, or one that an installed package adds.
     channel_names : sequence of str
         Names of the channels, as in docs/exchange.md.
 
@@ -136,17 +175,21 @@ def read_source(
     ExchangeError
         If the file cannot be read, or lacks a requested channel of numbers.
     """
-    file_format = _FORMATS.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    try:
+        owner = None if suffix in _FORMATS else find_plugin(FORMAT_GROUP, suffix.removeprefix("."))
+        file_format = _FORMATS.get(suffix) if owner is None else load_plugin(owner, ImportFormat)
+    except PluginError as error:
+        raise ExchangeError(f"{path}: {error}") from error
     if file_format is None:
+        added = [f".{plugin.name}" for plugin in installed_plugins(FORMAT_GROUP)]
         raise ExchangeError(
             f"{path}: the ending of the name selects the format; give a file that ends in one of "
-            f"{', '.join(_FORMATS)}."
+            f"{', '.join([*_FORMATS, *added])}."
         )
     _check_file(path, file_format)
-    read_format: Callable[[Path, Sequence[str]], Mapping[str, SourceChannel]]
-    read_format = import_module(f"analysis.exchange.{file_format.module}").read
     try:
-        channels = read_format(path, channel_names)
+        channels = _read_checked(file_format, owner, path, channel_names)
     except OSError as error:
         raise ExchangeError(f"{path}: cannot be read ({error.strerror or error}).") from error
     except MemoryError as error:
@@ -165,7 +208,38 @@ def read_source(
     return file_format.name, channels
 
 
-def _check_file(path: Path, file_format: _Format) -> None:
+def _read_checked(
+    file_format: ImportFormat, owner: Plugin | None, path: Path, channel_names: Sequence[str]
+) -> Mapping[str, SourceChannel]:
+    """Return the channels of a file; those that a package has read are checked."""
+    if owner is None:
+        return file_format.read(path, channel_names)
+    try:
+        with plugin_errors(owner, (ExchangeError, MemoryError)):
+            channels = file_format.read(path, channel_names)
+            return {
+                name: replace(channels[name], values=np.asarray(channels[name].values, float))
+                for name in channel_names
+            }
+    except PluginError as error:
+        raise ExchangeError(f"{path}: {error}") from error
+
+
+def check_format_plugin(plugin: Plugin) -> str:
+    """Import the file format that an installed package adds, and return its name.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    if f".{plugin.name}" in _FORMATS:
+        raise plugin.error("files of this suffix are read by rigd; it cannot be replaced.")
+    file_format = load_plugin(plugin, ImportFormat)
+    return f"{file_format.name}, import of .{plugin.name}"
+
+
+def _check_file(path: Path, file_format: ImportFormat) -> None:
     """Raise if a path is no regular file, or if the file is too large for its format."""
     try:
         file_status = path.stat()

@@ -6,11 +6,11 @@ The order matters: a failure on paper can rule out that devices are connected.
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.checks._gate import paper_rows
 from rigd.checks.devices import calibration_rows, inspect_devices
 from rigd.checks.machine import machine_rows, rights_rows
 from rigd.checks.on_paper import wiring_rows
-from rigd.checks.rows import CheckResult, CheckRow, grade
 from rigd.devices import unknown_values
 from rigd.errors import UserError
 from rigd.profile import Profile

@@ -8,8 +8,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Final
 
+from rigd.check_rows import CheckResult, CheckRow
 from rigd.checks import on_paper as paper
-from rigd.checks.rows import CheckResult, CheckRow
 from rigd.devices import unknown_values
 from rigd.errors import FailureError, UserError
 from rigd.profile import Profile
@@ -66,6 +66,12 @@ PAPER_CHECKS: Final = (
         lambda profile: paper.wiring_rows(profile.rig),
         (paper.CAN_IDENTIFIERS_ROW, paper.CAN_LOAD_ROW, paper.SERIAL_LOAD_ROW),
         not_acceptable="devices could receive what is not meant for them, or too late",
+        needs_values=False,
+    ),
+    PaperCheck(
+        paper.added_device_rows,
+        (paper.DEVICE_ROW,),
+        not_acceptable="the device could not be used",
         needs_values=False,
     ),
     PaperCheck(

@@ -13,14 +13,17 @@ from typing import Protocol, runtime_checkable
 
 import numpy as np
 
-from rigd.checks.rows import CheckResult, CheckRow, format_value, grade, key_label
+from rigd.check_rows import CheckResult, CheckRow, grade
+from rigd.checks.rows import format_value, key_label
 from rigd.devices import ActuationTarget, actuation_target, open_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.kinds import find_kind, find_owner
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import find_simulator
 from rigd.engine.timing import RealClock
+from rigd.plugins import plugin_errors
 from rigd.profile import Profile
 from rigd.safety.probing_move import PROBED_KEYS
 
@@ -275,8 +278,8 @@ def _required_calibration_value(key: str, rig: RigParameters) -> str:
     """Return the value of a key of the calibration that the profile requires, or ""."""
     if key != "serial_number":
         return ""
-    serial_number = rig.ati_can.serial_number if rig.ati_can else ""
-    return serial_number or (rig.ati_serial.serial_number if rig.ati_serial else "") or "any"
+    all_settings = (rig.ati_can, rig.ati_serial, *rig.added_settings)
+    return next(filter(None, (getattr(each, key, "") for each in all_settings)), "any")
 
 
 def _range_row(calibration: Mapping[str, object], profile_range: tuple[float, ...]) -> CheckRow:
@@ -311,8 +314,7 @@ def _assess_diagnostic(
     deadline_text = f"at most {deadline_s * 1e3:.4g} ms"
     if key == "polls_hz":
         return f"at least {rig.rate_hz:g} Hz", grade(fail=not measured_value >= rig.rate_hz)
-    if key == "records_hz" and rig.ati_serial is not None:
-        stated_hz = rig.ati_serial.stream_hz
+    if key == "records_hz" and (stated_hz := _stream_hz(rig)) is not None:
         relative_error = abs(measured_value / stated_hz - 1.0)
         return f"{stated_hz:g} Hz", grade(
             fail=not relative_error <= _RATE_ERROR_FAILURE,
@@ -326,6 +328,15 @@ def _assess_diagnostic(
         return f"at most {period_s * 1e3:.4g} ms", grade(fail=False, warn=measured_value > period_s)
     # All other diagnostics are counts of errors.
     return "0", grade(fail=False, warn=measured_value > 0)
+
+
+def _stream_hz(rig: RigParameters) -> float | None:
+    """Return the records per second that the sensor streams, or None if it is polled."""
+    kind = find_kind(rig.devices.sensor)
+    if kind is None or kind.stream_hz is None:
+        return None
+    with plugin_errors(find_owner(kind.name)):
+        return kind.stream_hz(rig)
 
 
 # Exchange of a tick
@@ -553,11 +564,10 @@ def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow
     if rig.can is not None:
         bus_text = f"{rig.can.channel} ({rig.can.interface})"
         yield CheckRow("link", "CAN", bus_text, "", CheckResult.OK)
-    if rig.ati_serial is not None:
-        yield CheckRow(
-            "link",
-            "serial",
-            f"{rig.ati_serial.port}, {rig.ati_serial.baud} baud",
-            "",
-            CheckResult.OK,
-        )
+    sensor_kind = find_kind(rig.devices.sensor)
+    if sensor_kind is not None and sensor_kind.address is not None:
+        owner = find_owner(sensor_kind.name)
+        with plugin_errors(owner):
+            sensor_address = sensor_kind.address(rig)
+        label = "serial" if owner is None else sensor_kind.name
+        yield CheckRow("link", label, sensor_address, "", CheckResult.OK)

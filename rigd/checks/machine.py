@@ -14,7 +14,7 @@ import subprocess
 from collections.abc import Iterator
 from pathlib import Path
 
-from rigd.checks.rows import CheckResult, CheckRow, grade
+from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.engine.realtime import MEMORY_LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
 from rigd.runtime import OWN_PYTHON

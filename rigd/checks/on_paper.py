@@ -28,7 +28,7 @@ its friction alone.
 """
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from inspect import signature
 from math import degrees, inf, isfinite, isinf, log1p, log10, radians, sin
@@ -37,11 +37,13 @@ from typing import TYPE_CHECKING
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.realisation import RealisationError
-from rigd.checks.rows import CheckResult, CheckRow, grade
+from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.control import ControlDesignError, stable_loop
-from rigd.devices import MAY_BE_UNKNOWN, unknown_values
+from rigd.devices import MAY_BE_UNKNOWN, is_simulated_here, unknown_values
+from rigd.devices.kinds import find_owner, selected_kinds
 from rigd.devices.parameters import RigParameters
 from rigd.excitation import chirp
+from rigd.plugins import plugin_errors
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S
 from rigd.safety.limits import Limits
@@ -534,7 +536,7 @@ _EXAMPLE_TILT_DEG = 0.5
 
 def axis_tilt_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the result on the measured inclination of the motor's axis; it refuses no session."""
-    if profile.rig.devices.drive == "sim":
+    if is_simulated_here(profile.rig):
         found_text, detail_text, check_result = (
             "the simulated rig has no gravity",
             "",
@@ -598,6 +600,22 @@ def wiring_rows(rig: RigParameters) -> Iterator[CheckRow]:
         yield _bus_row(bus_load(rig), rig.can.bitrate_bit_s)
     if rig.ati_serial is not None:
         yield _line_row(rig.ati_serial)
+
+
+DEVICE_ROW = "device_settings"
+"""Name of the rows that installed packages add for their devices."""
+
+
+def added_device_rows(profile: Profile) -> Iterator[CheckRow]:
+    """Yield the rows that the kinds of the profile's devices declare."""
+    for kind in selected_kinds(profile.rig.devices):
+        owner = find_owner(kind.name)
+        if owner is not None:
+            yield CheckRow("devices", kind.name, owner.label, "", CheckResult.OK)
+        if kind.check_rows is not None:
+            with plugin_errors(owner):
+                for row in kind.check_rows(profile.rig):
+                    yield replace(row, name=DEVICE_ROW)
 
 
 def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:

@@ -13,6 +13,7 @@ from rigd.cli.identify import identify_app
 from rigd.cli.library import info, list_sessions, recover, specimens
 from rigd.cli.live import live, replay
 from rigd.cli.options import exit_on_errors
+from rigd.cli.plugins import plugins_app
 from rigd.cli.probe import probe
 from rigd.cli.profiles import profiles_app
 from rigd.cli.run import run_app, start_app
@@ -42,7 +43,7 @@ _SECTIONS: Final = {
     "Sessions": ("run", "serve", "start", "status", "stop"),
     "Rig": ("check", "tare", "zero", "reset", "live"),
     "Session files": ("list", "info", "replay", "recover"),
-    "Set-up": ("profiles", "specimens", "probe", "identify", "bench"),
+    "Set-up": ("profiles", "plugins", "specimens", "probe", "identify", "bench"),
     "Simulated devices": ("simulate", "inject"),
 }
 """Names of the commands in each section of the help."""
@@ -117,6 +118,7 @@ app.command()(recover)
 app.command()(probe)
 app.add_typer(identify_app, name="identify")
 app.add_typer(profiles_app, name="profiles")
+app.add_typer(plugins_app, name="plugins")
 app.command()(bench)
 app.command()(simulate)
 app.command()(inject)

@@ -14,7 +14,7 @@ from rigd.runtime import raise_on_signals
 
 if TYPE_CHECKING:
     from rigd.bench import Results
-    from rigd.checks.rows import CheckRow
+    from rigd.check_rows import CheckRow
     from rigd.profile import Profile
 
 
@@ -71,15 +71,16 @@ def _print_result(check_rows: "list[CheckRow]", *, as_json: bool, on_paper: bool
 
     `on_paper` states that the rows are those of an EDS file only.
     """
-    from rigd.checks.rows import overall
+    from rigd.check_rows import overall
 
     verdict = overall(check_rows)
     if as_json:
         json_document = {"verdict": verdict, "rows": [row.as_dict() for row in check_rows]}
         typer.echo(json.dumps(json_document, ensure_ascii=False))
     else:
+        from rigd.check_rows import CheckResult
         from rigd.checks import ACCEPTABLE
-        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, CheckResult, print_table
+        from rigd.checks.rows import EDS_CONSEQUENCES, RIG_CONSEQUENCES, print_table
 
         print_table(check_rows, EDS_CONSEQUENCES if on_paper else RIG_CONSEQUENCES)
         has_failed = {row.name for row in check_rows if row.verdict is CheckResult.FAIL}

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 from rigd.cli.options import (
     EXIT_FAILED,
@@ -38,14 +39,43 @@ from rigd.cli.options import (
     session_notes,
 )
 from rigd.cli.start import SessionCommands, start_processes, start_sessions
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
     from rigd.excitation import Value
     from rigd.runner.session import RunResult
 
+
+class _AddedExcitations(TyperGroup):
+    """Group of the excitations' subcommands, with those of installed packages.
+
+    A package is imported when its excitation is named; the help lists the names alone.
+    """
+
+    # Typer's click is its own in some versions and the package of that name in others.
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:  # noqa: ANN401
+        """Return a subcommand; that of a package is made first."""
+        command = super().get_command(ctx, cmd_name)
+        return command or _added_command(self.name or "run", cmd_name)
+
+    def format_commands(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
+        """Write the list of commands of the help text, and what installed packages add."""
+        from rigd.plugins import installed_plugins
+
+        super().format_commands(ctx, formatter)
+        added = installed_plugins("rigd.excitations")
+        if added:
+            with formatter.section("Excitations of installed packages (rigd plugins)"):
+                formatter.write_dl([(plugin.name, plugin.label) for plugin in added])
+
+
+class _RunCommands(_AddedExcitations, SessionCommands):
+    """Subcommands of ``rigd run``."""
+
+
 run_app = typer.Typer(
     name="run",
-    cls=SessionCommands,
+    cls=_RunCommands,
     help="Run one or more sessions in the foreground; Ctrl-C stops safely.\n\n"
     "Example: rigd run chirp --profile sim --fast",
     no_args_is_help=True,
@@ -53,6 +83,7 @@ run_app = typer.Typer(
 )
 start_app = typer.Typer(
     name="start",
+    cls=_AddedExcitations,
     help="Run one or more sessions on the daemon; Ctrl-C stops safely.\n\n"
     "Example: rigd start chirp --repeat 20",
     no_args_is_help=True,
@@ -125,6 +156,49 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
         {"ignore_unknown_options": True} if excitation_kind in ("move", "touch") else None
     )
     app.command(excitation_kind, help=help_text, context_settings=command_settings)(command)
+
+
+def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's click varies
+    """Return the subcommand of an excitation that an installed package adds, or None."""
+    from rigd.excitation import find_excitation, option_types
+
+    added = find_excitation(name)
+    if added is None:
+        return None
+    kind, owner = added
+
+    def parameters(**options: "Value") -> "dict[str, Value]":
+        return options
+
+    parameters.__name__ = name
+    parameters.__doc__ = f"{kind.summary} (package {owner.label})."
+    parameters.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
+        [
+            inspect.Parameter(
+                option,
+                inspect.Parameter.KEYWORD_ONLY,
+                default=default,
+                annotation=Annotated[
+                    value_type,
+                    typer.Option(_option_flag(option), help=f"{text or option}{_in_unit(option)}."),
+                ],
+            )
+            for option, (value_type, default, text) in option_types(kind).items()
+        ]
+    )
+    app = typer.Typer(name=app_name, rich_markup_mode=None)
+    _add_subcommand(app, run_sessions if app_name == "run" else start_sessions, parameters)
+    return typer.main.get_command(app)
+
+
+def _option_flag(option: str) -> str:
+    """Return the flag of an option: without the units s and rad, as of rigd's own."""
+    return "--" + option.removesuffix("_s").removesuffix("_rad").replace("_", "-")
+
+
+def _in_unit(option: str) -> str:
+    """Return the unit of an option in parentheses after a space, or "" if it has none."""
+    return f" ({unit_of(option)})" if unit_of(option) else ""
 
 
 def run_sessions(

@@ -90,8 +90,8 @@ class CheckJob:
 
     def perform(self) -> dict[str, Any]:
         """Return the results of all checks and the verdict as a dictionary for JSON."""
+        from rigd.check_rows import overall
         from rigd.checks import check_without_devices
-        from rigd.checks.rows import overall
 
         check_rows = check_without_devices(self.profile, self.calibration)
         return {

@@ -3,6 +3,7 @@ from ._registry import actuation_target as actuation_target
 from ._registry import bus_conflicts as bus_conflicts
 from ._registry import check_selection as check_selection
 from ._registry import describe_actuation_target as describe_actuation_target
+from ._registry import is_simulated_here as is_simulated_here
 from ._registry import open_devices as open_devices
 from ._registry import simulated_differently as simulated_differently
 from ._registry import simulator as simulator

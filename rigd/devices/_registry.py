@@ -1,31 +1,17 @@
-"""Registry of the drivers that a profile can name; only the named drivers are imported."""
+"""Opening of the devices that a profile names, and what then moves; only these are imported."""
 
 import importlib
-from collections.abc import Callable
 from enum import Enum
 from pathlib import Path
 from types import ModuleType
-from typing import cast
 
 from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
+from rigd.devices.kinds import find_kind, find_owner, fits, known_selections
 from rigd.devices.parameters import DeviceSelection, RigParameters
 from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
-
-# Drive and sensor use the same plant or bus, so drivers are opened in pairs.
-_OPENERS = {
-    DeviceSelection(drive="sim", sensor="sim"): ("rigd.sim._devices", "open_simulated_rig"),
-    DeviceSelection(drive="cia402", sensor="ati_can"): (
-        "rigd.devices._wired_rig",
-        "open_wired_rig",
-    ),
-    DeviceSelection(drive="cia402", sensor="ati_serial"): (
-        "rigd.devices._wired_rig",
-        "open_wired_rig",
-    ),
-}
-"""Module and function that open a pair of drive and sensor, by the selection in a profile."""
+from rigd.plugins import PluginError, plugin_errors
 
 
 class UnknownDeviceError(UserError, ValueError):
@@ -67,9 +53,12 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
     ------
     UnknownDeviceError
         If there is no such combination; the message lists the existing combinations.
+    PluginError
+        If the package that adds one of the devices cannot be used.
     """
-    if selection not in _OPENERS:
-        known_pairs = "; ".join(f'drive = "{s.drive}" with sensor = "{s.sensor}"' for s in _OPENERS)
+    drive, sensor = find_kind(selection.drive), find_kind(selection.sensor)
+    if drive is None or sensor is None or not fits(drive, sensor):
+        known_pairs = "; ".join(known_selections())
         file_prefix = "" if source is None else f"{source}: "
         raise UnknownDeviceError(
             f'{file_prefix}devices: drive = "{selection.drive}" with sensor = '
@@ -78,9 +67,15 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
         )
 
 
+def is_simulated_here(rig: RigParameters) -> bool:
+    """Return whether the drive of a rig is a simulation in the process that opens it."""
+    kind = find_kind(rig.devices.drive)
+    return kind is not None and kind.in_process
+
+
 def actuation_target(rig: RigParameters) -> ActuationTarget:
     """Return what would move if the devices of a rig were opened now."""
-    if rig.devices.drive == "sim":
+    if is_simulated_here(rig):
         return ActuationTarget.SIMULATED
     running_simulator = find_simulator(rig.name)
     if running_simulator is None:
@@ -101,12 +96,16 @@ def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> st
     if target is not ActuationTarget.HARDWARE:
         how = "in this process" if target is ActuationTarget.SIMULATED else target.value
         return f"No hardware: {rig.name} is simulated ({how})."
-    assert rig.can is not None
-    assert rig.cia402 is not None
-    return (
-        f"HARDWARE: {rig.name} moves the drive on {rig.can.interface} {rig.can.channel}, node "
-        f"{rig.cia402.node_id}."
-    )
+    return f"HARDWARE: {rig.name} moves the drive on {drive_address(rig)}."
+
+
+def drive_address(rig: RigParameters) -> str:
+    """Return where the drive of a rig is connected, as a phrase."""
+    kind = find_kind(rig.devices.drive)
+    if kind is None or kind.address is None:
+        return rig.devices.drive
+    with plugin_errors(find_owner(kind.name)):
+        return kind.address(rig)
 
 
 def simulated_differently(rig: RigParameters) -> list[str]:
@@ -114,7 +113,7 @@ def simulated_differently(rig: RigParameters) -> list[str]:
 
     The list is empty if no simulator runs.
     """
-    running_simulator = None if rig.devices.drive == "sim" else find_simulator(rig.name)
+    running_simulator = None if is_simulated_here(rig) else find_simulator(rig.name)
     return [] if running_simulator is None else differences(rig, running_simulator)
 
 
@@ -165,12 +164,10 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
     unknown_text = describe_unknown_values(rig)
     if unknown_text:
         raise DeviceError(unknown_text)
-    module_name, opener_name = _OPENERS[rig.devices]
-    opener = cast(
-        "Callable[[RigParameters], Devices]",
-        getattr(importlib.import_module(module_name), opener_name),
-    )
-    devices = opener(rig)
+    try:
+        devices = _create(rig)
+    except PluginError as error:
+        raise DeviceError(str(error)) from error
     if target is not None and devices.simulated is (target is ActuationTarget.HARDWARE):
         present_target = "a simulated rig" if devices.simulated else ActuationTarget.HARDWARE.value
         raise DeviceError(
@@ -178,3 +175,17 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
             "simulate was started or ended in between. Nothing was sent; start again."
         )
     return devices
+
+
+def _create(rig: RigParameters) -> Devices:
+    """Create drive and sensor of a rig with a valid selection of devices."""
+    drive_kind, sensor_kind = find_kind(rig.devices.drive), find_kind(rig.devices.sensor)
+    assert drive_kind is not None
+    assert drive_kind.open_drive is not None
+    assert sensor_kind is not None
+    assert sensor_kind.open_sensor is not None
+    with plugin_errors(find_owner(drive_kind.name)):
+        opened = drive_kind.open_drive(rig)
+    with plugin_errors(find_owner(sensor_kind.name)):
+        sensor = sensor_kind.open_sensor(opened.rig, opened)
+    return Devices(opened.drive, sensor, opened.simulated, opened.renew_noise)

@@ -1,6 +1,6 @@
-"""Opening of drive and sensor on a CAN bus or serial line as one rig, and the reset of a fault."""
+"""Opening of a CiA 402 drive on its bus, or on the simulator of it, and the reset of a fault."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Protocol, runtime_checkable
@@ -8,7 +8,8 @@ from typing import Protocol, runtime_checkable
 from rigd.devices._registry import ActuationTarget, bus_conflicts, open_devices
 from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
-from rigd.devices.contracts import DeviceError, Devices, WrenchSensor
+from rigd.devices.contracts import DeviceError
+from rigd.devices.declaration import OpenedDrive
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import SimulatorAddress, ask_simulator, find_simulator
 
@@ -21,8 +22,18 @@ _NETWORK_INTERFACES_FOLDER = Path("/sys/class/net")
 """Folder in which the kernel lists the network interfaces, CAN included."""
 
 
-def open_wired_rig(rig: RigParameters) -> Devices:
-    """Create the drivers of a rig on CAN, or on CAN and a serial line; nothing is connected yet.
+@dataclass(frozen=True, slots=True)
+class WiredLine:
+    """Bus of a CiA 402 drive, and the simulator that replaces it."""
+
+    can_link: CanLink
+    """Bus of the drive."""
+    simulator: SimulatorAddress | None
+    """Simulator of the rig's bus and serial line; None: the hardware is used."""
+
+
+def open_wired_drive(rig: RigParameters) -> OpenedDrive:
+    """Create the drive of a rig on CAN; nothing is connected yet.
 
     Raises
     ------
@@ -43,32 +54,20 @@ def open_wired_rig(rig: RigParameters) -> Devices:
             long_deadline = replace(rig.acquisition, deadline_us=_LOCK_STEP_DEADLINE_US)
             rig = replace(rig, acquisition=long_deadline)
     can_link = CanLink(bus, running_simulator)
-    return Devices(
-        drive=Cia402Drive(rig, can_link),
-        sensor=_make_sensor(rig, can_link, running_simulator),
+    return OpenedDrive(
+        rig,
+        Cia402Drive(rig, can_link),
         simulated=running_simulator is not None,
         renew_noise=None
         if running_simulator is None
         else partial(_restart_simulator_noise, running_simulator),
+        line=WiredLine(can_link, running_simulator),
     )
 
 
 def _restart_simulator_noise(simulator: SimulatorAddress, seed: int | None) -> int:
     """Restart the noise of a simulated rig with a seed (None: a random one); return the seed."""
     return int(ask_simulator(simulator, {"renew_noise": seed})["seed"])
-
-
-def _make_sensor(
-    rig: RigParameters, can_link: CanLink, simulator: SimulatorAddress | None
-) -> WrenchSensor:
-    """Create the driver of the force-torque sensor, on the serial line or on the CAN bus."""
-    if rig.devices.sensor == "ati_serial":
-        from rigd.devices.ati import AtiSerialSensor
-
-        return AtiSerialSensor(rig, simulator)
-    from rigd.devices.ati import AtiCanSensor
-
-    return AtiCanSensor(rig, can_link)
 
 
 def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:

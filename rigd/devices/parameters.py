@@ -5,11 +5,14 @@ The ranges (``Gt``, ``Ge``, …) are enforced where a profile is loaded (:mod:`r
 
 import math
 from dataclasses import dataclass, field
-from typing import Annotated, Literal
+from typing import Annotated, Literal, TypeVar
 
 from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.beam import Beam, Damping
+
+T = TypeVar("T")
+"""Type of the settings of a device."""
 
 OPTIONAL = {"optional": True}
 """Metadata of a field whose key a profile may omit; the field then has its default value."""
@@ -374,3 +377,23 @@ class RigParameters:
     """Settings of the sensor on CAN; None: the rig has none."""
     ati_serial: AtiSerial | None = field(default=None)
     """Settings of the sensor on a serial line; None: the rig has none."""
+    added_settings: tuple[object, ...] = ()
+    """Settings of devices that installed packages add, each of the type that its kind declares."""
+
+    def settings_of(self, settings_type: type[T]) -> T:
+        """Return the settings of a device that an installed package adds.
+
+        Parameters
+        ----------
+        settings_type
+            Dataclass that the device's kind declares as `settings`.
+
+        Raises
+        ------
+        LookupError
+            If the profile does not have the section.
+        """
+        for settings in self.added_settings:
+            if isinstance(settings, settings_type):
+                return settings
+        raise LookupError(f"The profile has no section for {settings_type.__name__}.")

@@ -1,16 +1,18 @@
 """Excitations by name and parameters, from a request or a command line."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Protocol
 
+from rigd.excitation._added import ExcitationKinds
 from rigd.excitation._from_file import from_csv
 from rigd.excitation._narrow_sweeps import SweepRig, modes
 from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
 from rigd.excitation._until import ScanRig, until
+from rigd.plugins import Plugin
 
 Value = float | int | str | Path
 """Type of an option's value in a request for an excitation."""
@@ -20,18 +22,22 @@ class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
     """Interface to a rig for which any kind of excitation is planned: limits and predictions."""
 
 
-KINDS: Mapping[str, Callable[..., Excitation]] = {
-    "chirp": chirp,
-    "hold": hold,
-    "step": step,
-    "multisine": multisine,
-    "file": from_csv,
-    "modes": modes,
-    "move": move,
-    "touch": touch,
-    "until": until,
-}
-"""Functions that return an excitation, by its name on the command line and in session files."""
+KINDS = ExcitationKinds(
+    {
+        "chirp": chirp,
+        "hold": hold,
+        "step": step,
+        "multisine": multisine,
+        "file": from_csv,
+        "modes": modes,
+        "move": move,
+        "touch": touch,
+        "until": until,
+    }
+)
+"""Functions that return an excitation, by its name on the command line and in session files.
+
+They include those of installed packages."""
 
 RIG_ARGUMENTS = frozenset({"rate_hz", "rig", "tip_slope_rad"})
 """Names of arguments of these functions that are data or limits of the rig, not options of the
@@ -70,3 +76,14 @@ def make_excitation(
     if "rig" in inspect.signature(make_kind).parameters:
         return make_kind(rate_hz=rate_hz, rig=rig, **parameters)
     return make_kind(rate_hz=rate_hz, **parameters)
+
+
+def check_excitation_plugin(plugin: Plugin) -> str:
+    """Import the excitation that an installed package adds, and return its summary.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    return KINDS.check_plugin(plugin)

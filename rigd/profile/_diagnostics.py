@@ -15,9 +15,8 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.devices import MAY_BE_UNKNOWN
-from rigd.devices.ati import RECORD_BITS
-from rigd.devices.cia402 import parse_assignment
-from rigd.devices.cia402.requirements import ACCEPTABLE
+from rigd.devices.declaration import DeviceKind
+from rigd.devices.kinds import find_owner, selected_kinds
 from rigd.devices.obstacles import (
     INCOMPATIBLE_WITH_FORCES,
     INCOMPATIBLE_WITH_OBSTACLES,
@@ -25,13 +24,14 @@ from rigd.devices.obstacles import (
     check_obstacles,
     parse_obstacle,
 )
-from rigd.devices.parameters import AtiSerial
+from rigd.devices.parameters import DeviceSelection
+from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile._schema import (
-    DEVICE_SECTIONS,
     SECTIONS,
     SOURCES,
     TEXT_KEYS,
+    device_sections,
     is_number,
     key_types,
     section_fields,
@@ -60,8 +60,6 @@ _FIRST_MODE_BAND_HZ = 0.1, 100.0
 """Plausible lowest and highest frequency in Hz of the undamped beam's first mode."""
 
 
-_PER_MILLE_LIMIT = 32.767
-"""Largest ratio of torque to rated torque that the 16 bits of object 6071 can hold."""
 _ROUNDING_S = 1e-9
 """Largest rounding error in seconds of a stated delay."""
 _PARALLEL_TOLERANCE = 1e-6
@@ -450,10 +448,10 @@ def wiring_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         return
     if "acquisition.mode" in profile_values:
         yield from _acquisition_contradictions(profile_values)
-    if "cia402.node_id" in profile_values:
-        yield from _drive_contradictions(profile_values)
-    if "ati_serial.port" in profile_values:
-        yield from _serial_contradictions(profile_values)
+    for kind in _selected_kinds(profile_values):
+        if kind.contradictions is not None:
+            with plugin_errors(find_owner(kind.name)):
+                yield from kind.contradictions(profile_values)
     yield from _delay_contradictions(profile_values)
 
 
@@ -461,16 +459,13 @@ def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for profile sections that the selected devices lack or do not use."""
     drive_name, sensor_name = profile_values["devices.drive"], profile_values["devices.sensor"]
     required_sections = {
-        *DEVICE_SECTIONS.get(drive_name, ()),
-        *DEVICE_SECTIONS.get(sensor_name, ()),
+        section_name
+        for kind in _selected_kinds(profile_values)
+        for section_name in kind.required_sections
     }
     used_sections = {
         section_name
-        for section_name in {
-            device_name
-            for section_names in DEVICE_SECTIONS.values()
-            for device_name in section_names
-        }
+        for section_name in device_sections()
         if any(key in profile_values for key, _ in section_fields(section_name))
     }
     for section_name in sorted(required_sections - used_sections):
@@ -486,6 +481,13 @@ def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
         )
 
 
+def _selected_kinds(profile_values: Mapping[str, Any]) -> tuple[DeviceKind, ...]:
+    """Return the known kinds of device that a profile names."""
+    return selected_kinds(
+        DeviceSelection(profile_values["devices.drive"], profile_values["devices.sensor"])
+    )
+
+
 def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield a message if the deadline of the replies is longer than a period."""
     period_us = 1e6 / profile_values["rig.rate_hz"]
@@ -497,101 +499,14 @@ def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[s
         )
 
 
-def _drive_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for contradictions in the settings of a CiA 402 drive."""
-    if profile_values["cia402.direction"] == 0:
-        yield "cia402.direction = 0 must be 1, or -1 where the drive turns the other way round."
-    if profile_values["cia402.host_node_id"] == profile_values["cia402.node_id"]:
-        yield (
-            f"cia402.host_node_id = {profile_values['cia402.host_node_id']} is the drive's own "
-            "cia402.node_id; choose another."
-        )
-    max_speed_rad_s, speed_limit_rad_s = (
-        profile_values["cia402.max_speed_rad_s"],
-        profile_values["limits.velocity_rad_s"],
-    )
-    if 0 < max_speed_rad_s < speed_limit_rad_s:
-        yield (
-            f"cia402.max_speed_rad_s = {max_speed_rad_s:g} rad/s is below "
-            f"limits.velocity_rad_s = {speed_limit_rad_s:g} "
-            "rad/s; the drive would hold back torques that a session may ask for. Choose a quarter "
-            "more than the limit, or 0 to leave what the drive has."
-        )
-    peak_ratio = profile_values["motor.peak_torque_nm"] / profile_values["motor.rated_torque_nm"]
-    if peak_ratio > _PER_MILLE_LIMIT:
-        yield (
-            f"motor.peak_torque_nm is {peak_ratio:g} times motor.rated_torque_nm; the "
-            "drive's target "
-            f"torque reaches {_PER_MILLE_LIMIT:g} times."
-        )
-    for key_prefix in ("", "drive_"):
-        period_text, timeout_text = (
-            f"cia402.{key_prefix}heartbeat_period_s",
-            f"cia402.{key_prefix}heartbeat_timeout_s",
-        )
-        for key in (period_text, timeout_text):
-            if (
-                abs(profile_values[key] * 1000 - round(profile_values[key] * 1000)) > 1e-6
-                or profile_values[key] < 1e-3
-            ):
-                yield f"{key} = {profile_values[key]:g} s must be a whole number of milliseconds."
-        if profile_values[timeout_text] < 2 * profile_values[period_text]:
-            yield (
-                f"{timeout_text} = {profile_values[timeout_text]:g} s is below twice "
-                f"{period_text} = "
-                f"{profile_values[period_text]:g} s; a single late heartbeat would end a session."
-            )
-
-    for entry_number, entry_text in enumerate(profile_values["cia402.set_objects"]):
-        try:
-            parse_assignment(entry_text)
-        except ValueError as error:
-            yield f'cia402.set_objects[{entry_number}] = "{entry_text}" {error}.'
-    for entry_number, key_name in enumerate(profile_values["cia402.accept_without"]):
-        if key_name not in ACCEPTABLE:
-            yield (
-                f'cia402.accept_without[{entry_number}] = "{key_name}" is nothing that a '
-                "profile can accept "
-                f"the absence of; choose {', '.join(ACCEPTABLE)}."
-            )
-
-
-def _serial_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
-    """Yield messages for contradictions in the settings of a sensor on a serial line."""
-    if profile_values["acquisition.mode"] != "same_tick":
-        yield (
-            'acquisition.mode = "previous_tick" does not go with [ati_serial]: a sensor that '
-            'streams is not asked, so there is no reply of the tick before; choose "same_tick".'
-        )
-    baud, stream_hz = profile_values["ati_serial.baud"], profile_values["ati_serial.stream_hz"]
-    max_records_hz = baud / RECORD_BITS
-    if stream_hz > max_records_hz:
-        yield (
-            f"ati_serial.stream_hz = {stream_hz:g} Hz does not fit ati_serial.baud = {baud}, which "
-            f"carries {max_records_hz:.0f} records a second; choose 1250000."
-        )
-    if stream_hz < profile_values["rig.rate_hz"]:
-        yield (
-            f"ati_serial.stream_hz = {stream_hz:g} Hz is below rig.rate_hz = "
-            f"{profile_values['rig.rate_hz']:g} Hz; there would be ticks without a record."
-        )
-
-
 def _delay_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for delays that are shorter than their protocol allows."""
     period_s = 1 / profile_values["rig.rate_hz"]
     reply_s = period_s if profile_values.get("acquisition.mode") == "previous_tick" else 0.0
-    wrench_s, wrench_cause = reply_s, "the reply of the previous tick"
-    if "ati_serial.port" in profile_values:
-        serial_settings = AtiSerial(
-            **{field_name: profile_values[key] for key, field_name in section_fields("ati_serial")}
-        )
-        wrench_s = serial_settings.filter_delay_s(profile_values["rig.rate_hz"])
-        wrench_cause = "the filter of the sensor's records"
     delivery_s = period_s if profile_values.get("cia402.torque_delivery") == "at_sync" else 0.0
     delay_causes = (
         ("encoder.delay_s", reply_s, "the reply of the previous tick"),
-        ("sensor.delay_s", wrench_s, wrench_cause),
+        ("sensor.delay_s", reply_s, "the reply of the previous tick"),
         ("actuation.delay_s", delivery_s, "a torque that takes effect at the next SYNC"),
     )
     for key, least_s, delay_cause in delay_causes:

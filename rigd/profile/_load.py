@@ -17,17 +17,20 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd import documents
 from rigd.devices import MAY_BE_UNKNOWN
+from rigd.devices.kinds import find_kind, find_owner
 from rigd.devices.parameters import RigParameters
 from rigd.documents import DocumentError
 from rigd.errors import UserError
+from rigd.plugins import PluginError
 from rigd.profile import _diagnostics as diagnostics
 from rigd.profile._locations import profile_files
 from rigd.profile._schema import (
-    OPTIONAL_SECTIONS,
     SECTIONS,
     SOURCES,
     UNKNOWN,
     Profile,
+    add_device_section,
+    device_sections,
     is_number,
     key_defaults,
     key_types,
@@ -94,11 +97,12 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         If the text has mistakes.
     """
     document = parse_document(profile_text, profile_path)
+    added_sections = _add_sections_of_packages(document, profile_path)
     problems: list[str] = []
     profile_values, sources = flatten_document(document, problems)
     absent_sections = {
         section_name
-        for section_name in OPTIONAL_SECTIONS
+        for section_name in device_sections()
         if not any(k.startswith(section_name + ".") for k in profile_values)
     }
     unknown_keys = frozenset(
@@ -140,6 +144,7 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
             cia402=sections.get("cia402"),
             ati_can=sections.get("ati_can"),
             ati_serial=sections.get("ati_serial"),
+            added_settings=tuple(sections[name] for name in added_sections if name in sections),
         ),
         control=sections["control"],
         limits=sections["limits"],
@@ -151,6 +156,29 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         tip_mass_kg=sections["beam"].tip_mass_kg,
         axis_tilt_deg=sections["rig"].axis_tilt_deg,
     )
+
+
+def _add_sections_of_packages(document: Mapping[str, Any], profile_path: Path) -> list[str]:
+    """Make the sections known that devices of installed packages require; return their names.
+
+    Raises
+    ------
+    ProfileError
+        If a package that adds a device of the profile cannot be used.
+    """
+    selection = document.get("devices")
+    names = selection.values() if isinstance(selection, dict) else ()
+    added_sections = []
+    for name in dict.fromkeys(filter(lambda value: isinstance(value, str), names)):
+        try:
+            plugin, kind = find_owner(name), find_kind(name)
+            if plugin is not None and kind is not None:
+                add_device_section(kind, plugin)
+                if kind.settings is not None:
+                    added_sections.append(kind.name)
+        except PluginError as error:
+            raise ProfileError(f'{profile_path}: devices: "{name}": {error}') from error
+    return added_sections
 
 
 def parse_document(text: str, path: Path) -> dict[str, Any]:
@@ -300,9 +328,9 @@ def validate_values(
         known_values = {
             key: key_value for key, key_value in tuple_values.items() if key not in unknown_keys
         }
-        validation_model = _validation_model(absent_sections, unknown_keys).model_validate(
-            known_values
-        )
+        validation_model = _validation_model(
+            tuple(SECTIONS), absent_sections, unknown_keys
+        ).model_validate(known_values)
     except ValidationError as error:
         error_details = error.errors(include_url=False)
         missing_keys = [
@@ -324,7 +352,9 @@ def validate_values(
 
 @cache
 def _validation_model(
-    absent_sections: frozenset[str], unknown_keys: frozenset[str]
+    section_names: tuple[str, ...],  # noqa: ARG001 - installed packages can add some
+    absent_sections: frozenset[str],
+    unknown_keys: frozenset[str],
 ) -> type[BaseModel]:
     """Return the pydantic model that validates all keys of a profile at once.
 

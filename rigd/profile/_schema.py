@@ -1,16 +1,20 @@
 """Schema of a profile: sections, keys and sources, and the settings that this module declares."""
 
+import json
 from collections.abc import Mapping
 from dataclasses import MISSING, dataclass, field, fields
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
-from annotated_types import Ge, Gt, Le, MinLen
+from annotated_types import DocInfo, Ge, Gt, Le, MinLen
+from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rigd.beam import Beam, Damping, Plant
 from rigd.control import ControlSettings, LoopModel
 from rigd.devices import describe_unknown_values
+from rigd.devices.declaration import DeviceKind
+from rigd.devices.kinds import load_kind, shipped_kinds
 from rigd.devices.parameters import (
     OPTIONAL,
     Acquisition,
@@ -27,7 +31,9 @@ from rigd.devices.parameters import (
     WrenchSensorSettings,
 )
 from rigd.errors import UserError
+from rigd.plugins import Plugin
 from rigd.safety.limits import Limits
+from rigd.units import unit_of
 
 
 @dataclass(frozen=True, slots=True)
@@ -163,23 +169,127 @@ SECTIONS: dict[str, type] = {
     "uncertainty": ScaleUncertainty,
 }
 """Map from a section's name to the dataclass of its keys."""
-DEVICE_SECTIONS = {
-    "cia402": ("can", "acquisition", "cia402"),
-    "ati_can": ("can", "acquisition", "ati_can"),
-    "ati_serial": ("acquisition", "ati_serial"),
-    "sim": ("simulation",),
-}
-"""Map from a device of ``[devices]`` to the sections that it requires."""
-OPTIONAL_SECTIONS = tuple(
-    dict.fromkeys(name for names in DEVICE_SECTIONS.values() for name in names)
-)
-"""Sections that only some devices require."""
+_ADDED_SECTIONS: set[str] = set()
+"""Names in `SECTIONS` of the sections of devices that installed packages add."""
+
+
+def device_sections() -> tuple[str, ...]:
+    """Return the names of the sections that only some devices require."""
+    shipped = [name for kind in shipped_kinds() for name in kind.required_sections]
+    return tuple(dict.fromkeys([*shipped, *sorted(_ADDED_SECTIONS)]))
+
+
+def add_device_section(kind: DeviceKind, plugin: Plugin) -> None:
+    """Add the section of a device of an installed package to the sections of a profile.
+
+    Nothing changes if it was added before.
+
+    Parameters
+    ----------
+    kind
+        Kind of device.
+    plugin
+        Package that adds it.
+
+    Raises
+    ------
+    PluginError
+        If the declaration of its settings is invalid, or the section is one of rigd's own.
+    """
+    settings = kind.settings
+    if settings is None or SECTIONS.get(kind.name) is settings:
+        return
+    if kind.name in SECTIONS and kind.name not in _ADDED_SECTIONS:
+        raise plugin.error(f"[{kind.name}] is a section of every profile; rename the device.")
+    if problem := _settings_problem(settings):
+        raise plugin.error(f"its settings {settings.__name__} are invalid: {problem}")
+    if unknown := set(kind.sections) - set(SECTIONS):
+        raise plugin.error(f"it requires the unknown section [{min(unknown)}].")
+    SECTIONS[kind.name] = settings
+    _ADDED_SECTIONS.add(kind.name)
+    key_types.cache_clear()
+    key_defaults.cache_clear()
+
+
+def _settings_problem(settings: type) -> str:
+    """Return the reason why a class cannot declare a section of a profile, or ""."""
+    parameters = getattr(settings, "__dataclass_params__", None)
+    if parameters is None or not parameters.frozen:
+        return "they are no frozen dataclass; declare them with @dataclass(frozen=True)."
+    try:
+        for key, value_type in get_type_hints(settings, include_extras=True).items():
+            default = next((f.default for f in fields(settings) if f.name == key), MISSING)
+            # Also builds the validator, which finds types and ranges that cannot be checked.
+            validator = TypeAdapter(value_type, config=ConfigDict(strict=True))
+            if default is not MISSING:
+                validator.validate_python(default)
+    except ValidationError as error:
+        return f"the default of {key} is not in its range ({error.errors()[0]['msg']})."
+    except Exception as error:  # whatever a foreign declaration causes
+        return f"{type(error).__name__}: {error}"
+    return ""
+
+
+def check_device_plugin(plugin: Plugin) -> str:
+    """Import the kind of device that an installed package adds, and return its summary.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    kind = load_kind(plugin)
+    add_device_section(kind, plugin)
+    return kind.summary
+
+
 TEXT_KEYS = ("name", "description")
 """Keys outside any section, whose values are texts."""
 SOURCES = ("paper", "datasheet", "measured", "assumed")
 """Valid sources of a number in a profile."""
 UNKNOWN = "unknown"
 """Source of a number without a value, which is NaN in the parameters (see `MAY_BE_UNKNOWN`)."""
+
+
+def section_text(kind: DeviceKind) -> str:
+    """Return a section of a profile for a kind of device, with ranges, units and help as comments.
+
+    Parameters
+    ----------
+    kind
+        Kind of device; without settings, the text is empty.
+    """
+    if kind.settings is None:
+        return ""
+    lines = [f"[{kind.name}]"]
+    type_hints = get_type_hints(kind.settings, include_extras=True)
+    for settings_field in fields(kind.settings):
+        hint = type_hints[settings_field.name]
+        extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
+        plain = get_args(hint)[0] if extras else hint
+        notes = [each.documentation for each in extras if isinstance(each, DocInfo)]
+        if get_origin(plain) is Literal:
+            notes.append("one of " + ", ".join(map(str, get_args(plain))))
+        for each in extras:
+            for bound_name, words in _BOUND_WORDS.items():
+                if (bound := getattr(each, bound_name, None)) is not None:
+                    notes.append(f"{words} {bound}")
+        if unit := unit_of(settings_field.name):
+            notes.append(f"in {unit}")
+        if notes:
+            lines.append(f"# {'; '.join(notes)}")
+        is_optional = settings_field.default is not MISSING
+        if is_optional:
+            value = json.dumps(settings_field.default, ensure_ascii=False)
+        else:
+            value = "…" if is_number(hint) else '"…"'
+        entry = f'{{ value = {value}, source = "assumed" }}' if is_number(hint) else value
+        lines.append(f"{'# ' if is_optional else ''}{settings_field.name} = {entry}")
+    return "\n".join(lines) + "\n"
+
+
+_BOUND_WORDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most"}
+"""Words for the bounds of a range, by the attributes of ``annotated_types``."""
 
 
 @cache
@@ -201,14 +311,15 @@ def key_types() -> dict[str, Any]:
 def key_defaults() -> dict[str, Any]:
     """Return the default value of each optional key, by the dotted keys of a profile.
 
-    Other defaults of the dataclasses are not used: for example, a delay that is not stated is
-    unknown and not zero.
+    Other defaults of rigd's own dataclasses are not used: for example, a delay that is not stated
+    is unknown and not zero.
     """
     return {
         f"{section_name}.{dataclass_field.name}": dataclass_field.default
         for section_name, cls in SECTIONS.items()
         for dataclass_field in fields(cls)
-        if dataclass_field.metadata.get("optional") and dataclass_field.default is not MISSING
+        if dataclass_field.default is not MISSING
+        and (dataclass_field.metadata.get("optional") or section_name in _ADDED_SECTIONS)
     }
 
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from rigd.devices import ActuationTarget, describe_actuation_target
+from rigd.devices import ActuationTarget, describe_actuation_target, is_simulated_here
 from rigd.devices.running_simulator import described, find_simulator
 from rigd.engine import probed_rig
 from rigd.errors import FailureError
@@ -123,7 +123,7 @@ def _is_identified(profile: Profile) -> bool:
 
 def _is_simulated_with_profile(profile: Profile) -> bool:
     """Return whether the rig is simulated with its profile's values, so that probing is useless."""
-    if profile.rig.devices.drive == "sim":
+    if is_simulated_here(profile.rig):
         return True
     simulator = find_simulator(profile.rig.name)
     if simulator is None:

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final, Literal, Protocol
 
-from rigd.devices import session_seed
+from rigd.devices import is_simulated_here, session_seed
 from rigd.engine.shared_state import LogEvent
 from rigd.excitation import Excitation, present_frequency_hz
 from rigd.profile import Profile
@@ -244,7 +244,7 @@ class Series:
 
         The metadata are empty if no move is needed.
         """
-        if self._profile.rig.devices.drive == "sim":
+        if is_simulated_here(self._profile.rig):
             return {}
         from rigd.runner import _probing  # late: a simulation in this process needs none
 

@@ -26,10 +26,13 @@ from rigd.devices import (
     describe_actuation_target,
     simulated_differently,
 )
+from rigd.devices.kinds import find_kind, find_owner
 from rigd.devices.obstacles import with_obstacles
+from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
 from rigd.engine.messages import Connected, Ending, FileHeader
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, find_excitation
+from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
 from rigd.runner._touch_search import TouchSearch
@@ -439,9 +442,7 @@ def _session_metadata(
     if rig.acquisition is not None:
         metadata["acquisition_mode"] = rig.acquisition.mode
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
-    if rig.ati_serial is not None:
-        metadata["sensor_filter"] = rig.ati_serial.filter
-        metadata["sensor_filter_delay_s"] = repr(rig.ati_serial.filter_delay_s(rig.rate_hz))
+    metadata = _device_metadata(rig) | _excitation_metadata(order.excitation.kind) | metadata
     if order.profile.tip_mass_kg is not None:
         metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
     if order.profile.axis_tilt_deg is not None:
@@ -453,6 +454,31 @@ def _session_metadata(
         metadata["torque_filter_order"] = repr(rig.sensor.filter_order)
     if rig.devices.drive == "sim" and rig.simulation is not None and rig.simulation.obstacles:
         metadata["simulation_obstacles"] = "; ".join(rig.simulation.obstacles)
+    return metadata
+
+
+def _excitation_metadata(kind: str) -> dict[str, str]:
+    """Return the package that adds an excitation, and its reason against the Welch method."""
+    added = find_excitation(kind)
+    if added is None:
+        return {}
+    declaration, owner = added
+    metadata = {"excitation_package": owner.label}
+    if declaration.welch_exclusion:
+        metadata["welch_exclusion"] = declaration.welch_exclusion
+    return metadata
+
+
+def _device_metadata(rig: RigParameters) -> dict[str, str]:
+    """Return the metadata that the kinds of the devices declare, and the packages that add them."""
+    metadata: dict[str, str] = {}
+    for role, name in (("drive", rig.devices.drive), ("sensor", rig.devices.sensor)):
+        kind, owner = find_kind(name), find_owner(name)
+        if owner is not None:
+            metadata[f"{role}_package"] = owner.label
+        if kind is not None and kind.metadata is not None:
+            with plugin_errors(owner):
+                metadata |= kind.metadata(rig)
     return metadata
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 import pytest
 from cases import further
 
+from rigd.check_rows import CheckResult, overall
 from rigd.checks.devices import inspect_devices
-from rigd.checks.rows import CheckResult, overall
 from rigd.devices import reset_drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.running_simulator import find_simulator

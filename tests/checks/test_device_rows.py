@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.check_rows import CheckResult, overall
 from rigd.checks.devices import inspect_devices
-from rigd.checks.rows import CheckResult, overall
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import Watchdog
 from rigd.devices.contracts import DeviceError

@@ -5,8 +5,8 @@ from dataclasses import replace
 import pytest
 
 from rigd.beam import Damping
+from rigd.check_rows import CheckResult, overall
 from rigd.checks.on_paper import margin_rows, stability_rows
-from rigd.checks.rows import CheckResult, overall
 from rigd.profile import load_profile
 
 

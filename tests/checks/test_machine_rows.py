@@ -4,8 +4,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.check_rows import CheckResult
 from rigd.checks.machine import machine_rows
-from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 CPU = "sys/devices/system/cpu"

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from rigd.beam import mode_shape, undamped_frequencies_rad_s
+from rigd.check_rows import CheckResult, CheckRow, overall
 from rigd.checks import check_on_paper, check_without_devices
 from rigd.checks.on_paper import axis_tilt_rows, profile_rows, record_rows, wiring_rows
-from rigd.checks.rows import CheckResult, CheckRow, overall
 from rigd.devices.canbus import bus_load
 from rigd.excitation import ExcitationError, chirp
 from rigd.profile import load_profile

@@ -8,8 +8,8 @@ import pytest
 from cases import further
 from eds_files import eds_path
 
+from rigd.check_rows import CheckResult, overall
 from rigd.checks import check_on_paper, check_without_devices
-from rigd.checks.rows import CheckResult, overall
 from rigd.control import ControlDesignError
 from rigd.devices import MAY_BE_UNKNOWN, open_devices, unknown_values
 from rigd.devices.contracts import DeviceError

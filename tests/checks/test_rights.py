@@ -6,8 +6,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.check_rows import CheckResult
 from rigd.checks.machine import rights_rows
-from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 

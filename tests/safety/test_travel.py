@@ -5,8 +5,8 @@ from dataclasses import replace
 
 import pytest
 
+from rigd.check_rows import CheckResult
 from rigd.checks.on_paper import travel_rows, worst_travel
-from rigd.checks.rows import CheckResult
 from rigd.profile import load_profile
 
 

@@ -1,0 +1,318 @@
+"""The driver on the simulated box: what suits, what is refused, and what each fault leads to."""
+
+import os
+import socket
+import subprocess
+import sys
+import threading
+import time
+from dataclasses import replace
+
+import pytest
+from rigd_netft import protocol
+from rigd_netft.box import SimulatedBox
+from rigd_netft.sensor import NetFtSensor
+from rigd_netft.settings import NetFtSettings
+
+from rigd.devices import open_devices
+from rigd.devices.contracts import DeviceError
+from rigd.profile import ProfileError, load_profile
+from rigd.session import read_session
+from rigd.testing import DEVICE_CHECKS, write_profile
+
+PERIOD_NS = 1_000_000
+WRENCH = (1.0, -2.0, 3.0, 0.1, -0.2, 0.3)
+
+
+def write_rig(folder, lines="", **values):
+    """Write a profile with the simulated drive and a box."""
+    path = write_profile(folder, {"name": "netft", "devices.sensor": "netft"} | values)
+    path.write_text(path.read_text() + f'\n[netft]\nhost = "192.168.1.1"\n{lines}\n')
+    return path
+
+
+@pytest.fixture
+def rig(tmp_path):
+    return load_profile(write_rig(tmp_path)).rig
+
+
+@pytest.fixture
+def connect(rig):
+    """Return a function that makes a connected driver and its box, in step with each other."""
+    made = []
+
+    def connect(tags=None, faults=(), **settings):
+        box = SimulatedBox(lambda: WRENCH, tags, faults)
+        sensor = NetFtSensor(
+            rig,
+            replace(NetFtSettings("127.0.0.1", port=box.port), **settings),
+            on_request=lambda: box.tick(1e-3),
+        )
+        made.append((sensor, box))
+        with box.page() as port:
+            sensor._settings = replace(sensor._settings, http_port=port)
+            sensor.connect()
+        return sensor, box
+
+    yield connect
+    for sensor, box in made:
+        sensor.close()
+        box.close()
+
+
+def run(sensor, ticks, first=0):
+    """Run ticks and return the number of stale ones and of saturated ones."""
+    stale = saturated = 0
+    for tick in range(first, first + ticks):
+        sensor.request(tick * PERIOD_NS)
+        sensor.read_wrench()
+        stale += sensor.wrench_stale
+        saturated += sensor.wrench_saturated
+    return stale, saturated
+
+
+@pytest.mark.parametrize("check", DEVICE_CHECKS)
+def test_it_passes_the_checks_of_devices(rig, check):
+    devices = open_devices(rig)
+    check(devices)
+    devices.sensor.close()
+
+
+def test_a_record_has_the_age_of_the_box_s_counter(connect):
+    sensor, _ = connect()
+    assert run(sensor, 3000) == (0, 0)
+    assert sensor.read_wrench() == pytest.approx(WRENCH)
+    assert sensor.wrench_stale  # no record since
+    assert sensor.wrench_time_ns == pytest.approx(2999 * PERIOD_NS, abs=1000)
+    assert not any(sensor.counts.values())
+    assert sensor.health().bits > 0
+
+
+@pytest.mark.parametrize(
+    ("unit_tags", "per_torque"),
+    [
+        ({"scfgtu": "Nm"}, 1.0), ({"scfgtu": "N-m", "cfgcpt": "250000"}, 1.0),
+        ({"scfgfu": "lbf", "scfgtu": "lbf-in"}, 1.0), ({"scfgtu": "Nmm", "cfgcpt": "1000"}, 1.0),
+    ],
+)  # fmt: skip
+def test_units_and_counts_of_the_box_make_no_difference(connect, unit_tags, per_torque):
+    sensor, _ = connect(unit_tags)
+    run(sensor, 5)
+    sensor.request(5 * PERIOD_NS)
+    assert sensor.read_wrench() == pytest.approx(WRENCH, rel=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("tags", "settings", "message"),
+    [
+        ({"scfgtu": "furlong"}, {}, 'scfgtu is "furlong", but unknown unit'),
+        ({"cfgcpf": "0"}, {}, 'cfgcpf is "0"'),
+        ({"cfgtfx": "0;0;132.710;0;0;0"}, {}, r"cfgtfx is .0;0;132.710;0;0;0.*tool_transform"),
+        ({}, {"serial_number": "FT1"}, 'cfgcalsn is "FT00001".*serial_number is FT1'),
+        ({"runrate": "3500"}, {}, "does not send 7000 records"),
+    ],
+)
+def test_a_box_that_does_not_suit_is_refused_by_name(connect, tags, settings, message):
+    with pytest.raises(DeviceError, match=message):
+        connect(tags, **settings)
+
+
+def test_rate_filter_and_bias_are_set_and_read_back(connect):
+    _, box = connect(
+        {"comrdtrate": "100", "comrdtbsiz": "40", "setuserfilter": "5", "comrdte": "Disabled"},
+        rate_hz=3500.0, filter_hz=73, bias="zero",
+    )  # fmt: skip
+    assert (box.tags["comrdtrate"], box.tags["comrdtbsiz"]) == ("3500", "1")
+    assert (box.tags["setuserfilter"], box.tags["setbias"]) == ("4", "0;0;0;0;0;0")
+    assert connect()[1].tags["setbias"].startswith("745")  # kept unless it is asked for
+
+
+def test_a_value_that_the_box_does_not_take_is_refused(connect, monkeypatch):
+    answer = SimulatedBox.answer
+    monkeypatch.setattr(
+        SimulatedBox, "answer", lambda box, path: (302, "") if "?" in path else answer(box, path)
+    )  # fmt: skip
+    with pytest.raises(DeviceError, match='setuserfilter is "5", but 0 was set'):
+        connect({"setuserfilter": "5"})
+
+
+def test_without_a_page_the_counts_must_be_stated(connect):
+    with pytest.raises(DeviceError, match=r"does not answer.*counts_per_n"):
+        connect(faults=["no_page"])
+    sensor, _ = connect(faults=["no_page"], counts_per_n=1e6, counts_per_nm=1e6)
+    run(sensor, 2)
+    assert sensor.read_wrench() == pytest.approx(WRENCH)
+    assert "assumed" in sensor.calibration()
+
+
+@pytest.mark.parametrize(
+    ("fault", "counted", "stale", "saturated"),
+    [
+        ("loss=0.01", {"lost"}, (0, 3), (0, 0)),
+        ("duplicate=0.05", {"duplicates"}, (0, 0), (0, 0)),
+        ("reorder=0.05", {"out_of_order"}, (0, 0), (0, 0)),
+        ("malformed=0.02", {"malformed", "lost"}, (0, 0), (0, 0)),
+        ("burst=0.04@0.5", set(), (38, 42), (0, 0)),
+        ("silence@0.5", set(), (495, 505), (0, 0)),
+        ("saturate=0.1@0.5", set(), (0, 0), (95, 105)),
+        ("threshold@0.5", set(), (0, 0), (0, 0)),
+    ],
+)
+def test_faults_are_counted_and_flagged(connect, fault, counted, stale, saturated):
+    sensor, _ = connect(faults=[fault])
+    stale_ticks, saturated_ticks = run(sensor, 1000)
+    assert {name for name, count in sensor.counts.items() if count} == counted
+    assert stale[0] <= stale_ticks <= stale[1]
+    assert saturated[0] <= saturated_ticks <= saturated[1]
+    assert bool(sensor.health().cause) == (fault.startswith("silence"))
+
+
+@pytest.mark.parametrize(
+    ("fault", "tags", "message"),
+    [
+        ("restart@0.2", {}, "has restarted; its bias may have changed"),
+        ("status=0x80000004@0.2", {}, "0x80000004 reports temperature"),
+        ("status=0x80001000@0.2", {}, "reports EEPROM"),
+        ("status=0x80000004@0.2", {"setadcrate": "7912"}, "reports broken gauge"),
+    ],
+)
+def test_faults_of_the_box_end_the_session(connect, fault, tags, message):
+    sensor, _ = connect(tags, [fault])
+    with pytest.raises(DeviceError, match=message):
+        run(sensor, 1000)
+
+
+def test_a_second_client_takes_the_stream_and_the_cause_is_stated(connect):
+    sensor, box = connect()
+    run(sensor, 10)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as thief:
+        thief.sendto(protocol.request(protocol.STREAM), ("127.0.0.1", box.port))
+        time.sleep(0.05)
+        box.tick(1e-3)
+        assert thief.recv(64)
+        sensor.request(10 * PERIOD_NS)
+        sensor._drain()
+    assert run(sensor, 20, 20)[0] >= 19
+    assert "another program has started a stream" in sensor.health().cause
+
+
+def test_packets_from_elsewhere_are_ignored(connect):
+    sensor, _ = connect()
+    port = sensor._socket.getsockname()[1]
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        for sequence in range(50):
+            record = protocol.RECORD.pack(sequence, sequence, 0xFFFFFFFF, *(6 * [10**9]))
+            stranger.sendto(record, ("127.0.0.1", port))
+    assert run(sensor, 20) == (0, 0)
+    assert not any(sensor.counts.values())
+    assert sensor.read_wrench() == pytest.approx(WRENCH)
+
+
+def test_counters_may_wrap_around():
+    assert protocol.difference(3, 0xFFFFFFFE) == 5
+    assert protocol.difference(0xFFFFFFFE, 3) == -5
+    assert protocol.status_texts(0x80010000, protocol.NETFT_BITS) == [
+        "a monitor condition is latched"
+    ]
+
+
+def test_a_box_that_streams_by_the_clock_is_read_without_a_growing_delay(rig):
+    box = SimulatedBox(lambda: WRENCH)
+    ended = threading.Event()
+    streaming = threading.Thread(target=box.run, args=(ended.is_set,))
+    streaming.start()
+    settings = NetFtSettings("127.0.0.1", port=box.port, counts_per_n=1e6, counts_per_nm=1e6)
+    sensor = NetFtSensor(rig, settings)
+    try:
+        sensor.connect()
+        time.sleep(0.1)  # 700 records wait
+        sensor.read_wrench()
+        newest_ns = sensor.wrench_time_ns
+        assert sensor._records > 300
+        time.sleep(0.02)
+        sensor.read_wrench()
+        assert sensor.wrench_time_ns > newest_ns
+        assert not any(sensor.counts.values())
+        measured = sensor.measure(0.3)
+        assert measured["records_hz"] > 0
+        sequence, _ = sensor._last
+        assert sequence == sensor._records  # all came, and none waits
+    finally:
+        sensor.close()
+        ended.set()
+        streaming.join()
+        box.close()
+
+
+@pytest.mark.parametrize(
+    ("line", "message"),
+    [
+        ('rate_hz = { value = 3000.0, source = "assumed" }', "would send 3500: write that"),
+        ('filter_hz = { value = 50, source = "assumed" }', "50 Hz is none of 0, 5, 8"),
+        ('filter_hz = { value = 73, source = "assumed" }', "state it as sensor.filter_hz"),
+        ('counts_per_n = { value = 1e6, source = "assumed" }', "go together"),
+        ('bias = "auto"', 'must be "keep" or "zero"'),
+        ('port = { value = 0, source = "assumed" }', "at least 1"),
+    ],
+)
+def test_a_profile_that_does_not_suit_the_box_is_refused(tmp_path, line, message):
+    with pytest.raises(ProfileError, match=message):
+        load_profile(write_rig(tmp_path, line))
+
+
+def rigd(*arguments):
+    return subprocess.run(
+        [sys.executable, "-P", "-m", "rigd", *map(str, arguments)],
+        capture_output=True, text=True, check=False, env=os.environ | {"RIGD_NO_LOOK": "1"},
+    )  # fmt: skip
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("faults", "code", "text"),
+    [('"loss=0.01", "reorder=0.01", "duplicate=0.01"', 0, ""),
+     ('"silence@1.2"', 1, "sends no records"), ('"restart@1.2"', 1, "has restarted")],
+)  # fmt: skip
+def test_sessions(tmp_path, faults, code, text):
+    path = write_rig(tmp_path, f"faults = [{faults}]")
+    done = rigd(
+        "run", "chirp", "--profile", path, "--fast", "--seed", "1", "--output", tmp_path / "out",
+        "--duration", "3", "--rest", "0.5", "--ring-down", "0.5",
+    )  # fmt: skip
+    assert done.returncode == code, done.stdout + done.stderr
+    assert text in done.stdout + done.stderr
+    if not code:
+        metadata = read_session(next((tmp_path / "out").glob("*.mcap"))).metadata
+        assert metadata["sensor_package"].startswith("rigd-netft ")
+        assert metadata["netft_rate_hz"] == "7000.0"
+        assert metadata["sensor_serial_number"] == "FT00001"
+
+
+@pytest.mark.process
+def test_check_reads_the_box(tmp_path):
+    done = rigd("check", "--profile", write_rig(tmp_path), "--json")
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "rigd-netft" in done.stdout
+    assert "FT00001" in done.stdout
+
+
+def test_an_independent_client_reads_the_simulated_box():
+    pynetft = pytest.importorskip("pynetft", reason="CLIENT NOT TESTED: pynetft is not installed")
+    box = SimulatedBox(lambda: WRENCH)
+    ended = threading.Event()
+    with box.page() as http_port:
+        streaming = threading.Thread(target=box.run, args=(ended.is_set,))
+        streaming.start()
+        try:
+            config = pynetft.Config(sensor_host="127.0.0.1", rdt_port=box.port, http_port=http_port)
+            client = pynetft.Client(config)
+            client.start()
+            assert client.wait_for_first_sample(20)
+            sample = client.latest_sample()
+            client.stop()
+            assert tuple(sample.force) == pytest.approx(WRENCH[:3])
+            assert tuple(sample.torque) == pytest.approx(WRENCH[3:])
+        finally:
+            ended.set()
+            streaming.join()
+            box.close()

@@ -1,0 +1,134 @@
+"""Command ``rigd plugins``: what installed packages add, and whether it can be used."""
+
+import json
+import re
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from rigd.cli.options import EXIT_FAILED, EXIT_WRONG_USE, AsJson, fail
+from rigd.printable import printable
+
+plugins_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
+
+
+@plugins_app.callback()
+def plugins(context: typer.Context, as_json: AsJson = False) -> None:
+    """List what installed packages add to rigd, or make a package of your own.
+
+    A package adds a device by an entry point of the group rigd.devices. Each is imported and
+    checked; one that cannot be used is named with the reason, and the command exits with 1.
+
+    Example: rigd plugins
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from rigd.plugins import GROUPS, PluginError, check_plugin, installed_plugins
+
+    rows = []
+    for group in GROUPS:
+        for plugin in installed_plugins(group):
+            summary = problem = ""
+            try:
+                summary = check_plugin(plugin)
+            except PluginError as error:
+                problem = str(error)
+            rows.append(
+                {
+                    "group": group,
+                    "name": plugin.name,
+                    "package": plugin.package,
+                    "version": plugin.version,
+                    "summary": summary,
+                    "problem": problem,
+                }
+            )
+    if as_json:
+        typer.echo(json.dumps({"plugins": rows}, ensure_ascii=False))
+    elif not rows:
+        typer.echo(f"No installed package adds anything ({', '.join(GROUPS)}).")
+    else:
+        for row in rows:
+            owner = f"{row['package']} {row['version']}"
+            text = row["problem"] or f"{row['name']}: {row['summary']} ({row['group']}, {owner})"
+            typer.echo(printable(f"Cannot be used: {text}" if row["problem"] else text))
+    if any(row["problem"] for row in rows):
+        raise typer.Exit(EXIT_FAILED)
+
+
+@plugins_app.command()
+def show(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the device.")],
+) -> None:
+    """Print the section of a profile for a device that an installed package adds.
+
+    Example: rigd plugins show netft
+    """
+    from rigd.devices.kinds import find_kind, find_owner
+    from rigd.profile import section_text
+
+    kind = find_kind(name)
+    if kind is None or find_owner(name) is None:
+        fail(f"No installed package adds a device {printable(name, 40)}.", EXIT_WRONG_USE)
+    typer.echo(section_text(kind), nl=False)
+
+
+_TEMPLATE = Path(__file__).with_name("plugin_template")
+"""Folder with the files of a new package, in which NAME represents the name of its device."""
+_TEMPLATE_FILES = {
+    "pyproject.toml.txt": "pyproject.toml",
+    "README.md.txt": "README.md",
+    "device.py.txt": "rigd_NAME/__init__.py",
+    "test_device.py.txt": "tests/test_NAME.py",
+}
+"""Files of the template, each with its path in the new package."""
+_DEVICE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+"""Pattern of the name of a device."""
+
+
+@plugins_app.command()
+def new(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new device.")],
+    folder: Annotated[
+        Path | None,
+        typer.Option("--folder", metavar="FOLDER", help="New folder (default: rigd-NAME)."),
+    ] = None,
+) -> None:
+    """Make a package with a force-torque sensor and its tests, to be changed for your device.
+
+    Example: rigd plugins new mysensor
+    """
+    from rigd.devices.kinds import find_kind
+    from rigd.plugins import PluginError
+
+    if not _DEVICE_NAME.fullmatch(name):
+        fail(
+            f"{printable(name, 40)}: choose a name of lower-case letters, digits and _, at most 32 "
+            "characters, that begins with a letter.",
+            EXIT_WRONG_USE,
+        )
+    try:
+        is_taken = find_kind(name) is not None
+    except PluginError:
+        is_taken = True
+    if is_taken:
+        fail(f"A device {name} exists already (rigd plugins); choose another name.", EXIT_WRONG_USE)
+    target = folder if folder is not None else Path(f"rigd-{name}")
+    try:
+        target.mkdir(parents=True)
+        for template, path in _TEMPLATE_FILES.items():
+            text = (_TEMPLATE / template).read_text(encoding="utf-8").replace("NAME", name)
+            new_file = target / path.replace("NAME", name)
+            new_file.parent.mkdir(exist_ok=True)
+            new_file.write_text(text, encoding="utf-8")
+    except FileExistsError:
+        fail(f"{target} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
+    except OSError as error:
+        fail(f"{target} cannot be written ({error.strerror}).", EXIT_FAILED)
+    typer.echo(
+        printable(
+            f"{target} is made. In the environment of rigd: pip install --editable {target}, "
+        )
+        + f"rigd plugins, python -m pytest {printable(str(target))}/tests."
+    )

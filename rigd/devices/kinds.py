@@ -1,0 +1,103 @@
+"""Kinds of devices that a profile can name: those of rigd, and those of installed packages.
+
+A package adds a kind by an entry point of the group ``rigd.devices`` (:mod:`rigd.plugins`), which
+names a `rigd.devices.declaration.DeviceKind`.
+"""
+
+from typing import Final
+
+from rigd.devices._shipped import SHIPPED
+from rigd.devices.declaration import DeviceKind
+from rigd.devices.parameters import DeviceSelection
+from rigd.plugins import Plugin, find_plugin, installed_plugins, load_plugin
+
+DEVICE_GROUP: Final = "rigd.devices"
+"""Group of the entry points by which packages add kinds of devices."""
+
+
+def shipped_kinds() -> tuple[DeviceKind, ...]:
+    """Return the kinds of devices that come with rigd."""
+    return tuple(SHIPPED.values())
+
+
+def find_kind(name: str) -> DeviceKind | None:
+    """Return the kind of device of a name, shipped or of an installed package, or None.
+
+    Parameters
+    ----------
+    name
+        Name in the section ``[devices]`` of a profile.
+
+    Raises
+    ------
+    PluginError
+        If the package that adds the kind cannot be used.
+    """
+    if name in SHIPPED:
+        return SHIPPED[name]
+    plugin = find_plugin(DEVICE_GROUP, name)
+    return None if plugin is None else load_kind(plugin)
+
+
+def load_kind(plugin: Plugin) -> DeviceKind:
+    """Import the kind of device that a package adds.
+
+    Raises
+    ------
+    PluginError
+        If the package cannot be imported, or its declaration is invalid or replaces a shipped kind.
+    """
+    if plugin.name in SHIPPED:
+        raise plugin.error("this device is built into rigd and cannot be replaced; rename it.")
+    kind = load_plugin(plugin, DeviceKind)
+    if kind.name != plugin.name:
+        raise plugin.error(
+            f'it declares the device "{kind.name}"; the two names must be equal: rename one.'
+        )
+    if kind.open_drive is None and kind.open_sensor is None:
+        raise plugin.error("it is neither drive nor sensor; add open_drive or open_sensor.")
+    return kind
+
+
+def find_owner(name: str) -> Plugin | None:
+    """Return the package that adds a kind of device, or None for a shipped or unknown kind."""
+    return None if name in SHIPPED else find_plugin(DEVICE_GROUP, name)
+
+
+def selected_kinds(selection: DeviceSelection) -> tuple[DeviceKind, ...]:
+    """Return the kinds that a profile names, the drive's first and none twice; unknown ones not.
+
+    Raises
+    ------
+    PluginError
+        If a package that adds one of them cannot be used.
+    """
+    names = dict.fromkeys((selection.drive, selection.sensor))
+    return tuple(kind for name in names if (kind := find_kind(name)) is not None)
+
+
+def known_selections() -> list[str]:
+    """Return the drives and sensors that can be combined, each as a phrase of a message."""
+    phrases = [
+        f'drive = "{drive.name}" with sensor = "{sensor.name}"'
+        for drive in SHIPPED.values()
+        for sensor in SHIPPED.values()
+        if drive.open_drive and sensor.open_sensor and fits(drive, sensor)
+    ]
+    added = [plugin.name for plugin in installed_plugins(DEVICE_GROUP)]
+    return [*phrases, *([f"installed packages add {', '.join(added)}"] if added else [])]
+
+
+def fits(drive: DeviceKind, sensor: DeviceKind) -> bool:
+    """Return whether a kind of drive and a kind of sensor can be combined.
+
+    Parameters
+    ----------
+    drive, sensor
+        Kinds of devices; the first must be a drive and the second a sensor.
+    """
+    return (
+        drive.open_drive is not None
+        and sensor.open_sensor is not None
+        and (not sensor.drives or drive.name in sensor.drives)
+    )

@@ -1,0 +1,277 @@
+"""Installed packages that add devices and other parts by entry points, found without an import.
+
+A package states in the file ``entry_points.txt`` of its metadata what it adds to which group. The
+files of the installed packages are read directly, because ``importlib.metadata`` is slow to import
+and fails for all packages if the file of one is invalid. A package that cannot be used is named
+with the reason, and affects nothing else. Nothing is taken from the working folder.
+"""
+
+import contextlib
+import importlib
+import os
+import re
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Final, TypeVar
+
+from rigd.errors import FailureError, UserError
+from rigd.printable import listed, printable
+
+T = TypeVar("T")
+"""Type of the object that an entry point names."""
+
+GROUPS: Final = {
+    "rigd.devices": "rigd.profile:check_device_plugin",
+    "rigd.excitations": "rigd.excitation:check_excitation_plugin",
+    "analysis.formats": "analysis.exchange:check_format_plugin",
+}
+"""Groups of entry points, each with the function that checks an entry point of the group."""
+
+_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+"""Pattern of the names that a package can add; they are keys of profiles and options."""
+_REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
+"""Pattern of the object that an entry point names: module and attribute."""
+_MAX_FILE_BYTES = 1 << 20
+"""Largest size in bytes of a file ``entry_points.txt`` that is read."""
+_GROUP_MARKS = tuple(f"[{group}]".encode() for group in GROUPS)
+"""Headings of the groups, one of which a file must contain to be of interest."""
+
+
+class PluginError(UserError):
+    """A package that adds a part cannot be used; the message names package, reason and remedy."""
+
+
+@dataclass(frozen=True, slots=True)
+class Plugin:
+    """Part that an installed package adds to a group, before it is imported."""
+
+    group: str
+    """Group of the entry point, a key of `GROUPS`."""
+    name: str
+    """Name of the part, such as the name of a device in a profile."""
+    reference: str
+    """Module and object that declare the part, as ``module:object``."""
+    package: str
+    """Name of the package."""
+    version: str
+    """Version of the package."""
+    problem: str = ""
+    """Reason why the part cannot be used, as a sentence with a remedy; empty if none is known."""
+
+    @property
+    def label(self) -> str:
+        """Name and version of the package, as stored in session files."""
+        return f"{self.package} {self.version}".strip()
+
+    def error(self, reason: str) -> PluginError:
+        """Return the error that names package and part, with the reason as a sentence."""
+        text = f"Package {self.label}, {self.group} entry point {self.name}: {reason}"
+        return PluginError(printable(text))
+
+
+def installed_plugins(group: str) -> tuple[Plugin, ...]:
+    """Return what the installed packages add to a group, in the order of the names.
+
+    Nothing is imported. A part whose `Plugin.problem` is not empty cannot be used.
+
+    Parameters
+    ----------
+    group
+        Group of entry points, a key of `GROUPS`.
+    """
+    return tuple(plugin for plugin in _scan(_search_folders()) if plugin.group == group)
+
+
+def find_plugin(group: str, name: str) -> Plugin | None:
+    """Return the part of a name that an installed package adds, or None if there is none.
+
+    Parameters
+    ----------
+    group
+        Group of entry points, a key of `GROUPS`.
+    name
+        Name of the part.
+
+    Raises
+    ------
+    PluginError
+        If the part is known to be unusable.
+    """
+    for plugin in installed_plugins(group):
+        if plugin.name == name:
+            if plugin.problem:
+                raise plugin.error(plugin.problem)
+            return plugin
+    return None
+
+
+def load_plugin(plugin: Plugin, expected: type[T]) -> T:
+    """Import a package and return the object that its entry point names.
+
+    Parameters
+    ----------
+    plugin
+        Part of an installed package.
+    expected
+        Type that the object must have.
+
+    Raises
+    ------
+    PluginError
+        If the import fails in any way, or the object has another type.
+    """
+    if plugin.problem:
+        raise plugin.error(plugin.problem)
+    module_name, _, object_name = plugin.reference.partition(":")
+    try:
+        # A package that prints must not disturb the output of a command.
+        with _without_working_folder(), contextlib.redirect_stdout(sys.stderr):
+            found = getattr(importlib.import_module(module_name), object_name)
+    except KeyboardInterrupt:
+        raise
+    except BaseException as error:  # SystemExit is no Exception
+        raise plugin.error(
+            f"{plugin.reference} cannot be imported ({_described(error)}); repair, upgrade or "
+            "uninstall the package."
+        ) from error
+    if not isinstance(found, expected):
+        raise plugin.error(
+            f"{plugin.reference} is a {type(found).__name__} and no {expected.__name__}; repair, "
+            "upgrade or uninstall the package."
+        )
+    return found
+
+
+def check_plugin(plugin: Plugin) -> str:
+    """Import a part that a package adds, check it, and return one line on it.
+
+    Raises
+    ------
+    PluginError
+        If the part cannot be used.
+    """
+    module_name, _, function_name = GROUPS[plugin.group].partition(":")
+    summary: str = getattr(importlib.import_module(module_name), function_name)(plugin)
+    return summary
+
+
+@contextlib.contextmanager
+def plugin_errors(
+    plugin: Plugin | None, passed: tuple[type[Exception], ...] = ()
+) -> Iterator[None]:
+    """Turn an unexpected exception of a package's code into an error that names the package.
+
+    Errors for the operator and of the operating system are passed on. Nothing is changed for a part
+    of rigd itself.
+
+    Parameters
+    ----------
+    plugin
+        Part of a package, or None for a part of rigd.
+    passed
+        Further exceptions that are passed on.
+    """
+    passed_on: tuple[type[Exception], ...] = (UserError, FailureError, OSError, *passed)
+    try:
+        yield
+    except passed_on:
+        raise
+    except Exception as error:
+        if plugin is None:
+            raise
+        raise plugin.error(
+            f"its code failed ({_described(error)}); report that to the package's author."
+        ) from error
+
+
+def _described(error: BaseException) -> str:
+    """Return type and message of an exception."""
+    return f"{type(error).__name__}: {error}".removesuffix(": ")
+
+
+def _starts_with_working_folder() -> bool:
+    """Return whether Python has put the working folder at the start of the search path."""
+    if sys.flags.safe_path or not sys.path:
+        return False
+    try:
+        return sys.path[0] in ("", os.getcwd())  # noqa: PTH109 - pathlib would resolve nothing more
+    except OSError:  # the folder was removed
+        return False
+
+
+@contextlib.contextmanager
+def _without_working_folder() -> Iterator[None]:
+    """Remove the working folder from the start of the search path in this context."""
+    if not _starts_with_working_folder():
+        yield
+        return
+    working_folder = sys.path.pop(0)
+    try:
+        yield
+    finally:
+        sys.path.insert(0, working_folder)
+
+
+def _search_folders() -> tuple[str, ...]:
+    """Return the folders in which installed packages are searched."""
+    folders = sys.path[1:] if _starts_with_working_folder() else sys.path
+    return tuple(folder for folder in dict.fromkeys(folders) if Path(folder).is_absolute())
+
+
+@lru_cache(maxsize=8)
+def _scan(folders: tuple[str, ...]) -> tuple[Plugin, ...]:
+    """Return all parts that the packages in these folders add, in the order of their names."""
+    found: list[Plugin] = []
+    packages: set[str] = set()
+    for folder in folders:
+        with contextlib.suppress(OSError), os.scandir(folder) as entries:
+            for entry in sorted(entries, key=lambda e: e.name):
+                if not entry.name.endswith(".dist-info"):
+                    continue
+                package, _, version = entry.name.removesuffix(".dist-info").partition("-")
+                identity = re.sub(r"[-_.]+", "-", package).lower()
+                if identity not in packages:  # else it is hidden by the one found before
+                    packages.add(identity)
+                    found += _read(Path(entry.path, "entry_points.txt"), identity, version)
+    return tuple(sorted(_with_clashes(found), key=lambda p: (p.group, p.name)))
+
+
+def _with_clashes(found: list[Plugin]) -> Iterator[Plugin]:
+    """Yield the parts; those of the same name have the problem that several packages add them."""
+    owners: dict[tuple[str, str], list[str]] = {}
+    for plugin in found:
+        owners.setdefault((plugin.group, plugin.name), []).append(plugin.label)
+    for plugin in found:
+        labels = owners[plugin.group, plugin.name]
+        clash = f"{listed(labels)} add the same name; uninstall all but one."
+        yield plugin if len(labels) == 1 else replace(plugin, problem=clash)
+
+
+def _read(path: Path, package: str, version: str) -> Iterator[Plugin]:
+    """Yield the parts that the file of a package's entry points names."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(_MAX_FILE_BYTES)
+    except OSError:
+        return  # the package has none
+    if not any(mark in content for mark in _GROUP_MARKS):
+        return
+    group = ""
+    for line in content.decode("utf-8", errors="replace").splitlines():
+        text = line.strip()
+        if text.startswith("[") and text.endswith("]"):
+            group = text[1:-1].strip()
+        elif group in GROUPS and text and not text.startswith(("#", ";")):
+            name, equals, reference = (part.strip() for part in text.partition("="))
+            reference = reference.partition("[")[0].strip()
+            problem = ""
+            if not equals or not _REFERENCE.fullmatch(reference):
+                problem = "its line is not of the form name = module:object; correct it."
+            elif not _NAME.fullmatch(name):
+                problem = (
+                    "its name is not of lower-case letters, digits and _, at most 32; rename it."
+                )
+            yield Plugin(group, printable(name, 40), reference, package, version, problem)

@@ -1,0 +1,193 @@
+"""A drive and a sensor in one file outside: each part of rigd takes them without a change."""
+
+import json
+import sys
+
+import pytest
+from packages import DEVICES, install, rigd_with
+
+from rigd.devices import actuation_target, check_selection, open_devices
+from rigd.devices.contracts import DeviceError
+from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
+from rigd.profile import ProfileError, load_profile
+from rigd.session import read_session
+from rigd.testing import DEVICE_CHECKS, write_profile
+
+ENTRY_POINTS = "[rigd.devices]\ntwin = {0}:TWIN\nscaled = {0}:SCALED\n"
+SECTIONS = """
+[twin]
+serial_number = "T1"
+
+[scaled]
+gain_percent = { value = 110.0, source = "datasheet" }
+"""
+
+
+def write_rig(folder, sections=SECTIONS, **devices):
+    devices = {"drive": "twin", "sensor": "scaled"} | devices
+    path = write_profile(
+        folder, {"name": "lab"} | {f"devices.{key}": name for key, name in devices.items()}
+    )
+    path.write_text(path.read_text() + sections)
+    return path
+
+
+@pytest.fixture
+def packages(tmp_path, monkeypatch):
+    """Folder in which the package with the two devices is installed."""
+    folder = tmp_path / "site"
+    install(folder, "lab-devices", "1.2", DEVICES, ENTRY_POINTS.format("lab_devices"))
+    monkeypatch.syspath_prepend(folder)
+    yield folder
+    sys.modules.pop("lab_devices", None)
+
+
+def test_a_profile_takes_their_sections(packages, tmp_path):
+    profile = load_profile(write_rig(tmp_path))
+    twin, scaled = profile.rig.added_settings
+    assert (twin.serial_number, twin.limit_nm) == ("T1", 5.0)  # the default
+    assert (scaled.gain_percent, scaled.mode) == (110.0, "fast")
+    assert profile.sources["scaled.gain_percent"] == "datasheet"
+    check_selection(profile.rig.devices)
+    assert actuation_target(profile.rig).allows_virtual_clock
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "message"),
+    [
+        ("110.0", "10.0", "scaled.gain_percent = 10 % must be at least 60"),
+        ("gain_percent", "gain_hz", "wrong unit .* write scaled.gain_percent, the value in %"),
+        ('"T1"', "1", 'twin.serial_number = 1 must be text'),
+        ('serial_number = "T1"', "", "section .twin. is missing"),
+        ('"T1"', '"T1"\nlimit_nm = 0.1', "limit_nm = 0.1 N·m does not say where it comes from"),
+        ('"T1"', '"T1"\nspeed = 1', "twin.speed is unknown; .twin. has serial_number, limit_nm"),
+        ('"T1"', '"T1"\nlimit_nm = { value = 0.1, source = "assumed" }', "below motor.peak_tor"),
+        ("[scaled]", '[scaled]\nmode = "odd"', 'scaled.mode = "odd" must be "fast" or "slow"'),
+    ],
+)  # fmt: skip
+def test_wrong_values_are_named_as_those_of_other_sections(packages, tmp_path, old, new, message):
+    with pytest.raises(ProfileError, match=message):
+        load_profile(write_rig(tmp_path, SECTIONS.replace(old, new)))
+
+
+def test_they_pass_the_checks_of_devices(packages, tmp_path):
+    rig = load_profile(write_rig(tmp_path)).rig
+    for check in DEVICE_CHECKS:
+        check(open_devices(rig))
+
+
+def test_a_sensor_that_needs_another_drive_is_refused_with_what_there_is(packages, tmp_path):
+    profile = load_profile(write_rig(tmp_path, SECTIONS.partition("[scaled]")[0], sensor="sim"))
+    with pytest.raises(ValueError, match=r"no known combination.*packages add scaled, twin"):
+        check_selection(profile.rig.devices, profile.path)
+
+
+@pytest.mark.process
+def test_commands_check_run_and_list_them(packages, tmp_path):
+    path, out = write_rig(tmp_path), tmp_path / "out"
+    code, output, _ = rigd_with(packages, "check", "--profile", path, "--json")
+    rows = {(row["group"], row["what"]): row for row in json.loads(output)["rows"]}
+    assert code == 0
+    assert rows["sensor", "gain"]["verdict"] == "ok"
+    assert rows["devices", "twin"]["found"] == "lab-devices 1.2"
+    # The processes of a session find the package, though the working folder is another.
+    code, output, errors = rigd_with(
+        packages, "run", "hold", "--duration", "0.2", "--profile", path, "--fast", "--seed", "1",
+        "--output", out, cwd=tmp_path,
+    )  # fmt: skip
+    assert code == 0, output + errors
+    metadata = read_session(next(out.glob("*.mcap"))).metadata
+    assert metadata["drive_package"] == metadata["sensor_package"] == "lab-devices 1.2"
+    assert metadata["gain_mode"] == "fast"
+    code, output, _ = rigd_with(packages, "plugins")
+    assert code == 0
+    assert "twin: twin of the simulated drive (rigd.devices, lab-devices 1.2)" in output
+    code, output, _ = rigd_with(packages, "plugins", "show", "twin")
+    assert "# serial number on the case\n" in output
+    assert '# limit_nm = { value = 5.0, source = "assumed" }' in output
+
+
+@pytest.mark.process
+def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path):
+    path = write_rig(tmp_path, SECTIONS.replace("110.0", "300.0"))
+    code, _, errors = rigd_with(packages, "run", "hold", "--profile", path, "--fast")
+    assert code != 0
+    assert "device_settings" in errors
+
+
+WRONG = {  # code of a package, its entry points, and the reason that is stated
+    "raises": ("raise ValueError('no licence')", "w_raises:KIND", "ValueError: no licence"),
+    "exits": ("raise SystemExit(3)", "w_exits:KIND", "SystemExit: 3"),
+    "syntax": ("def", "w_syntax:KIND", "SyntaxError"),
+    "imports": ("import no_such_module", "w_imports:KIND", "No module named 'no_such_module'"),
+    "absent": ("", "w_absent:KIND", "no attribute 'KIND'"),
+    "type": ("KIND = 3", "w_type:KIND", "is a int and no DeviceKind"),
+    "form": ("", "w_form", "not of the form name = module:object"),
+    "other": (DEVICES, "w_other:TWIN", 'declares the device "twin"'),
+    "range": (
+        DEVICES.replace("= 5.0", "= -5.0").replace('"twin", "', '"range", "'), "w_range:TWIN",
+        "the default of limit_nm is not in its range",
+    ),
+    "thawed": (
+        DEVICES.replace("(frozen=True)", "").replace('"twin", "', '"thawed", "'),
+        "w_thawed:TWIN", "no frozen dataclass",
+    ),
+    "motor": (DEVICES.replace('"twin", "', '"motor", "'), "w_motor:TWIN", "every profile"),
+    "cia402": (DEVICES.replace('"twin", "', '"cia402", "'), "w_cia402:TWIN", "built into rigd"),
+    "Upper": ("", "w_Upper:KIND", "lower-case"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
+    packages, tmp_path, monkeypatch, name
+):
+    code, reference, reason = WRONG[name]
+    folder = tmp_path / "wrong"
+    install(folder, f"w-{name}", "0.3", code, f"[rigd.devices]\n{name} = {reference}\n")
+    monkeypatch.syspath_prepend(folder)
+    (plugin,) = [each for each in installed_plugins("rigd.devices") if each.name == name]
+    with pytest.raises(PluginError, match=reason) as caught:
+        check_plugin(plugin)
+    assert f"w-{name.lower()} 0.3" in str(caught.value)
+    check_plugin(find_plugin("rigd.devices", "twin"))
+    load_profile("sim")
+    if name not in ("motor", "Upper", "cia402"):
+        with pytest.raises(ProfileError, match=reason):
+            load_profile(write_rig(tmp_path, sensor=name))
+
+
+def test_two_packages_of_one_name_are_both_named_and_neither_is_used(
+    packages, tmp_path, monkeypatch
+):
+    install(tmp_path / "b", "other-lab", "2.0", DEVICES, "[rigd.devices]\ntwin = other_lab:TWIN\n")
+    monkeypatch.syspath_prepend(tmp_path / "b")
+    with pytest.raises(PluginError, match=r"lab-devices 1\.2.*other-lab 2\.0|other-lab 2\.0.*1\.2"):
+        find_plugin("rigd.devices", "twin")
+    assert find_plugin("rigd.devices", "scaled").package == "lab-devices"
+
+
+def test_code_of_a_package_that_fails_is_an_error_with_its_name(packages, tmp_path, monkeypatch):
+    rig = load_profile(write_rig(tmp_path)).rig
+    monkeypatch.delattr("rigd.devices.parameters.RigParameters.settings_of")
+    with pytest.raises(DeviceError, match=r"lab-devices 1\.2.*AttributeError"):
+        open_devices(rig)
+
+
+@pytest.mark.process
+def test_nothing_comes_from_the_working_folder_and_help_does_not_search(packages, tmp_path):
+    install(tmp_path / "here", "here-only", "1", "KIND = 1", "[rigd.devices]\nhere = here_only:K\n")
+    for program in (("-m", "rigd"), ("-P", "-m", "rigd")):
+        code, output, _ = rigd_with(
+            packages, "plugins", "--json", cwd=tmp_path / "here", program=program
+        )
+        assert code == 0
+        assert {row["name"] for row in json.loads(output)["plugins"]} >= {"twin", "scaled"}
+        assert "here" not in output
+    code = (
+        "import sys; sys.argv[1:] = ['--help']\n"
+        "from rigd.__main__ import main\n"
+        "try: main()\nexcept SystemExit: pass\n"
+        "sys.exit(len({'importlib.metadata', 'rigd.plugins', 'lab_devices'} & set(sys.modules)))"
+    )
+    assert rigd_with(packages, program=("-c", code))[0] == 0

@@ -1,0 +1,119 @@
+"""An excitation in one file outside: command line, socket, page, file and analysis take it."""
+
+import sys
+
+import numpy as np
+import pytest
+from packages import EXCITATION, install, rigd_with
+
+from analysis.record import load_record
+from analysis.suited import welch_exclusion_reason
+from rigd.excitation import KINDS, ExcitationError, make_excitation
+from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
+from rigd.session import read_session
+
+GROUP = "rigd.excitations"
+
+
+@pytest.fixture
+def packages(tmp_path, monkeypatch):
+    """Folder in which the package with the excitation is installed."""
+    folder = tmp_path / "site"
+    install(
+        folder, "lab-signals", "0.4", EXCITATION, f"[{GROUP}]\ntriangle = lab_signals:TRIANGLE\n"
+    )
+    monkeypatch.syspath_prepend(folder)
+    yield folder
+    sys.modules.pop("lab_signals", None)
+
+
+def test_it_is_made_by_name_like_those_of_rigd(packages):
+    assert "triangle" in KINDS
+    assert list(KINDS)[-1] == "triangle"
+    excitation = make_excitation("triangle", {"amplitude_rad": 0.02}, rate_hz=1000)
+    assert excitation.kind == "triangle"
+    assert np.ptp(excitation.reference_rad) == pytest.approx(0.02)
+    assert excitation.segments["sweep"] == (500, 4500)
+    assert excitation.parameters["period_s"] == 1.0
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "message"),
+    [
+        ("amplitude_rad", 0.5, "amplitude_rad = 0.5 rad must be less than or equal to 0.1"),
+        ("period_s", 0.0, "period_s = 0.0 s must be greater than 0"),
+        ("period_s", float("nan"), "period_s = nan s must be"),
+        ("duration_s", 1e9, "samples"),
+    ],
+)
+def test_options_out_of_their_range_are_named(packages, name, value, message):
+    with pytest.raises(ExcitationError, match=message):
+        make_excitation("triangle", {name: value}, rate_hz=1000)
+
+
+WRONG = {  # code of a package, and the reason that is stated
+    "raises": ("raise RuntimeError('no')", "RuntimeError: no"),
+    "exits": ("import sys; sys.exit()", "SystemExit"),
+    "type": ("TRIANGLE = 'triangle'", "is a str and no ExcitationKind"),
+    "other": (EXCITATION, 'declares the excitation "triangle"'),
+    "lacks": (
+        EXCITATION.replace('"triangle", "S', '"lacks", "S').replace("rest_s: float", "rest: float"),
+        "lack rest_s",
+    ),
+    "range": (
+        EXCITATION.replace('"triangle", "S', '"range", "S').replace("= 0.01", "= 0.2"),
+        "amplitude_rad = 0.2 rad",
+    ),
+    "chirp": (EXCITATION.replace('"triangle", "S', '"chirp", "S'), "built into rigd"),
+    "shape": (
+        EXCITATION.replace('"triangle", "S', '"shape", "S').replace("(phase % 1)", "phase[1:] % 1"),
+        "no 4000 finite angles",
+    ),
+    "fails": (
+        EXCITATION.replace('"triangle", "S', '"fails", "S').replace("/ options.period_s", "/ no"),
+        "NameError",
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", WRONG)
+def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
+    packages, tmp_path, monkeypatch, name
+):
+    code, reason = WRONG[name]
+    entry_points = f"[{GROUP}]\n{name} = x_{name}:TRIANGLE\n"
+    install(tmp_path / "wrong", f"x-{name}", "0.3", code, entry_points)
+    monkeypatch.syspath_prepend(tmp_path / "wrong")
+    (plugin,) = [each for each in installed_plugins(GROUP) if each.name == name]
+    with pytest.raises((PluginError, ExcitationError), match=reason):
+        check_plugin(plugin)
+        make_excitation(name, {}, rate_hz=1000)
+    assert {"chirp", "triangle"} <= set(KINDS)
+    check_plugin(find_plugin(GROUP, "triangle"))
+    assert make_excitation("chirp", {}, rate_hz=1000).kind == "chirp"
+
+
+@pytest.mark.process
+def test_commands_run_it_and_file_and_analysis_know_it(packages, tmp_path):
+    code, output, errors = rigd_with(packages, "run", "--help")
+    assert code == 0, errors
+    assert "triangle" in output
+    assert "lab-signals 0.4" in output
+    code, output, _ = rigd_with(packages, "run", "triangle", "--help")
+    assert "peak of the triangle (rad)." in output
+    code, output, errors = rigd_with(
+        packages, "run", "triangle", "--amplitude", "0.005", "--duration", "2", "--fast",
+        "--seed", "1", "--output", tmp_path / "out", cwd=tmp_path,
+    )  # fmt: skip
+    assert code == 0, output + errors
+    path = next((tmp_path / "out").glob("*-triangle.mcap"))
+    metadata = read_session(path).metadata
+    assert metadata["excitation"] == "triangle"
+    assert metadata["excitation_package"] == "lab-signals 0.4"
+    assert metadata["welch_exclusion"].startswith("a triangle excites")
+    assert float(metadata["amplitude_rad"]) == 0.005
+    # An analysis needs no package.
+    assert welch_exclusion_reason(load_record(path)).startswith("a triangle excites")
+    code, _, errors = rigd_with(packages, "run", "triangle", "--amplitude", "3", "--fast")
+    assert code == 2
+    assert "amplitude_rad = 3.0 rad" in errors

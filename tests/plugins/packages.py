@@ -1,0 +1,37 @@
+"""Packages of one file that add parts by entry points, as pip leaves them in a folder."""
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+
+def install(folder, package, version, code, entry_points):
+    """Write module and metadata of a package; `entry_points` is the text of its file."""
+    module = package.replace("-", "_")
+    folder.mkdir(parents=True, exist_ok=True)
+    (folder / f"{module}.py").write_text(code)
+    metadata = folder / f"{module}-{version}.dist-info"
+    metadata.mkdir()
+    (metadata / "METADATA").write_text(f"Name: {package}\nVersion: {version}\n")
+    (metadata / "entry_points.txt").write_text(entry_points)
+
+
+def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd")):
+    """Run rigd with the packages of a folder; return exit code, output and errors."""
+    done = subprocess.run(
+        [sys.executable, *program, *map(str, arguments)],
+        cwd=cwd or folder, capture_output=True, text=True, check=False,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, map(str, (folder,))))},
+    )  # fmt: skip
+    return done.returncode, done.stdout, done.stderr
+
+
+DEVICES = Path(__file__).with_name("outside_devices.txt").read_text()
+"""Code of a package with a drive and a sensor, both around the simulated rig."""
+
+EXCITATION = Path(__file__).with_name("outside_excitation.txt").read_text()
+"""Code of a package with the excitation ``triangle``."""
+
+FORMAT = Path(__file__).with_name("outside_format.txt").read_text()
+"""Code of a package with the import format ``.npz``."""
