@@ -8,12 +8,7 @@ the last estimate of a session equals that of its file. The fit process of rigd 
 from __future__ import annotations
 
 import time
-<<<<<<< HEAD
-from contextlib import suppress
 from dataclasses import dataclass, field
-=======
-from dataclasses import asdict, dataclass, field
->>>>>>> part-workers
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
@@ -29,11 +24,7 @@ if TYPE_CHECKING:
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict
     from analysis.record import Record
-<<<<<<< HEAD
     from rigd.beam import Plant
-    from rigd.session.online_fit import StreamStart
-=======
->>>>>>> part-workers
 
 _NOISE_POINTS: Final = 40
 """Number of frequencies at which the noise spectrum is reported."""
