@@ -522,10 +522,10 @@ class Plant:
             could not be followed.
         """
         if near_rad_s is not None and bool((near_rad_s.imag > 0).all()):
-            upper_poles = newton_roots(self, near_rad_s, CLOSE_START_TOLERANCE, zeros=False)
+            upper_poles = self._newton_roots(near_rad_s, CLOSE_START_TOLERANCE, zeros=False)
             if bool((np.abs(upper_poles / near_rad_s - 1) < SAME_ROOT_TOLERANCE).all()):
                 return np.column_stack([upper_poles, upper_poles.conj()])
-        return followed_roots(self, z, zeros=False)
+        return self._followed_roots(z, zeros=False)
 
     def zeros(self, z: Real) -> Complex:
         """Return the zeros of the coupling torque per angle in rad/s, in pairs as in `poles`.
@@ -535,7 +535,48 @@ class Plant:
         z : ndarray
             Roots of ``tan z = tanh z``, which determine the zeros of the uniform beam.
         """
-        return followed_roots(self, z, zeros=True)
+        return self._followed_roots(z, zeros=True)
+
+    def _followed_roots(self, z: Real, *, zeros: bool) -> Complex:
+        """Return poles or zeros, followed from those of the uniform beam with eigenvalues `z`."""
+        offsets = np.array(self.stiffness_offsets)
+        if not zeros and offsets.size:
+            # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
+            z = z.copy()
+            z[1 : 1 + offsets.size] *= (1 + offsets[: z.size - 1]) ** 0.25
+        roots = poles_for_eigenvalues(z, self.beam, self.damping).astype(np.complex128)
+        is_rigid = self.tip_mass_kg == 0 and self.root_compliance_rad_per_nm == 0
+        if is_rigid and not (zeros and offsets.any()):
+            return roots
+        relative_change = self.tip_mass_kg / (self.beam.density_kg_per_m * self.beam.length_m)
+        stiffness_nm_per_rad = self.beam.bending_stiffness_n_m2 / self.beam.length_m
+        relative_change = max(
+            relative_change, self.root_compliance_rad_per_nm * stiffness_nm_per_rad
+        )
+        if zeros:
+            relative_change = max(relative_change, float(np.abs(offsets).max(initial=0.0)))
+
+        def roots_near(fraction: float, start_roots: Complex, step_tolerance: float) -> Complex:
+            partial_plant = replace(
+                self,
+                tip_mass_kg=fraction * self.tip_mass_kg,
+                root_compliance_rad_per_nm=fraction * self.root_compliance_rad_per_nm,
+                stiffness_offsets=tuple((fraction if zeros else 1.0) * offsets),
+            )
+            return partial_plant._newton_roots(start_roots, step_tolerance, zeros=zeros)
+
+        return followed_roots(roots, relative_change, roots_near)
+
+    def _newton_roots(self, s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
+        """Return the roots of ``1/G + kappa``, or with `zeros` of G, near the start values `s`."""
+
+        def newton_step(s: Complex) -> Complex:
+            at = self.rigid_clamp_response(s)
+            factor = -1 if zeros else 1 + self.root_compliance_rad_per_nm * at.response
+            step: Complex = at.response / self.derivative_by_s(s, at) * factor
+            return step
+
+        return newton_roots(newton_step, s, step_tolerance)
 
     def mode_poles(
         self, mode_count: int, wrt: Sequence[str] = (), near_rad_s: Sequence[complex] = ()

@@ -1,16 +1,11 @@
 """Poles of a plant, and Newton's search for its poles and zeros."""
 
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-
-from rigd.beam._modes import poles_for_eigenvalues
-
-if TYPE_CHECKING:
-    from rigd.beam._plant import Plant
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -80,51 +75,36 @@ class Pole:
         return np.asarray(damping_derivatives, dtype=np.float64)
 
 
-def followed_roots(plant: "Plant", z: Real, *, zeros: bool) -> Complex:
+def followed_roots(
+    uniform_roots: Complex,
+    relative_change: float,
+    roots_near: Callable[[float, Complex, float], Complex],
+) -> Complex:
     """Return poles or zeros, followed from those of the uniform beam on a rigid clamp.
 
-    A row is NaN if the path was lost.
+    `relative_change` is how far the plant differs from that beam, relative to the beam's own
+    values. ``roots_near(fraction, start_roots, step_tolerance)`` returns the roots of a plant with
+    a fraction of this difference. A row is NaN if the path was lost.
     """
-    stiffness_offsets = np.array(plant.stiffness_offsets)
-    if not zeros and stiffness_offsets.size:
-        # On a rigid clamp the poles are exactly those of the stiffness k⁴ (1 + d).
-        z = z.copy()
-        z[1 : 1 + stiffness_offsets.size] *= (1 + stiffness_offsets[: z.size - 1]) ** 0.25
-    roots = poles_for_eigenvalues(z, plant.beam, plant.damping).astype(np.complex128)
-    is_rigid = plant.tip_mass_kg == 0 and plant.root_compliance_rad_per_nm == 0
-    if is_rigid and not (zeros and stiffness_offsets.any()):
-        return roots
+    roots = uniform_roots
     has_root = ~np.isnan(roots[:, 0])
     # One of a conjugate pair suffices; without oscillation both have to be found.
     oscillating = roots[has_root][:, 0].imag != 0
     second_real_poles = roots[has_root][~oscillating][:, 1]
     current_roots = np.concatenate([roots[has_root][:, 0], second_real_poles])
     current_roots *= 1 - _START_POLE_DISTANCE  # G is infinite at an undamped pole
-    # Relative to the beam's own values: a change that moves the poles little needs few steps.
-    relative_change = plant.tip_mass_kg / (plant.beam.density_kg_per_m * plant.beam.length_m)
-    stiffness_nm_per_rad = plant.beam.bending_stiffness_n_m2 / plant.beam.length_m
-    relative_change = max(relative_change, plant.root_compliance_rad_per_nm * stiffness_nm_per_rad)
-    if zeros:
-        relative_change = max(relative_change, float(np.abs(stiffness_offsets).max(initial=0.0)))
+    # A change that moves the poles little needs few steps.
     step_count = min(max(math.ceil(relative_change / _CHANGE_PER_STEP), 2), _MAX_HOMOTOPY_STEPS)
     previous_roots = current_roots
     for step_number in range(1, step_count + 1):
-        fraction = step_number / step_count
-        partial_plant = replace(
-            plant,
-            tip_mass_kg=fraction * plant.tip_mass_kg,
-            root_compliance_rad_per_nm=fraction * plant.root_compliance_rad_per_nm,
-            stiffness_offsets=tuple((fraction if zeros else 1.0) * stiffness_offsets),
-        )
         is_last_step = step_number == step_count
         start_roots = 2 * current_roots - previous_roots if step_number > 1 else current_roots
         previous_roots, current_roots = (
             current_roots,
-            newton_roots(
-                partial_plant,
+            roots_near(
+                step_number / step_count,
                 start_roots,
                 _NEWTON_TOLERANCE if is_last_step else _INTERMEDIATE_TOLERANCE,
-                zeros=zeros,
             ),
         )
     first_roots = current_roots[: oscillating.size]
@@ -134,23 +114,23 @@ def followed_roots(plant: "Plant", z: Real, *, zeros: bool) -> Complex:
     return roots
 
 
-def newton_roots(plant: "Plant", s: Complex, step_tolerance: float, *, zeros: bool) -> Complex:
-    """Return the roots of ``1/G + kappa``, or with `zeros` of G, that Newton's method finds.
+def newton_roots(
+    newton_step: Callable[[Complex], Complex], s: Complex, step_tolerance: float
+) -> Complex:
+    """Return the roots that Newton's method finds from the start values `s`.
 
-    `s` has the start values; `step_tolerance` is the relative length of the last step. The
-    result is NaN where no root is found near its start.
+    `step_tolerance` is the relative length of the last step. The result is NaN where no root is
+    found near its start.
     """
     start_roots = s
     with np.errstate(all="ignore"):
         for _ in range(_MAX_NEWTON_STEPS):
-            at = plant.rigid_clamp_response(s)
-            newton_step = at.response / plant.derivative_by_s(s, at)
-            newton_step *= -1 if zeros else 1 + plant.root_compliance_rad_per_nm * at.response
-            s = s + newton_step
-            if not np.nanmax(np.abs(newton_step / s), initial=0.0) > step_tolerance:
+            step = newton_step(s)
+            s = s + step
+            if not np.nanmax(np.abs(step / s), initial=0.0) > step_tolerance:
                 break
         # Far from any root every step is short, too.
-        has_converged = (np.abs(newton_step) < max(step_tolerance, 1e-9) * np.abs(s)) & (
+        has_converged = (np.abs(step) < max(step_tolerance, 1e-9) * np.abs(s)) & (
             np.abs(s) < _MAX_ROOT_TO_START_RATIO * np.abs(start_roots)
         )
         return np.where(has_converged, s, np.nan + 0j)
