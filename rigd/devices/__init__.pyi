@@ -1,6 +1,6 @@
+from ._fault_reset import reset_drive as reset_drive
 from ._registry import ActuationTarget as ActuationTarget
 from ._registry import actuation_target as actuation_target
-from ._registry import bus_conflicts as bus_conflicts
 from ._registry import check_selection as check_selection
 from ._registry import describe_actuation_target as describe_actuation_target
 from ._registry import is_simulated_here as is_simulated_here
@@ -12,4 +12,4 @@ from ._seeds import session_seed as session_seed
 from ._unknown import MAY_BE_UNKNOWN as MAY_BE_UNKNOWN
 from ._unknown import describe_unknown_values as describe_unknown_values
 from ._unknown import unknown_values as unknown_values
-from ._wired_rig import reset_drive as reset_drive
+from ._wired_drive import bus_conflicts as bus_conflicts

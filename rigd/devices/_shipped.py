@@ -42,7 +42,7 @@ def _simulated_sensor(_rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
 def _open_wired_drive(rig: RigParameters) -> OpenedDrive:
     """Create the CiA 402 drive."""
-    from rigd.devices._wired_rig import open_wired_drive
+    from rigd.devices._wired_drive import open_wired_drive
 
     return open_wired_drive(rig)
 

@@ -152,7 +152,7 @@ def stand_ins(monkeypatch):
     """Devices of which the checks believe that they are the profile's."""
     made = StandIns()
     monkeypatch.setattr("rigd.checks.devices.open_devices", made.open)
-    monkeypatch.setattr("rigd.devices._wired_rig.open_devices", made.open)
+    monkeypatch.setattr("rigd.devices._fault_reset.open_devices", made.open)
     monkeypatch.setattr("rigd.checks.devices.EXCHANGE_TICKS", 100)
     return made
 

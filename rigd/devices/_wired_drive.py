@@ -1,12 +1,10 @@
-"""Opening of a CiA 402 drive on its bus, or on the simulator of it, and the reset of a fault."""
+"""Opening of a CiA 402 drive on its bus, or on the simulator of it."""
 
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Protocol, runtime_checkable
 
-from rigd.devices._registry import ActuationTarget, bus_conflicts, open_devices
-from rigd.devices.canbus import CanLink
+from rigd.devices.canbus import MAX_LOAD, CanLink, bus_load, check_identifiers
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.declaration import OpenedDrive
@@ -86,52 +84,19 @@ def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
         )
 
 
-@runtime_checkable
-class ResettableDrive(Protocol):
-    """Drive whose faults can be reset, unlike a drive simulated in this process."""
+def bus_conflicts(rig: RigParameters) -> list[str]:
+    """Return the reasons why the devices of a rig cannot use one CAN bus, as sentences.
 
-    def reset_fault(self) -> str | None:
-        """Switch off, reset the fault, check that the drive gets ready; return the fault or None.
-
-        Raises
-        ------
-        DeviceError
-            If the drive may still turn, the fault persists, or the drive does not get ready.
-        """
-
-
-def reset_drive(rig: RigParameters, target: ActuationTarget | None = None) -> str:
-    """Reset the fault of a rig's drive, release the drive, and describe the result.
-
-    Parameters
-    ----------
-    rig, target
-        See :func:`rigd.devices._registry.open_devices`.
-
-    Returns
-    -------
-    str
-        Sentence for the operator with the fault that was found and the drive's present state.
-
-    Raises
-    ------
-    DeviceError
-        If the drive does not answer, may still turn, the fault persists, or the drive does not
-        become ready, for instance because STO is open.
+    The list is empty if they can. Nothing is sent on the bus.
     """
-    drive = open_devices(rig, target).drive
-    if not isinstance(drive, ResettableDrive):
-        return "Each session simulates a new drive: there is no fault to reset."
-    try:
-        fault = drive.reset_fault()
-    finally:
-        drive.close()
-    if fault is None:
-        return (
-            "The drive is not in fault, so there is nothing to reset. Its statusword shows it off "
-            "and it gets ready to switch on: the next session can be started."
+    if rig.can is None:
+        return []
+    conflict_reasons = check_identifiers(rig)
+    worst_load = bus_load(rig).worst
+    if worst_load > MAX_LOAD:
+        conflict_reasons.append(
+            f"The frames of a tick take up to {100 * worst_load:.0f} % of the CAN bus at "
+            f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
+            "can.bitrate_bit_s or a lower rig.rate_hz."
         )
-    return (
-        f"The drive was in fault: {fault}. The fault is reset. Its statusword shows it off and it "
-        "gets ready to switch on: the next session can be started."
-    )
+    return conflict_reasons
