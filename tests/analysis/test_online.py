@@ -8,6 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import warm_start
 from cases import further
 
 from analysis.identify import Measurement, fit_freest_alone, select
@@ -291,7 +292,7 @@ def wire(samples) -> bytes:
 
 @pytest.fixture
 def program():
-    process = subprocess.Popen(
+    process = warm_start.start(
         [sys.executable, "-P", "-m", "analysis.online"],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
