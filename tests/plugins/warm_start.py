@@ -1,8 +1,8 @@
 """Run commands of this project in copies of a process that has imported the project already.
 
-The imports of one `rigd` take half a second of a processor, a copy takes a hundredth. `run` and
-`Popen` are used like those of `subprocess`. What depends on how Python itself starts, and one
-session of each command from end to end, is tested with `subprocess`.
+The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
+like that of `subprocess`, `start` like its `Popen`. What depends on how Python itself starts is
+tested with `subprocess`, and so are a session and an analysis from end to end.
 """
 
 import atexit
@@ -24,6 +24,7 @@ from pathlib import Path
 from subprocess import DEVNULL, PIPE, STDOUT, CalledProcessError, CompletedProcess, TimeoutExpired
 
 _MAX_REQUEST_BYTES = 1 << 17
+_MAX_REPORT_BYTES = 1 << 16
 _STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
 """Packages whose import starts threads, which would be missing in a copy."""
 
@@ -45,11 +46,19 @@ def run(command, *, capture_output=False, timeout=None, check=False, input=None,
     return CompletedProcess(command, process.returncode, said, errors)
 
 
+def _settings_of_python(environment):
+    """Return the variables that Python reads when it starts."""
+    names = ("PYTHON", "LC_", "LANG")
+    return {name: value for name, value in environment.items() if name.startswith(names)}
+
+
+_OWN_SETTINGS = _settings_of_python(os.environ)
+
+
 def start(command, *, env=None, **options):
     """Start a command, in a new process if its environment changes how Python itself starts."""
     env = dict(os.environ if env is None else env)
-    changed = dict(env.items() ^ os.environ.items())
-    if any(name.startswith(("PYTHON", "LC_", "LANG")) for name in changed):
+    if _settings_of_python(env) != _OWN_SETTINGS:
         return subprocess.Popen(command, env=env, **options)
     return Copy(list(map(os.fspath, command)), env, **options)
 
@@ -213,10 +222,12 @@ def _finish(pidfd, pid, status, imported):
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
     with os.fdopen(status, "wb") as stream:
         stream.write(_number(code))
-    with os.fdopen(imported) as stream:
-        for name in stream.read().split():
+    os.set_blocking(imported, False)  # a child of the copy may still have the other end
+    with contextlib.suppress(BlockingIOError):
+        for name in os.read(imported, _MAX_REPORT_BYTES).decode().split():
             with contextlib.suppress(ImportError):
                 import_module(name)
+    os.close(imported)
 
 
 def _become_new_process(job, descriptors, importing):

@@ -47,7 +47,10 @@ def session(paper_file, tmp_path):
 
 @pytest.mark.process
 def test_one_session_from_end_to_end(session, tmp_path):
-    result = run(session.name, "--json", "fits.json", cwd=tmp_path)
+    result = subprocess.run(
+        [sys.executable, "-m", "analysis", session.name, "--json", "fits.json"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     report = tmp_path / "session.report"
