@@ -31,7 +31,7 @@ def test_the_one_session_is_reported_by_itself_beside_the_other_s_error(
     run_here, short_sessions, tmp_path
 ):
     shutil.copy(short_sessions[0], tmp_path / "ok.mcap")
-    result = run_here("ok.mcap", "nosuch.mcap", "--method", "welch", "--json", "all.json")
+    result = run_here("ok.mcap", "nosuch.mcap", "--json", "all.json")
     assert result.returncode == 1
     (error,) = errors(result)
     assert "nosuch.mcap cannot be read: No such file" in error
