@@ -152,6 +152,9 @@ def simulate(
             y = np.einsum("mi,moi->mo", coming[:, : modes + 1], push)
             place = place + rate * dt
             gap = y - place  # penetration without the new force, positive inside
+            if not (gap > 0).any() and not force.any() and not np.isfinite(begun[knock != 0]).any():
+                state, before = coming, gap  # nothing is touched
+                continue
             begun = np.minimum(begun, np.where(gap > 0, now, np.inf))
             force = np.zeros((m, most))
             for _ in range(1 if most == 1 else 30):

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warm_start
 from hypothesis import settings
 
 from rigd import testing
@@ -30,6 +31,9 @@ pytest_plugins = [
     "rewritten_once", "shared_memory_closed", "shipped_profile", "standstill", "synthetic_sessions",
     "touch_sessions", "web_daemon",
 ]  # fmt: skip
+
+# Nothing of what collecting makes is garbage: see `pytest_collection_finish`.
+gc.disable()
 
 # As in the commands; threads would fight each other where tests run in parallel.
 use_one_thread()
@@ -64,9 +68,10 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:
-    """Four thousand tests stay to the end: no garbage collection need look at them again."""
+    """Seven thousand tests stay to the end: no garbage collection need look at them."""
     gc.collect()
     gc.freeze()
+    gc.enable()
 
 
 RIGD = Path(sys.executable).parent / "rigd"
@@ -160,7 +165,7 @@ def rigd(tmp_path):
     """Run `rigd` in an empty folder; returns the completed process."""
 
     def run(*arguments, timeout=300):
-        return subprocess.run(
+        return warm_start.run(
             [RIGD, *map(str, arguments)],
             cwd=tmp_path,
             capture_output=True,
@@ -180,7 +185,7 @@ def start_rigd(tmp_path):
 
     def start(*arguments, folder=tmp_path):
         started.append(
-            subprocess.Popen(
+            warm_start.start(
                 [RIGD, *map(str, arguments)],
                 cwd=folder,
                 stdout=subprocess.PIPE,
@@ -248,12 +253,11 @@ def start_simulator(runtime_folder, tmp_path):
 
     def start(profile, *options) -> subprocess.Popen:
         with (tmp_path / f"simulator-{len(started)}.txt").open("w") as said:
-            process = subprocess.Popen(
+            process = warm_start.start(
                 [RIGD, "simulate", "--profile", str(profile), *map(str, options)],
                 cwd=tmp_path,
                 stdout=said,
                 stderr=subprocess.STDOUT,
-                env=os.environ,
             )
         started.append(process)
         name = load_profile(profile).name
@@ -317,7 +321,7 @@ def short_chirps(made_once):
         command = [RIGD, "run", "chirp", "--profile", HW_PROFILES / "sim.toml", "--fast"]
         command += ["--duration", "20", "--rest", "0.5", "--ring-down", "1", "--seed", "3"]
         command += ["--repeat", "2", "--output", folder]
-        subprocess.run(command, check=True, capture_output=True, timeout=300)
+        warm_start.run(command, check=True, capture_output=True, timeout=300)
 
     return sorted(made_once("short_chirps", make).glob("*.mcap"))
 

@@ -16,6 +16,9 @@ SettingValue = bool | int | float | str | tuple[str, ...]
 _COMMENT_WIDTH = 100
 """Largest length of a comment's lines, in characters."""
 
+_NAMING_LINE = re.compile(r"\[([^\]]+)\]|(\w+)\s*=|# (\w+) = ")
+"""Beginning of a line with the title of a section, a key, or a key in a comment."""
+
 
 @dataclass(frozen=True, slots=True)
 class Setting:
@@ -188,13 +191,16 @@ def _line_indices(text_lines: Sequence[str]) -> dict[str, int]:
     value_text: dict[str, int] = {}
     section = ""
     for line_index, text_line in enumerate(text_lines):
-        if section_title := re.match(r"\[([^\]]+)\]", text_line):
-            index_by_key[section_title[1]] = line_index
-            section = section_title[1] + "."
-        elif key := re.match(r"(\w+)\s*=", text_line):
-            index_by_key[section + key[1]] = line_index
-        elif (key := re.match(r"# (\w+) = ", text_line)) and section + key[1] in key_types():
-            value_text[section + key[1]] = line_index
+        if not (found := _NAMING_LINE.match(text_line)):
+            continue
+        title, key_name, commented_key = found.groups()
+        if title:
+            index_by_key[title] = line_index
+            section = f"{title}."
+        elif key_name:
+            index_by_key[section + key_name] = line_index
+        elif section + commented_key in key_types():
+            value_text[section + commented_key] = line_index
     return value_text | index_by_key
 
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warm_start
 from processes import eventually, has_ended
 
 from analysis import quick_look
@@ -267,7 +268,7 @@ def test_a_look_is_written_whole_and_replaces_an_older_one_only(tmp_path):
 
 
 def look(*arguments):
-    return subprocess.run(
+    return warm_start.run(
         [sys.executable, "-m", "analysis.quick_look", *map(str, arguments)],
         capture_output=True, text=True, check=False,
     )  # fmt: skip

@@ -57,10 +57,10 @@ def test_scatter_by_hand(of_frequencies):
 
 
 def test_sessions_that_repeat_are_of_one_specimen(of_frequencies):
-    """A thousand campaigns of five: no more false alarms than one in a hundred, and few more."""
+    """Of 250 campaigns of five: one false alarm in a hundred, and as many more as chance has it."""
     rng = np.random.default_rng(3)
-    alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).mixed for _ in range(1000))
-    assert alarms <= 15
+    alarms = sum(of_frequencies(rng.normal(2.5, 0.01, 5), 0.01).mixed for _ in range(250))
+    assert alarms <= 6
 
 
 def test_a_scatter_like_their_own_uncertainty_is_no_mixture(of_frequencies):

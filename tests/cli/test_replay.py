@@ -17,6 +17,7 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
+import warm_start
 from graphics import NO_GRAPHICS, viewer_ended
 from processes import children, eventually, has_ended, listeners
 from rerun_files import batches
@@ -39,7 +40,7 @@ LOOPBACK = "0100007F"  # 127.0.0.1 as /proc/net/tcp writes it
 
 
 def run(*arguments, **options):
-    return subprocess.run(
+    return warm_start.run(
         [RIGD, *map(str, arguments)], capture_output=True, text=True, check=False, **options
     )
 

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warm_start
 from cases import further
 from processes import child_running, eventually, has_ended, ignored, ignores
 from resting_beams import pressing_force_n
@@ -527,7 +528,7 @@ def test_a_chirp_there_and_back_begins_as_a_plain_one_and_so_does_its_welch_esti
     """With the seed of the plain chirp: equal to the last bit up to the turn."""
     command = [RIGD, "run", "chirp", "--there-and-back", "--duration", "20", "--rest", "0.5"]
     command += ["--ring-down", "1", "--seed", "3", "--fast", "--no-look", "--output", tmp_path]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = warm_start.run(command, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr
     assert "sweeps from 0.05 to 50 Hz and back, 20 s each way, record of 41.5 s" in done.stdout
     (path,) = tmp_path.glob("*.mcap")

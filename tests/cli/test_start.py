@@ -5,12 +5,12 @@ import os
 import signal
 import socket
 import struct
-import subprocess
 import sys
 import threading
 
 import pytest
 import typer
+import warm_start
 
 from rigd.cli import start
 from rigd.daemon.address import socket_path
@@ -187,7 +187,7 @@ def interrupting_daemon(runtime_folder):
 @pytest.mark.process
 @pytest.mark.parametrize("options", [(), ("--detach",)])
 def test_ctrl_c_cancels_a_start_that_waits(interrupting_daemon, options):
-    done = subprocess.run(
+    done = warm_start.run(
         [sys.executable, "-m", "rigd", "start", "hold", "--profile", "sim", *options],
         check=False,
         capture_output=True,

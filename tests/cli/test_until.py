@@ -240,6 +240,7 @@ def test_a_chirp_is_fitted_while_it_runs(rigd, tmp_path):
     assert told.modes[0].damping_ratio.as_json() == session["fit"]["modes"][0]["damping_ratio"]
 
 
+@pytest.mark.further  # as tests/recovery/test_recovery_disk.py has it of other sessions
 def test_a_full_disk_ends_it_with_its_reason(start_rigd, tmp_path):
     process = start_rigd(*LONG)
     for line in process.stderr:

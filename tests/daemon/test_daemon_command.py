@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+import warm_start
 from processes import eventually
 
 from rigd.daemon.address import socket_path
@@ -30,7 +31,7 @@ def rigd(runtime_folder, tmp_path):
 
     def start(*arguments):
         started.append(
-            subprocess.Popen(
+            warm_start.start(
                 [RIGD, *map(str, arguments)],
                 cwd=tmp_path,
                 stdout=subprocess.PIPE,

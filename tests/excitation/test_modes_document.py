@@ -2,11 +2,11 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+import warm_start
 from operated_daemons import RequestError, parse_request
 
 from rigd.excitation import ExcitationError
@@ -145,7 +145,7 @@ def test_what_is_no_plain_file_is_refused(tmp_path):
 def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(document()), "--fast", "--json"]
     command += ["--duration", "14", "--ring-down", "1", "--output", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = warm_start.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
     (session,) = json.loads(done.stdout)["sessions"]
     assert (session["outcome"], session["recorded"]) == ("complete", 16_000)
@@ -158,7 +158,7 @@ def test_a_session_is_run_and_says_what_it_did(document, tmp_path):
 @pytest.mark.process
 def test_the_command_refuses_in_one_sentence(tmp_path):
     command = [sys.executable, "-m", "rigd", "run", "modes", str(tmp_path / "no.json"), "--fast"]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    done = warm_start.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 2
     assert "no.json: cannot be read" in done.stderr
     assert "Traceback" not in done.stderr

@@ -65,7 +65,8 @@ def drag_torque(angle_rad, rate_hz, beam, damping, constant_m, slowing=0.0, mode
     def slope(q, v, air):
         speed = air + v @ shapes
         size = np.abs(speed)
-        force = -HALF_AIR_DENSITY_KG_PER_M3 * (constant_m * size + slowing * np.cbrt(size)) * speed
+        drag = constant_m * size + slowing * np.cbrt(size) if slowing else constant_m * size
+        force = -HALF_AIR_DENSITY_KG_PER_M3 * drag * speed
         modal = force @ shares
         return (modal - viscous * v - elastic * q) / density, force, modal
 

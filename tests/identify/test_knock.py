@@ -57,7 +57,7 @@ def told(headline, plants, link):
 
 @pytest.mark.parametrize(
     ("force_n", "at_s", "duration_s"),
-    [(0.3, 30.0, 0.02), further(3.0, 45.0, 0.02), (1.0, 12.3456, 0.005), (0.3, 40.0, 0.3)],
+    [further(0.3, 30.0, 0.02), further(3.0, 45.0, 0.02), (1.0, 12.3456, 0.005), (0.3, 40.0, 0.3)],
 )
 def test_a_knock_is_named_with_its_instant(knocked, plants, link, force_n, at_s, duration_s):
     measurement = knocked(force_n, at_s, duration_s=duration_s).measured(NOISE_NM, 1)

@@ -276,7 +276,7 @@ def test_a_change_that_cannot_come_near_another_explanation_is_not_fitted(candid
     ("what", "change"),
     [
         ("stiffness", 0.005),
-        ("damping", 0.2),
+        further("damping", 0.2),
         further("stiffness", -0.01),
         further("damping", -0.3),
         further("damping", 0.0),

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from cases import further
 
 from analysis.identify import select
 
@@ -18,10 +19,14 @@ def rubbed(made, friction_nm, sliding_rad_s):
     return type(made)(made.angle_rad, torque_nm)
 
 
-@pytest.mark.parametrize("sliding_rad_s", [0.003, 0.03])
-def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, sliding_rad_s):
+@pytest.fixture(scope="module")
+def plain(sessions):
+    return select(sessions("III").measured(NOISE_NM, 3))
+
+
+@pytest.mark.parametrize("sliding_rad_s", [0.003, further(0.03)])
+def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, plain, sliding_rad_s):
     """A torque of known sign that grows with nothing: no harmonic, no order, no stiffness."""
-    plain = select(sessions("III").measured(NOISE_NM, 3))
     selection = select(rubbed(sessions("III"), 0.01, sliding_rad_s).measured(NOISE_NM, 3))
     (finding,) = selection.verdict.findings
     assert finding.kind == "friction"
@@ -39,6 +44,5 @@ def test_dry_friction_is_named_and_leaves_the_modes_right(sessions, sliding_rad_
     assert selection.verdict.alpha.status == "compatible"
 
 
-def test_without_friction_none_is_named(sessions):
-    kinds = {each.kind for each in select(sessions("III").measured(NOISE_NM, 4)).verdict.findings}
-    assert "friction" not in kinds
+def test_without_friction_none_is_named(plain):
+    assert "friction" not in {each.kind for each in plain.verdict.findings}

@@ -6,7 +6,6 @@ import json
 import os
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -14,6 +13,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+import warm_start
 from processes import eventually
 
 from rigd.daemon import page_address
@@ -177,7 +177,7 @@ def rig_with_page(write_profile_in, folder, *options):
     told = folder / "serve.txt"
     environment = {name: value for name, value in os.environ.items() if name != "RIGD_NO_LOOK"}
     with told.open("w") as said:
-        process = subprocess.Popen(
+        process = warm_start.start(
             command, stdout=said, stderr=said, start_new_session=True, env=environment
         )
     try:

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warm_start
 from PIL import Image
 from typer.testing import CliRunner
 
@@ -21,7 +22,7 @@ QUICK = ("--method", "welch", "--types", "I", "--weights", "const", "--figures",
 
 
 def run(*arguments, cwd):
-    return subprocess.run(
+    return warm_start.run(
         [sys.executable, "-m", "analysis", *map(str, arguments)],
         cwd=cwd, capture_output=True, text=True, timeout=300, check=False,
     )  # fmt: skip
@@ -46,7 +47,10 @@ def session(paper_file, tmp_path):
 
 @pytest.mark.process
 def test_one_session_from_end_to_end(session, tmp_path):
-    result = run(session.name, "--json", "fits.json", cwd=tmp_path)
+    result = subprocess.run(
+        [sys.executable, "-m", "analysis", session.name, "--json", "fits.json"],
+        cwd=tmp_path, capture_output=True, text=True, timeout=300, check=False,
+    )  # fmt: skip
     assert result.returncode == 0, result.stderr
     assert result.stderr == ""
     report = tmp_path / "session.report"
@@ -262,7 +266,7 @@ def test_a_report_that_cannot_be_written_is_refused(session, tmp_path, analyze_h
 
 @pytest.mark.process
 def test_ctrl_c_ends_with_130_and_leaves_nothing_half(session, tmp_path):
-    process = subprocess.Popen(
+    process = warm_start.start(
         [sys.executable, "-m", "analysis", *([session.name] * 60),
          "--each", *QUICK, "--report", "out"],
         cwd=tmp_path, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,

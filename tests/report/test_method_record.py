@@ -19,7 +19,7 @@ def done(write_session, make_signals, tmp_path_factory):
         app,
         [
             str(path), "--method", "record", "--band", "1,20", "--weights", "omega",
-            "--json", str(folder / "a.json"),
+            "--figures", "png", "--json", str(folder / "a.json"),
         ],
     )  # fmt: skip
     assert result.exit_code == 0, result.stderr

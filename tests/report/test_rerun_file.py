@@ -242,11 +242,11 @@ def titles(path):
     return found
 
 
-def test_weightings_of_ones_own_and_an_estimate_without_coherence(paper_file, tmp_path):
+def test_weightings_of_ones_own_and_an_estimate_without_coherence(session, tmp_path):
     settings = WelchSettings(
         estimator="fft", types=("III",), weightings=("omega", "omega^0.5", "omega^-0.5")
     )
-    analysis = analyse(load_record(paper_file), settings)
+    analysis = analyse(load_record(session), settings)
     assert analysis.response.coherence is None
     path = tmp_path / "own.rrd"
     write_rerun_file(RecordResult(analysis.record, welch=analysis), path)

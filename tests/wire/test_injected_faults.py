@@ -116,8 +116,15 @@ AGAIN = {
     "wrench lost",
 }
 """What the loop does then another row shows as well, or the same fault of the other device."""
-FURTHER = {"controller off the bus", "emergency message", "sensor frozen", "serial line cut"}
-"""Lost devices and faults of drives, as other rows have them by other ways."""
+FURTHER = {
+    "controller off the bus",
+    "emergency message",
+    "encoder frozen",
+    "sensor frozen",
+    "serial line cut",
+}
+"""Lost devices and faults of drives, as other rows have them by other ways; what is frozen, as
+tests/engine/test_every_interlock.py has it without the wire."""
 
 
 def marks(row):

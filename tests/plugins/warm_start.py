@@ -1,0 +1,291 @@
+"""Run commands of this project in copies of a process that has imported the project already.
+
+The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
+like that of `subprocess`, `start` like its `Popen`. What depends on how Python itself starts is
+tested with `subprocess`, and so are a session and an analysis from end to end.
+"""
+
+import atexit
+import contextlib
+import functools
+import gc
+import io
+import json
+import os
+import runpy
+import selectors
+import signal
+import socket
+import subprocess
+import sys
+import threading
+from importlib import import_module
+from pathlib import Path
+from subprocess import DEVNULL, PIPE, STDOUT, CalledProcessError, CompletedProcess, TimeoutExpired
+
+_MAX_REQUEST_BYTES = 1 << 17
+_MAX_REPORT_BYTES = 1 << 16
+_STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
+"""Packages whose import starts threads, which would be missing in a copy."""
+
+
+def run(command, *, capture_output=False, timeout=None, check=False, input=None, **options):  # noqa: A002
+    """Run a command to its end, as `subprocess.run` does."""
+    if capture_output:
+        options |= {"stdout": PIPE, "stderr": PIPE}
+    if input is not None:
+        options["stdin"] = PIPE
+    with start(command, **options) as process:
+        try:
+            said, errors = process.communicate(input, timeout=timeout)
+        except BaseException:
+            process.kill()
+            raise
+    if check and process.returncode:
+        raise CalledProcessError(process.returncode, command, said, errors)
+    return CompletedProcess(command, process.returncode, said, errors)
+
+
+def _settings_of_python(environment):
+    """Return the variables that Python reads when it starts."""
+    names = ("PYTHON", "LC_", "LANG")
+    return {name: value for name, value in environment.items() if name.startswith(names)}
+
+
+_OWN_SETTINGS = _settings_of_python(os.environ)
+
+
+def start(command, *, env=None, **options):
+    """Start a command, in a new process if its environment changes how Python itself starts."""
+    env = dict(os.environ if env is None else env)
+    if _settings_of_python(env) != _OWN_SETTINGS:
+        return subprocess.Popen(command, env=env, **options)
+    return Copy(list(map(os.fspath, command)), env, **options)
+
+
+class Copy:
+    """A command in a copy of the warm process, with what tests use of `subprocess.Popen`."""
+
+    def __init__(
+        self, command, env, *, cwd=None, stdin=None, stdout=None, stderr=None, text=False,
+        start_new_session=False,
+    ):  # fmt: skip
+        self.args = command
+        self.returncode = None
+        self.stdin = self.stdout = self.stderr = None
+        self._communicated = []
+        mode = "t" if text else "b"
+        with contextlib.ExitStack() as of_the_copy:
+            ends = []
+            for number, given in enumerate((stdin, stdout, stderr)):
+                if given == PIPE:
+                    reading, writing = os.pipe()
+                    mine, end = (reading, writing) if number else (writing, reading)
+                    stream = os.fdopen(mine, f"{'r' if number else 'w'}{mode}")
+                    setattr(self, ("stdin", "stdout", "stderr")[number], stream)
+                    of_the_copy.callback(os.close, end)
+                elif given == DEVNULL:
+                    end = os.open(os.devnull, os.O_RDWR)
+                    of_the_copy.callback(os.close, end)
+                elif given == STDOUT:
+                    end = ends[1]
+                elif given is None:
+                    end = number
+                else:
+                    end = given if isinstance(given, int) else given.fileno()
+                ends.append(end)
+            reading, writing = os.pipe()
+            of_the_copy.callback(os.close, writing)
+            self._status = os.fdopen(reading, "rb", buffering=0)
+            job = [command, os.fspath(cwd or Path.cwd()), env, start_new_session]
+            socket.send_fds(_warm_process(), [json.dumps(job).encode()], [*ends, writing])
+        self.pid = self._next_status()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        for stream in (self.stdin, self.stdout, self.stderr):
+            if stream:
+                with contextlib.suppress(BrokenPipeError):
+                    stream.close()
+        self.wait()
+
+    def _next_status(self):
+        number = self._status.read(4)
+        assert number, "the warm process has ended"
+        return int.from_bytes(number, sys.byteorder, signed=True)
+
+    def poll(self):
+        with contextlib.suppress(TimeoutExpired):
+            self.wait(0.0)
+        return self.returncode
+
+    def wait(self, timeout=None):
+        if self.returncode is None:
+            with selectors.DefaultSelector() as selector:
+                selector.register(self._status, selectors.EVENT_READ)
+                if not selector.select(timeout):
+                    raise TimeoutExpired(self.args, timeout)
+            self.returncode = self._next_status()
+            self._status.close()
+        return self.returncode
+
+    def communicate(self, input=None, timeout=None):  # noqa: A002
+        if not self._communicated:
+            said = {}
+            streams = [stream for stream in (self.stdout, self.stderr) if stream]
+            jobs = [functools.partial(_read_all, stream, said) for stream in streams]
+            if self.stdin:
+                jobs.append(functools.partial(_write_all, self.stdin, input))
+            threads = [threading.Thread(target=job, daemon=True) for job in jobs]
+            self._communicated = [threads, said]
+            for thread in threads:
+                thread.start()
+        threads, said = self._communicated
+        for thread in threads:
+            thread.join(timeout)
+            if thread.is_alive():
+                raise TimeoutExpired(self.args, timeout)
+        self.wait(timeout)
+        return said.get(self.stdout), said.get(self.stderr)
+
+    def send_signal(self, number):
+        if self.poll() is None:
+            os.kill(self.pid, number)
+
+    def terminate(self):
+        self.send_signal(signal.SIGTERM)
+
+    def kill(self):
+        self.send_signal(signal.SIGKILL)
+
+
+def _read_all(stream, said):
+    said[stream] = stream.read()
+    stream.close()
+
+
+def _write_all(stream, content):
+    with contextlib.suppress(BrokenPipeError), stream:
+        if content:
+            stream.write(content)
+
+
+@functools.cache
+def _warm_process():
+    """Start the process that is copied; it ends with this one."""
+    mine, other = socket.socketpair(type=socket.SOCK_SEQPACKET)
+    command = [sys.executable, "-P", __file__, str(other.fileno())]
+    process = subprocess.Popen(command, stdin=DEVNULL, pass_fds=[other.fileno()])
+    other.close()
+
+    def end():
+        mine.close()
+        process.wait()
+
+    atexit.register(end)
+    return mine
+
+
+# The warm process
+
+
+def _serve(requests):
+    """Make the copies that are requested and report how they end; returns, in a copy, its job."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the tests to handle
+    with selectors.DefaultSelector() as selector:
+        selector.register(requests, selectors.EVENT_READ)
+        while True:
+            for key, _ in selector.select():
+                if key.data:
+                    selector.unregister(key.fd)
+                    _finish(key.fd, *key.data)
+                    continue
+                content, descriptors, _, _ = socket.recv_fds(requests, _MAX_REQUEST_BYTES, 4)
+                if not content:
+                    sys.exit()
+                imported, importing = os.pipe()
+                gc.freeze()
+                if not (pid := os.fork()):
+                    requests.detach()
+                    return json.loads(content), descriptors, importing
+                for descriptor in (importing, *descriptors[:3]):
+                    os.close(descriptor)
+                data = pid, descriptors[3], imported
+                selector.register(os.pidfd_open(pid), selectors.EVENT_READ, data)
+
+
+def _finish(pidfd, pid, status, imported):
+    """Report how a copy ended; later ones need not import what it had to import itself."""
+    os.close(pidfd)
+    code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
+    with os.fdopen(status, "wb") as stream:
+        stream.write(_number(code))
+    os.set_blocking(imported, False)  # a child of the copy may still have the other end
+    with contextlib.suppress(BlockingIOError):
+        for name in os.read(imported, _MAX_REPORT_BYTES).decode().split():
+            with contextlib.suppress(ImportError):
+                import_module(name)
+    os.close(imported)
+
+
+def _become_new_process(job, descriptors, importing):
+    """Make this copy what a process is that has just started; returns its command."""
+    command, folder, environment, start_new_session = job
+    os.environ.clear()
+    os.environ.update(environment)
+    os.chdir(folder)
+    if start_new_session:
+        os.setsid()
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    for number, descriptor in enumerate(descriptors[:3]):
+        os.dup2(descriptor, number)
+    os.write(descriptors[3], _number(os.getpid()))
+    os.dup2(importing, 3, inheritable=False)
+    os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+    sys.stdin = sys.__stdin__ = os.fdopen(0, closefd=False)
+    for number, name in ((1, "stdout"), (2, "stderr")):
+        before = getattr(sys, name)
+        stream = io.TextIOWrapper(
+            os.fdopen(number, "wb", 0 if before.write_through else -1, closefd=False),
+            before.encoding,
+            before.errors,
+            line_buffering=before.line_buffering or os.isatty(number),
+            write_through=before.write_through,
+        )
+        setattr(sys, name, stream)
+        setattr(sys, f"__{name}__", stream)
+    atexit.register(_report_imports, frozenset(sys.modules))
+    return command
+
+
+def _report_imports(before):
+    new = (name for name in sys.modules if name not in before and not name.endswith("__main__"))
+    harmless = [name for name in new if name.partition(".")[0] not in _STARTS_THREADS]
+    os.write(3, "\n".join(harmless).encode())
+
+
+def _run(command):
+    program, *arguments = command
+    if program == sys.executable:
+        if arguments[0] == "-P":
+            del arguments[0]
+        else:
+            sys.path.insert(0, str(Path.cwd()))
+        option, module, *arguments = arguments
+        assert option == "-m", command
+        sys.argv = [module, *arguments]
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    else:
+        sys.argv = [program, *arguments]
+        sys.path.insert(0, str(Path(program).parent))
+        runpy.run_path(program, run_name="__main__")
+
+
+def _number(value):
+    return value.to_bytes(4, sys.byteorder, signed=True)
+
+
+if __name__ == "__main__":
+    _run(_become_new_process(*_serve(socket.socket(fileno=int(sys.argv[1])))))
