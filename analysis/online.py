@@ -20,7 +20,7 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.runtime import begin_background, give_way, ignore
+from rigd.runtime import begin_background, give_way
 from rigd.session import Session, SessionError, Validity, segments_until
 from rigd.session.online_fit import EstimateRequest, read_frames, read_start
 
@@ -440,6 +440,8 @@ def _write_estimate(online_estimator: OnlineEstimator, request: EstimateRequest)
 
 def main() -> None:
     """Read a session's samples from standard input, and write estimates to standard output."""
+    from rigd.runtime import ignore  # not on Windows, where no session runs
+
     # Ctrl-C stops the session safely. This program ends with the stream.
     ignore()
     argument_parser = argparse.ArgumentParser(prog="python -m analysis.online", description=__doc__)

@@ -575,7 +575,7 @@ def main() -> None:
     )
     parsed_arguments = begin_background(argument_parser)
     # The priority is not the lowest one, because other programs may never pause.
-    with suppress(OSError):
+    with suppress(OSError, AttributeError):  # AttributeError on Windows
         os.nice(_NICENESS)
     try:
         quick_look_document = make_quick_look(parsed_arguments.file, parsed_arguments.last)
