@@ -469,9 +469,15 @@ def _check_rerun(rerun_file: Path, files: Sequence[Path]) -> None:
     Raise the error of `check_new_file` if its file already exists.
     """
     from analysis.report import check_rerun_file
+    from rigd.extras import MissingExtraError, require_extra
 
     if len(files) > 1:
         raise typer.BadParameter(
             f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
         )
+    try:
+        require_extra("live", "--rerun")
+    except MissingExtraError as error:
+        print_error(str(error))
+        raise typer.Exit(1) from None
     check_rerun_file(rerun_file)

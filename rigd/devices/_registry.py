@@ -12,6 +12,7 @@ from rigd.devices.contracts import DeviceError, Devices
 from rigd.devices.parameters import DeviceSelection, RigParameters
 from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
+from rigd.extras import require_extra
 
 # Drive and sensor use the same plant or bus, so drivers are opened in pairs.
 _OPENERS = {
@@ -125,6 +126,7 @@ def bus_conflicts(rig: RigParameters) -> list[str]:
     """
     if rig.can is None:
         return []
+    require_extra("rig", f"The rig {rig.name}")
     from rigd.devices.canbus import MAX_LOAD, bus_load, check_identifiers
 
     conflict_reasons = check_identifiers(rig)

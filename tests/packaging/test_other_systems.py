@@ -167,6 +167,18 @@ def test_records_are_exported_and_imported(analyze, sessions, tmp_path):
     assert (tmp_path / "frf.mat").stat().st_size > 1000
 
 
+def test_of_rigd_the_file_tools_work(python, sessions, variables):
+    assert "2.mcap" in python("-m", "rigd", "list", sessions)
+    assert "rate" in python("-m", "rigd", "info", sessions / "0.mcap")
+    done = subprocess.run(
+        [sys.executable, "-m", "rigd", "run", "chirp", "--fast"],
+        cwd=sessions, env=variables, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: rigd run needs Linux. ")
+    assert len(done.stderr.splitlines()) == 1
+
+
 @pytest.mark.further
 def test_a_campaign_has_workers(analyze, sessions, tmp_path):
     analyze(
