@@ -73,7 +73,7 @@ $(VENV)/ready: pyproject.toml plugins/rigd-netft/pyproject.toml
 	$(PYTHON) -c 'import sys; sys.exit(0 if sys.version_info >= (3, 11) else "rigd needs Python 3.11 or newer; set PYTHON=/path/to/it")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade "pip>=25.1"
-	$(BIN)/python -m pip install --quiet --editable . --editable plugins/rigd-netft --group dev
+	$(BIN)/python -m pip install --quiet --editable '.[all]' --editable plugins/rigd-netft --group dev
 	touch $@
 
 clean:

@@ -1,3 +1,3 @@
 """Real-time acquisition daemon for a slewing flexible antenna."""
 
-__version__ = "0.1.0"
+__version__ = "1.0.0"

@@ -7,12 +7,21 @@ import sys
 
 _NOTHING_BEGAN_MESSAGE = b"Stopped before anything began.\n"
 """Message after Ctrl-C before a command has started."""
+_PORTABLE_COMMANDS = ("list", "info", "recover", "replay", "profiles", "specimens")
+"""Commands that use files only, which Windows has as well."""
 
 
 def main() -> None:
     """Run the command line ``rigd``; Ctrl-C during its import ends it with exit code 130."""
     signal.signal(signal.SIGINT, _end_on_interrupt)
     _fill_standard_descriptors()
+    command = next(iter(sys.argv[1:]), "--help")
+    is_posix = hasattr(os, "getuid")
+    if not is_posix and command not in _PORTABLE_COMMANDS and not command.startswith("-"):
+        sys.exit(
+            f"Error: rigd {command} needs Linux. This system has analyze, and of rigd the commands "
+            f"{', '.join(_PORTABLE_COMMANDS)}."
+        )
     from rigd.runtime import ignore_handled_signals, use_one_thread
 
     use_one_thread()

@@ -33,7 +33,8 @@
      |    +-- AddressError          no daemon is running, or its socket cannot be made
      |    +-- DaemonGoneError       the daemon was killed during a request
      |    +-- SessionError          a session file is damaged, or the disk is full
-     |    +-- RrdFileError          a recording for Rerun exists already
+     |    +-- MissingExtraError     --live without the packages of rigd[live]
+    |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run
      |    +-- EdsError, UnusableDriveError    the EDS file of a drive is invalid or insufficient
      |    +-- MotorEstimateError    the sessions do not determine the motor's data

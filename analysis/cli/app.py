@@ -16,7 +16,13 @@ from typer.core import TyperCommand, TyperGroup
 
 import rigd
 from analysis.cli.exchange import IMPORT_EPILOG, export_app, import_command
-from analysis.cli.sessions import NoSessionsError, Outputs, session_command, session_files
+from analysis.cli.sessions import (
+    NoSessionsError,
+    Outputs,
+    latest_session,
+    session_command,
+    session_files,
+)
 from analysis.cli.standard_streams import print_error, standard_streams
 from analysis.cli.touch import TOUCH_EPILOG, touch_command
 from analysis.cli.welch_options import (
@@ -42,6 +48,8 @@ if TYPE_CHECKING:
 
 DEFAULT_COMMAND: Final = "default"
 """Name of the command that runs if the first argument is not the name of a command."""
+_COMPLETION_OPTIONS: Final = (["--install-completion"], ["--show-completion"])
+"""Options of the group, which Typer adds to it."""
 
 
 class DefaultCommandGroup(TyperGroup):
@@ -61,7 +69,8 @@ class DefaultCommandGroup(TyperGroup):
     ) -> Any:  # noqa: ANN401
         """Parse the arguments of the command named first, or of the default command."""
         with readable_errors():
-            if args and args[0] in self.commands and args[0] != DEFAULT_COMMAND:
+            is_other = args and args[0] in self.commands and args[0] != DEFAULT_COMMAND
+            if is_other or args[:1] in _COMPLETION_OPTIONS:
                 return super().make_context(info_name, args, parent, **extra)
             return self.commands[DEFAULT_COMMAND].make_context(info_name, args, parent, **extra)
 
@@ -135,7 +144,6 @@ _COMMAND_LINE_SOURCE: Final = "COMMANDLINE"
 # Plain messages of one or two sentences, not boxes: they end up in logs.
 app = typer.Typer(
     cls=DefaultCommandGroup,
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
@@ -176,11 +184,20 @@ def _suppress_library_warnings() -> None:
 def analyze(
     context: typer.Context,
     files: Annotated[
-        list[Path],
+        list[Path] | None,
         typer.Argument(
-            metavar="FILE", readable=False, help="Session files (.mcap), or folders of them."
+            metavar="FILE",
+            readable=False,
+            show_default=False,
+            help="Session files (.mcap), or folders of them.",
         ),
-    ],
+    ] = None,
+    latest: Annotated[
+        bool,
+        typer.Option(
+            "--latest", help="Analyse the newest session of the folder FILE, or of sessions."
+        ),
+    ] = False,
     method: Annotated[
         str,
         typer.Option(
@@ -280,8 +297,14 @@ def analyze(
     """
     from analysis.report.folder import OutputError, OutputExistsError, check_new_file
 
+    if not files and not latest:
+        context.fail("Missing argument 'FILE'. Name session files, or take --latest.")
+    if latest and files and len(files) > 1:
+        raise typer.BadParameter(
+            f"it takes one folder, and {len(files)} were given.", param_hint="--latest"
+        )
     try:
-        files = session_files(files)
+        files = [latest_session(*files or ())] if latest else session_files(files or ())
     except NoSessionsError as error:
         print_error(str(error))
         raise typer.Exit(1) from None
@@ -336,6 +359,11 @@ def analyze(
             from analysis.cli.campaign import campaign_command
             from analysis.models import STRUCTURES
 
+            typer.echo(
+                f"{len(files)} sessions are analysed together, as a campaign; --each reports each "
+                "by itself.",
+                err=True,
+            )
             try:
                 exit_code = campaign_command(
                     files, settings, output_options,
@@ -469,9 +497,15 @@ def _check_rerun(rerun_file: Path, files: Sequence[Path]) -> None:
     Raise the error of `check_new_file` if its file already exists.
     """
     from analysis.report import check_rerun_file
+    from rigd.extras import MissingExtraError, require_extra
 
     if len(files) > 1:
         raise typer.BadParameter(
             f"it takes one session, and {len(files)} files were given.", param_hint="--rerun"
         )
+    try:
+        require_extra("live", "--rerun")
+    except MissingExtraError as error:
+        print_error(str(error))
+        raise typer.Exit(1) from None
     check_rerun_file(rerun_file)

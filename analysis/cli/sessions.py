@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Final
 
 import typer
@@ -12,7 +13,6 @@ from analysis.cli.standard_streams import print_readable
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
-    from pathlib import Path
 
     from rich.console import Console
 
@@ -98,6 +98,35 @@ def session_files(paths: Sequence[Path]) -> list[Path]:
             )
         session_paths += folder_sessions
     return session_paths
+
+
+def latest_session(folder: Path = Path("sessions")) -> Path:
+    """Return the file of the newest complete session in a folder, by its time of start.
+
+    Parameters
+    ----------
+    folder : Path
+        Folder with session files, by default that in which ``rigd run`` writes them.
+
+    Raises
+    ------
+    NoSessionsError
+        The folder contains no session, or cannot be read.
+    """
+    from rigd.errors import UserError
+    from rigd.library import list_sessions
+
+    try:
+        sessions = list_sessions(folder)
+    except UserError as error:
+        raise NoSessionsError(f"--latest: {error}") from None
+    for session in sessions:
+        if session.start_utc_ns is not None and session.path.suffix == ".mcap":
+            return session.path
+    raise NoSessionsError(
+        f"--latest: there is no session (*.mcap) in {folder}; name the folder: "
+        "analyze --latest FOLDER."
+    )
 
 
 def session_command(

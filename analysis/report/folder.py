@@ -192,6 +192,8 @@ def new_folder(folder: Path, *, overwrite: bool = False) -> Iterator[Path]:
             _replace_report(folder, temporary_folder, checksums)
             return
         (temporary_folder / CHECKSUM_LIST_NAME).write_text(_list_text(checksums), encoding="utf-8")
+        with suppress(OSError):
+            folder.rmdir()  # Windows does not replace a folder, not even an empty one
         try:
             temporary_folder.rename(folder)
         except OSError as error:

@@ -96,7 +96,6 @@ app = typer.Typer(
     no_args_is_help=True,
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
-    add_completion=False,
 )
 app.callback()(before_a_command)
 # In the order in which an operator meets them.

@@ -23,6 +23,7 @@ from rigd.cli.options import (
     fail,
 )
 from rigd.errors import RigdError
+from rigd.extras import require_extra
 from rigd.units import suffix_of, unit_of
 
 if TYPE_CHECKING:
@@ -70,6 +71,11 @@ def serve(
     from rigd.daemon import run_daemon
     from rigd.runner.request import load_rig, make_folder
 
+    page = web or web_port is not None
+    if live:
+        require_extra("live", "--live")
+    if page:
+        require_extra("rig", "The page")
     rig_profile, _ = load_rig(profile, fast=fast, hardware=hardware)
     make_folder(output)
     exit_code = run_daemon(
@@ -78,7 +84,7 @@ def serve(
         group=group,
         live=live,
         fast=fast,
-        page=web or web_port is not None,
+        page=page,
         page_port=web_port,
         quick_looks=not no_quick_look,
     )

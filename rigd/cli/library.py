@@ -28,6 +28,11 @@ _MAX_TEXT_WIDTH: Final = 24
 """Largest width of a text in a table, in characters."""
 _PLOT_WIDTH: Final = 25
 """Width of the plot of a trend, in characters."""
+_FIRST_SESSION_TEXT: Final = (
+    f"No sessions yet: there is no folder {SESSIONS}. Record one on the simulated rig with "
+    "rigd run chirp --fast, or list those of another folder with rigd list FOLDER."
+)
+"""What is listed where the default folder does not exist."""
 
 
 def list_sessions(
@@ -72,7 +77,9 @@ def list_sessions(
     from rigd.library.trend import mode_trends
 
     rows: list[SessionRow] = []
-    for folder in folders or [SESSIONS]:
+    if not folders:
+        folders = [SESSIONS] if SESSIONS.exists() else []
+    for folder in folders:
         with progress(folder.name) as on_progress:
             rows += sessions_of(
                 folder,
@@ -94,6 +101,8 @@ def list_sessions(
         typer.echo(json.dumps(json_document))
     elif trend:
         typer.echo("\n".join(_trend_lines(trends)))
+    elif not folders:
+        typer.echo(_FIRST_SESSION_TEXT)
     else:
         typer.echo("\n".join(_session_lines(rows)))
 

@@ -10,6 +10,7 @@ import typer
 
 from rigd.cli import entry
 from rigd.errors import RigdError
+from rigd.extras import explain_missing_module
 from rigd.printable import progress_bar, readable_message
 
 if TYPE_CHECKING:
@@ -36,6 +37,11 @@ def exit_on_errors() -> Iterator[None]:
     """Turn an error of the rig into a message and exit code 1, or 2 if the request is wrong."""
     try:
         yield
+    except ModuleNotFoundError as error:
+        explanation = explain_missing_module(error)
+        if explanation is None:
+            raise
+        fail(str(explanation), EXIT_FAILED)
     except RigdError as error:
         fail(error.full_message(), EXIT_WRONG_USE if error.wrong_use else EXIT_FAILED)
 

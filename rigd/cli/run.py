@@ -39,6 +39,7 @@ from rigd.cli.options import (
     session_notes,
 )
 from rigd.cli.start import SessionCommands, start_processes, start_sessions
+from rigd.extras import require_extra
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -224,6 +225,8 @@ def run_sessions(
     as_json: AsJson = False,
 ) -> None:
     """Run sessions of an excitation one after the other, and report how they ended."""
+    if live:
+        require_extra("live", "--live")
     session_metadata = session_notes(operator, specimen, note, meta)
     fits_live = watch_fit or kind == "until"
     stop_request, process_group = start_processes(live=live, touch=kind == "touch", fit=fits_live)

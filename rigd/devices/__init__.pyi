@@ -1,3 +1,4 @@
+from ._bus_conflicts import bus_conflicts as bus_conflicts
 from ._fault_reset import reset_drive as reset_drive
 from ._registry import ActuationTarget as ActuationTarget
 from ._registry import actuation_target as actuation_target
@@ -12,4 +13,3 @@ from ._seeds import session_seed as session_seed
 from ._unknown import MAY_BE_UNKNOWN as MAY_BE_UNKNOWN
 from ._unknown import describe_unknown_values as describe_unknown_values
 from ._unknown import unknown_values as unknown_values
-from ._wired_drive import bus_conflicts as bus_conflicts

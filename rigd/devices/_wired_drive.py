@@ -4,7 +4,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
-from rigd.devices.canbus import MAX_LOAD, CanLink, bus_load, check_identifiers
+from rigd.devices._bus_conflicts import bus_conflicts
+from rigd.devices.canbus import CanLink
 from rigd.devices.cia402 import Cia402Drive
 from rigd.devices.contracts import DeviceError
 from rigd.devices.declaration import OpenedDrive
@@ -82,21 +83,3 @@ def _refuse_ambiguity(rig: RigParameters, simulator: SimulatorAddress) -> None:
             f"and {' and '.join(hardware_found)} of the real one is here too; stop the simulated "
             "rig, or unplug the real one."
         )
-
-
-def bus_conflicts(rig: RigParameters) -> list[str]:
-    """Return the reasons why the devices of a rig cannot use one CAN bus, as sentences.
-
-    The list is empty if they can. Nothing is sent on the bus.
-    """
-    if rig.can is None:
-        return []
-    conflict_reasons = check_identifiers(rig)
-    worst_load = bus_load(rig).worst
-    if worst_load > MAX_LOAD:
-        conflict_reasons.append(
-            f"The frames of a tick take up to {100 * worst_load:.0f} % of the CAN bus at "
-            f"{rig.can.bitrate_bit_s} bit/s, more than {100 * MAX_LOAD:.0f} %; choose a higher "
-            "can.bitrate_bit_s or a lower rig.rate_hz."
-        )
-    return conflict_reasons

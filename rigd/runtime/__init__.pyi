@@ -17,10 +17,10 @@ from ._locks import held_rig as held_rig
 from ._locks import holds_rig as holds_rig
 from ._plain_files import open_plain_file as open_plain_file
 from ._plain_files import read_plain_file as read_plain_file
-from ._stop_signals import STOP_SIGNAL as STOP_SIGNAL
-from ._stop_signals import StopRequest as StopRequest
-from ._stop_signals import ignore as ignore
+from ._session_signals import STOP_SIGNAL as STOP_SIGNAL
+from ._session_signals import StopRequest as StopRequest
+from ._session_signals import ignore as ignore
+from ._session_signals import signals_blocked as signals_blocked
 from ._stop_signals import ignore_handled_signals as ignore_handled_signals
 from ._stop_signals import raise_on_signals as raise_on_signals
 from ._stop_signals import signal_when_orphaned as signal_when_orphaned
-from ._stop_signals import signals_blocked as signals_blocked

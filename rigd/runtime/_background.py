@@ -66,7 +66,7 @@ def give_way(pid: int = 0) -> None:
     pid
         Process id, or 0 for this process.
     """
-    with suppress(OSError):
+    with suppress(OSError, AttributeError):  # AttributeError on Windows
         os.setpriority(os.PRIO_PROCESS, pid, _LOWEST_PRIORITY)
     with suppress(OSError, AttributeError):  # not everywhere
         os.sched_setscheduler(pid, os.SCHED_IDLE, os.sched_param(0))

@@ -573,7 +573,12 @@ _COPY_BLOCK_BYTES: Final = 1 << 20
 
 
 def fsync_directory(path: Path) -> None:
-    """Write the entries of a folder to the disk, so that a new or renamed file survives a crash."""
+    """Write the entries of a folder to the disk, so that a new or renamed file survives a crash.
+
+    Windows opens no folders, and writes their entries by itself.
+    """
+    if not hasattr(os, "O_DIRECTORY"):
+        return
     descriptor = os.open(path, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

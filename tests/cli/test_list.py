@@ -124,6 +124,12 @@ def test_metadata_that_cannot_be_stored_is_refused_before_anything_starts(option
     assert told in refused.stderr
 
 
+def test_completion_of_the_shell_can_be_installed():
+    words = {"_RIGD_COMPLETE": "complete_bash", "COMP_WORDS": "rigd ru", "COMP_CWORD": "1"}
+    completed = CliRunner().invoke(app, [], prog_name="rigd", env=words)
+    assert completed.stdout.split() == ["run"]
+
+
 def test_folders_stand_together_and_one_that_is_not_there_is_told(listed, record_briefly, tmp_path):
     path = record_briefly("first")
     other = tmp_path / "other"
@@ -132,8 +138,13 @@ def test_folders_stand_together_and_one_that_is_not_there_is_told(listed, record
     record_briefly("second", day=1)
     told = listed(".", "other").stdout.splitlines()
     assert [line.split()[2] for line in told[1:]] == ["second.mcap", "late.mcap"]
-    missing = listed()
+    missing = listed("sessions")
     assert missing.exit_code == 2
     assert "sessions: the folder cannot be listed" in missing.stderr
+    first = listed()
+    assert first.exit_code == 0
+    assert first.stdout.startswith("No sessions yet: ")
+    assert "rigd run chirp --fast" in first.stdout
+    assert json.loads(listed("--json").stdout) == {"sessions": []}
     (tmp_path / "sessions").mkdir()
     assert listed().stdout == "No sessions.\n"

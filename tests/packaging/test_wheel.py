@@ -1,13 +1,18 @@
 """The wheel, installed apart from the checkout: what it holds is enough to run and to analyse."""
 
 import os
+import re
 import subprocess
 import sys
 import venv
 import zipfile
+from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+
+from rigd.testing import chirp_signals, write_session
 
 pytestmark = pytest.mark.process
 
@@ -15,13 +20,18 @@ PROJECT = Path(__file__).resolve().parents[2]
 SHIPPED = sorted(path.name for path in (PROJECT / "hw_profiles").glob("*.toml"))
 
 
-def run(*command, folder, **variables):
-    """Run a command that goes well; return what it wrote to standard output."""
+def completed(*command, folder, **variables):
+    """Run a command; return its exit code and what it wrote."""
     environment = {k: v for k, v in os.environ.items() if not k.startswith("PYTHON")}
-    done = subprocess.run(
+    return subprocess.run(
         list(map(str, command)),
         cwd=folder, env=environment | variables, capture_output=True, text=True, check=False,
     )  # fmt: skip
+
+
+def run(*command, folder, **variables):
+    """Run a command that goes well; return what it wrote to standard output."""
+    done = completed(*command, folder=folder, **variables)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
@@ -55,6 +65,80 @@ def installed(wheel, tmp_path_factory):
         folder=folder,
     )
     return folder
+
+
+def required(distributions):
+    """Return the distributions that some require, without extras, and those that these require."""
+    found = {}
+    waiting = list(distributions)
+    while waiting:
+        for text in waiting.pop().requires or ():
+            requirement = Requirement(text)
+            if requirement.marker is None or requirement.marker.evaluate({"extra": ""}):
+                name = re.sub(r"[-_.]+", "-", requirement.name.lower())
+                if name not in found:
+                    found[name] = distribution(requirement.name)
+                    waiting.append(found[name])
+    return found
+
+
+@pytest.fixture(scope="module")
+def bare(wheel, tmp_path_factory):
+    """An environment with the wheel and what it requires, without any extra."""
+    folder = tmp_path_factory.mktemp("bare")
+    venv.create(folder, symlinks=True)
+    (packages,) = folder.glob("lib/python3*/site-packages")
+    run(
+        *(sys.executable, "-m", "pip", "--python", folder / "bin" / "python"),
+        *("install", "--quiet", "--no-deps", "--no-index", wheel),
+        folder=folder,
+    )
+    (metadata,) = packages.glob("rigd-*.dist-info")
+    for each in required([Distribution.at(metadata)]).values():
+        for name in {file.parts[0] for file in each.files} - {".."}:
+            if not (packages / name).exists():
+                (packages / name).symlink_to(each.locate_file(name))
+    return folder
+
+
+def test_the_analyser_needs_no_extra(bare, tmp_path):
+    signals = chirp_signals(sweep_s=30.0, ring_down_s=5.0, rate_hz=250.0, start_hz=0.5)
+    session = write_session(tmp_path / "session.mcap", signals)
+
+    def here(program, *options):
+        return run(bare / "bin" / program, *options, folder=tmp_path)
+
+    options = ("--method", "welch", "--types", "I", "--weights", "const", "--report", "report")
+    here("analyze", session, *options)
+    assert (tmp_path / "report" / "figures" / "welch_frf.svg").stat().st_size > 10_000
+    here("analyze", "export", "record", session, "record.csv")
+    (profile,) = bare.glob("lib/python3*/site-packages/rigd/profile/shipped/sim.toml")
+    channels = ("--time", "time_s:s", "--angle", "angle_rad:rad")
+    channels += ("--torque", "coupling_torque_nm:N.m")
+    here("analyze", "import", "record.csv", "imported.mcap", "--profile", profile, *channels)
+    assert "imported.mcap" in here("rigd", "list", tmp_path)
+    assert "antenna_can" in here("rigd", "profiles")
+
+
+@pytest.mark.parametrize(
+    ("command", "subject", "extra"),
+    [
+        (("rigd", "run", "chirp", "--fast", "--live"), "--live", "live"),
+        (("rigd", "serve", "--profile", "sim", "--web"), "The page", "rig"),
+        (("rigd", "check", "--profile", "sim"), "This command", "rig"),
+        (("rigd", "run", "chirp", "--profile", "antenna_can"), "The rig antenna_can", "rig"),
+        (("analyze", "session.mcap", "--rerun", "session.rrd"), "--rerun", "live"),
+    ],
+)
+def test_a_missing_extra_is_named(bare, tmp_path, command, subject, extra):
+    write_session(tmp_path / "session.mcap", chirp_signals(sweep_s=2.0, ring_down_s=0.5))
+    runtime = {"XDG_RUNTIME_DIR": str(tmp_path)}
+    program, *options = command
+    done = completed(bare / "bin" / program, *options, folder=tmp_path, **runtime)
+    assert done.returncode == 1, done.stdout + done.stderr
+    message = f"Error: {subject} needs optional packages: pip install 'rigd[{extra}]'."
+    assert done.stderr.splitlines()[-1] == message
+    assert not list(tmp_path.rglob("*.mcap*"))[1:]  # nothing has run
 
 
 def test_it_holds_all_modules_and_profiles_and_nothing_else(wheel):

@@ -359,6 +359,50 @@ def test_a_folder_stands_for_the_sessions_in_it(tmp_path, monkeypatch):
     assert asked == [of_folder[1:], of_folder, [Path("first.mcap"), *of_folder]]
 
 
+def test_the_newest_session_of_a_folder_can_be_asked_for(record_briefly, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr("analysis.cli.app.session_command", lambda files, *_: asked.append(files))
+    monkeypatch.chdir(tmp_path)
+    nothing = CliRunner().invoke(app, ["--latest"])
+    assert nothing.exit_code == 1
+    assert nothing.stderr.startswith("Error: --latest: sessions: the folder cannot be listed")
+    for name, day in (("zulu", 1), ("alpha", 3), ("mike", 2)):
+        record_briefly(name, day=day)
+    CliRunner().invoke(app, ["--latest", "."])
+    assert asked == [[Path("alpha.mcap")]]
+    two = CliRunner().invoke(app, ["--latest", ".", "sessions"])
+    assert two.exit_code == 2
+    assert "it takes one folder, and 2 were given" in two.stderr
+
+
+def test_without_a_file_the_command_says_what_it_takes():
+    refused = CliRunner().invoke(app, [])
+    assert refused.exit_code == 2
+    assert "Error: Missing argument 'FILE'. Name session files, or take --latest." in refused.stderr
+
+
+def test_a_campaign_is_announced_before_it_starts(tmp_path, monkeypatch):
+    started = []
+    monkeypatch.setattr(
+        "analysis.cli.campaign.campaign_command", lambda files, *_, **__: started.append(files) or 0
+    )
+    result = CliRunner().invoke(app, ["a.mcap", "b.mcap"])
+    assert result.exit_code == 0
+    assert len(started) == 1
+    assert result.stderr == (
+        "2 sessions are analysed together, as a campaign; --each reports each by itself.\n"
+    )
+
+
+def test_completion_of_the_shell_can_be_installed():
+    shown = CliRunner().invoke(app, ["--show-completion", "bash"], prog_name="analyze")
+    assert shown.exit_code == 0
+    assert "_ANALYZE_COMPLETE=complete_bash" in shown.stdout
+    words = {"_ANALYZE_COMPLETE": "complete_bash", "COMP_WORDS": "analyze --la", "COMP_CWORD": "1"}
+    completed = CliRunner().invoke(app, [], prog_name="analyze", env=words)
+    assert completed.stdout.split() == ["--latest"]
+
+
 @pytest.mark.fit
 @pytest.mark.further  # as test_folder.py
 def test_a_second_look_replaces_the_first_and_nothing_else(session, tmp_path, analyze_here):

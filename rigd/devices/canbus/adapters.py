@@ -268,18 +268,22 @@ def open_port(settings: CanBus, simulator: SimulatorAddress | None) -> CanPort:
 def _open_socketcan(settings: CanBus) -> socket.socket:
     """Open and bind a CAN socket of the kernel; raise with a remedy if that fails."""
     interface_name = settings.channel
+    simulation = "start the simulated rig: rigd simulate --profile PROFILE"
     remedy = (
         f"bring it up with: ip link set {interface_name} up type can bitrate "
-        f"{settings.bitrate_bit_s}; or start the simulated rig: rigd simulate --profile PROFILE"
+        f"{settings.bitrate_bit_s}; or {simulation}"
     )
     if not hasattr(socket, "AF_CAN"):
-        raise DeviceError(f"CAN bus {interface_name}: this system has no CAN sockets; {remedy}.")
+        raise DeviceError(
+            f"CAN bus {interface_name}: this system has no CAN sockets; run the rig on Linux, or "
+            f"{simulation}."
+        )
     try:
         can_socket = socket.socket(socket.AF_CAN, socket.SOCK_RAW, socket.CAN_RAW)
     except OSError as error:
         raise DeviceError(
-            f"CAN bus {interface_name}: this kernel has no CAN sockets ({error.strerror}); "
-            f"{remedy}."
+            f"CAN bus {interface_name}: this kernel has no CAN sockets ({error.strerror}); load "
+            f"them with: modprobe can_raw; or, if it was built without them, {simulation}."
         ) from None
     try:
         can_socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _RECEIVE_BUFFER_SIZE)

@@ -172,7 +172,36 @@ def test_on_the_kernel_s_bus_only_what_is_wanted_gets_in(kernel_bus):
         port.close()
 
 
-def test_a_bus_that_is_not_there_is_told_with_its_remedy():
+class KernelSocket:
+    """CAN socket of a kernel that has CAN, but not the interface."""
+
+    def __init__(self, *_):
+        pass
+
+    def setsockopt(self, *_):
+        pass
+
+    def bind(self, _):
+        raise OSError(errno.ENODEV, "No such device")
+
+    def close(self):
+        pass
+
+
+def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(monkeypatch):
+    def refuse(*_):
+        raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
+
+    monkeypatch.setattr("rigd.devices.canbus.port.socket.socket", refuse)
+    with pytest.raises(DeviceError, match="this kernel has no CAN sockets") as refused:
+        open_port(SETTINGS, None)
+    assert "ip link" not in str(refused.value)
+    assert "modprobe can_raw" in str(refused.value)
+    assert "rigd simulate" in str(refused.value)
+
+
+def test_a_bus_that_is_not_there_is_told_with_its_remedy(monkeypatch):
+    monkeypatch.setattr("rigd.devices.canbus.port.socket.socket", KernelSocket)
     with pytest.raises(DeviceError) as refused:
         open_port(SETTINGS, None)
     assert "rigd-none0" in str(refused.value)
@@ -209,7 +238,7 @@ def test_a_simulated_bus_that_is_gone_is_told(runtime_folder):
 
 
 def test_a_simulator_on_a_real_bus_leaves_the_profile_s(runtime_folder):
-    with pytest.raises(DeviceError, match="ip link set"):
+    with pytest.raises(DeviceError, match=r"CAN bus rigd-none0: .*start the simulated rig"):
         open_port(SETTINGS, SimulatorAddress(1, "", can_socket=""))
 
 

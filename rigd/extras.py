@@ -1,0 +1,50 @@
+"""Optional packages, by the extra of ``pip install 'rigd[EXTRA]'`` that installs them."""
+
+from importlib.util import find_spec
+from typing import Final
+
+from rigd.errors import FailureError
+
+_EXTRA_MODULES: Final = {
+    "rig": ("aiohttp", "can", "canopen", "serial"),
+    "live": ("rerun",),
+}
+"""Modules that each extra installs, of those that commands use without a message of their own."""
+
+
+class MissingExtraError(FailureError):
+    """Raised if an optional package is not installed; the message states how to install it."""
+
+
+def require_extra(extra: str, subject: str) -> None:
+    """Raise if the packages of an extra are not installed.
+
+    Parameters
+    ----------
+    extra
+        Name of the extra.
+    subject
+        Beginning of the message: what needs the packages.
+
+    Raises
+    ------
+    MissingExtraError
+        If a package is missing.
+    """
+    missing = [module for module in _EXTRA_MODULES[extra] if find_spec(module) is None]
+    if missing:
+        raise _missing_extra(subject, extra)
+
+
+def explain_missing_module(error: ModuleNotFoundError) -> MissingExtraError | None:
+    """Return the error to report for a missing module, or None if no extra installs the module."""
+    module = (error.name or "").partition(".")[0]
+    for extra, modules in _EXTRA_MODULES.items():
+        if module in modules:
+            return _missing_extra("This command", extra)
+    return None
+
+
+def _missing_extra(subject: str, extra: str) -> MissingExtraError:
+    """Return the error on the missing packages of an extra."""
+    return MissingExtraError(f"{subject} needs optional packages: pip install 'rigd[{extra}]'.")

@@ -1,0 +1,211 @@
+"""The analyser on systems without POSIX: its modules and its whole command line.
+
+On Windows and macOS the commands run as they are. On Linux `windows_like/sitecustomize.py` takes
+from `rigd` and `analysis` what Windows does not have.
+"""
+
+import ast
+import json
+import os
+import subprocess
+import sys
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from rigd.session import read_session
+from rigd.testing import PAPER_BEAM, chirp_signals, write_session
+
+pytestmark = [pytest.mark.process, pytest.mark.fit]
+
+PROJECT = Path(__file__).parents[2]
+WINDOWS_LIKE = Path(__file__).with_name("windows_like")
+POSIX_MODULES = ("fcntl", "grp", "posix", "pty", "pwd", "resource", "syslog", "termios", "tty")
+
+
+def names_of_platform(statements, platform):
+    """Return the names that the description of a module defines for a platform."""
+    names = set()
+    for statement in statements:
+        if isinstance(statement, ast.If):
+            system = SimpleNamespace(platform=platform, version_info=sys.version_info)
+            condition = compile(ast.Expression(statement.test), "condition", "eval")
+            branch = statement.body if eval(condition, {"sys": system}) else statement.orelse
+            names |= names_of_platform(branch, platform)
+        elif isinstance(statement, (ast.ImportFrom, ast.Import)):
+            names |= {alias.asname or alias.name for alias in statement.names}
+        elif isinstance(statement, (ast.FunctionDef, ast.ClassDef)):
+            names.add(statement.name)
+        elif isinstance(statement, ast.AnnAssign):
+            names.add(statement.target.id)
+        elif isinstance(statement, ast.Assign):
+            names |= {target.id for target in statement.targets}
+    return names
+
+
+def missing_on_windows():
+    """Return module → names that Windows does not have, by mypy's descriptions of the library."""
+    stubs = Path(find_spec("mypy").origin).parent / "typeshed" / "stdlib"
+    missing = dict.fromkeys(POSIX_MODULES)
+    for module, stub in {"os": "os/__init__", "signal": "signal", "socket": "socket"}.items():
+        statements = ast.parse((stubs / f"{stub}.pyi").read_text()).body
+        missing[module] = sorted(
+            names_of_platform(statements, "linux") - names_of_platform(statements, "win32")
+        )
+    return missing
+
+
+@pytest.fixture(scope="module")
+def variables():
+    if sys.platform != "linux":
+        return os.environ | {"PYTHONIOENCODING": "cp1252"}
+    return os.environ | {
+        "MISSING_ON_WINDOWS": json.dumps(missing_on_windows()),
+        "PYTHONPATH": str(WINDOWS_LIKE),
+        "PYTHONIOENCODING": "cp1252",  # what a pipe has there
+    }
+
+
+@pytest.fixture(scope="module")
+def sessions(tmp_path_factory):
+    """Three short chirps of a beam with other noise."""
+    folder = tmp_path_factory.mktemp("sessions")
+    for seed in range(3):
+        signals = chirp_signals(
+            sweep_s=30.0, ring_down_s=5.0, rate_hz=250.0, start_hz=0.5, noise_nm=1e-3,
+            quantum_rad=0.0, seed=seed,
+        )  # fmt: skip
+        write_session(folder / f"{seed}.mcap", replace(signals, metadata={}), beam=PAPER_BEAM)
+    return folder
+
+
+@pytest.fixture
+def python(variables, tmp_path):
+    """Run Python in an empty folder, and return what it prints."""
+
+    def run(*arguments):
+        done = subprocess.run(
+            [sys.executable, *map(str, arguments)],
+            cwd=tmp_path, env=variables, capture_output=True, encoding="cp1252", check=False,
+        )  # fmt: skip
+        assert done.returncode == 0, done.stdout + done.stderr
+        return done.stdout
+
+    return run
+
+
+@pytest.fixture
+def analyze(python):
+    return lambda *arguments: python("-m", "analysis", *arguments)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="nothing is simulated there")
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        ("import fcntl", "No module named 'fcntl'"),
+        ("import os; os.getuid()", "has no attribute 'getuid'"),
+        ("from signal import SIGHUP", "cannot import name 'SIGHUP'"),
+        ("import socket; socket.AF_UNIX", "has no attribute 'AF_UNIX'"),
+        ("import os; os.fork()", "has no attribute 'fork'"),
+        ("open('/proc/self/stat')", "No such file"),
+        ("open('12:30.mcap', 'w')", "filename"),
+        ("f = open('a', 'w'); import os; os.remove('a')", "used by another process"),
+    ],
+)
+def test_the_simulation_refuses_what_windows_does_not_have(variables, tmp_path, code, words):
+    done = subprocess.run(
+        [sys.executable, "-c", f"__package__ = 'analysis.simulated'\n{code}"],
+        cwd=tmp_path, env=variables, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert words in done.stderr.splitlines()[-1]
+
+
+ALL_MODULES = """
+import importlib, pkgutil, analysis
+names = [each.name for each in pkgutil.walk_packages(analysis.__path__, "analysis.")]
+for name in names:
+    importlib.import_module(name)
+    module = importlib.import_module(name)
+    for public in getattr(module, "__all__", ()):
+        getattr(module, public)
+print(len(names))
+"""
+
+
+def test_every_module_of_the_analyser_can_be_imported(python):
+    assert int(python("-c", ALL_MODULES)) > 100
+
+
+def test_a_session_is_analysed_and_reported(analyze, sessions, tmp_path):
+    (tmp_path / "report").mkdir()  # an empty folder is taken
+    analyze(
+        sessions / "0.mcap", "--method", "welch", "--types", "I", "--weights", "const",
+        "--report", "report", "--json", "fits.json", "--figures", "svg",
+    )  # fmt: skip
+    assert (tmp_path / "report" / "figures" / "welch_frf.svg").stat().st_size > 10_000
+    assert json.loads((tmp_path / "fits.json").read_text("utf-8"))["fits"]
+    assert not list(tmp_path.glob(".*"))  # nothing temporary remains
+
+
+def test_records_are_exported_and_imported(analyze, sessions, tmp_path):
+    analyze("export", "record", sessions / "0.mcap", "record.csv")
+    analyze(
+        "import", "record.csv", "imported.mcap", "--profile", PROJECT / "hw_profiles" / "sim.toml",
+        "--time", "time_s:s", "--angle", "angle_rad:rad", "--torque", "coupling_torque_nm:N.m",
+        "--sweep", "1,31",
+    )  # fmt: skip
+    imported, original = read_session(tmp_path / "imported.mcap"), read_session(sessions / "0.mcap")
+    for field in ("angle_rad", "coupling_torque_nm"):
+        assert np.array_equal(imported.samples[field], original.samples[field])
+    analyze("export", "frf", "imported.mcap", "frf.mat")
+    assert (tmp_path / "frf.mat").stat().st_size > 1000
+
+
+def test_of_rigd_the_file_tools_work(python, sessions, variables):
+    assert "2.mcap" in python("-m", "rigd", "list", sessions)
+    assert "rate" in python("-m", "rigd", "info", sessions / "0.mcap")
+    if sys.platform == "darwin":
+        return
+    done = subprocess.run(
+        [sys.executable, "-m", "rigd", "run", "chirp", "--fast"],
+        cwd=sessions, env=variables, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 1
+    assert done.stderr.startswith("Error: rigd run needs Linux. ")
+    assert len(done.stderr.splitlines()) == 1
+
+
+@pytest.mark.further
+def test_a_campaign_has_workers(analyze, sessions, tmp_path):
+    analyze(
+        *sorted(sessions.glob("*.mcap")), "--method", "welch", "--types", "I", "--weights", "const",
+        "--segment", "2000", "--overlap", "300", "--nfft", "8000",
+        "--jobs", "2", "--report", "campaign", "--json", "campaign.json", "--figures", "svg",
+    )  # fmt: skip
+    document = json.loads((tmp_path / "campaign.json").read_text("utf-8"))
+    assert len({fit["file"] for fit in document["fits"]} - {None}) == 3
+    assert (tmp_path / "campaign" / "report.html").exists()
+
+
+@pytest.mark.further
+def test_whole_record_fits_and_their_model(analyze, sessions, tmp_path):
+    analyze(
+        sessions / "0.mcap", "--method", "record",
+        "--report", "report", "--json", "fits.json", "--figures", "svg",
+    )  # fmt: skip
+    assert (tmp_path / "report" / "report.html").exists()
+    analyze("export", "model", "fits.json", "model.mat")
+    assert (tmp_path / "model.mat").stat().st_size > 1000
+
+
+@pytest.mark.further
+def test_touches_are_estimated(analyze, touch_file, tmp_path):
+    analyze("touch", touch_file.path, "--report", "touches", "--json", "touches.json")
+    assert len(json.loads((tmp_path / "touches.json").read_text("utf-8"))["touches"]) == 1
+    assert (tmp_path / "touches" / "report.html").exists()
