@@ -309,7 +309,7 @@ def _select_with_known_impacts(
         linear_candidates, modes_with_drag.modal_fit, band_hz
     ):
         is_linear_and_constant, modal_fit_with_effect = True, modes_with_drag.modal_fit
-        if small_linear_effect is not None and not small_linear_effect.significant_beside(
+        if small_linear_effect is not None and not small_linear_effect.significant_with(
             modes_with_drag.modal_fit
         ):
             small_linear_effect = None

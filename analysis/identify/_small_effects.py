@@ -78,7 +78,7 @@ class SmallEffect:
         """Return whether the nonlinear effect is so large that it needs a model of its own."""
         return self.saved > LARGE_DEVIANCE_REDUCTION and not self.linear
 
-    def significant_beside(self, modal_fit: ModalFit) -> bool:
+    def significant_with(self, modal_fit: ModalFit) -> bool:
         """Return whether the effect would improve a modal model that contains other effects."""
         [cost_reduction] = modal_fit.cost_reduction_by_spectrum(self.column[None])
         return bool(cost_reduction >= MIN_DEVIANCE_REDUCTION)

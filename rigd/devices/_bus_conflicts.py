@@ -1,4 +1,4 @@
-"""Whether the devices of a rig can share one CAN bus."""
+"""Whether the devices of a rig can be on one CAN bus."""
 
 from rigd.devices.parameters import RigParameters
 from rigd.extras import require_extra
