@@ -2,17 +2,17 @@
 
 The supervisor sends jobs and orders, the other processes answer:
 
-============  =============================================  ================================
-process       receives                                       sends
-============  =============================================  ================================
-control       ControlJob, then SessionJob, Tare, Zero, Probe Connected, then Ready, Finished;
-                                                             Measured or Refused; last Ended
-recorder      RecorderJob, FileHeader, Close                 Opened, Armed, Closed; or Failed
-live          LiveJob, LiveSession, LiveEnd of `rigd.live`   LiveAddress, LiveShown; or Failed
-touch         TouchJob                                       TouchReady, then TouchReport
-fit           FitJob, FileHeader, RecordEnded                FitReady, then FitReport,
-                                                             PlannedSegment, SearchEnded; or Failed
-============  =============================================  ================================
+============  ==============================================  ================================
+process       receives                                        sends
+============  ==============================================  ================================
+control       ControlJob, then SessionJob, Tare, Zero, Probe  Connected, then Ready, Finished;
+                                                              Measured or Refused; last Ended
+recorder      RecorderJob, FileHeader, Close                  Opened, Armed, Closed; or Failed
+live          LiveJob, LiveSession, LiveEnd of `rigd.live`    LiveAddress, LiveShown; or Failed
+touch         TouchJob                                        TouchReady, then TouchReport
+fit           FitJob, FileHeader, RecordEnded                 FitReady, then FitReport,
+                                                              PlannedSegment, SearchEnded; or Failed
+============  ==============================================  ================================
 
 A message is its length followed by one of these objects, pickled. Each is short enough for a pipe's
 buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is not used,
