@@ -1,5 +1,6 @@
 """Settings of the documentation site; `make docs` builds it."""
 
+import re
 import sys
 from pathlib import Path
 
@@ -25,6 +26,7 @@ exclude_patterns = ["generated/*.txt"]
 myst_heading_anchors = 4
 myst_enable_extensions = ["colon_fence", "dollarmath"]
 
+default_role = "code"
 autodoc_member_order = "bysource"
 autodoc_typehints_format = "short"
 numpydoc_show_class_members = False
@@ -55,12 +57,31 @@ def visit_display(translator: HTML5Translator, node: nodes.math_block) -> None:
 
 
 def lead_to_pages(_app: Sphinx, _name: str, source: list[str]) -> None:
-    """Let links to documents beside this folder lead to the pages that contain them."""
-    source[0] = source[0].replace("](../CONTRIBUTING.md", "](contributing.md")
+    """Let links lead to pages of the site, under their titles instead of file names."""
+    text = source[0].replace("](../CONTRIBUTING.md", "](contributing.md")
+    source[0] = re.sub(r"\[[\w/]+\.md\]\((?!#)", "[](", text)
+
+
+def shorten_arrays(
+    _app: Sphinx,
+    _what: str,
+    _name: str,
+    _object: object,
+    _options: object,
+    signature: str | None,
+    returns: str | None,
+) -> tuple[str | None, str | None]:
+    """Write types of arrays as the code does."""
+    short, full = r"NDArray[\1]", r"~numpy\.ndarray\[tuple\[.*?\], ~numpy\.dtype\[(.*?)\]\]"
+    return (
+        signature and re.sub(full, short, signature),
+        returns and re.sub(full, short, returns),
+    )
 
 
 def setup(app: Sphinx) -> None:
     """Register what Sphinx does not have, and make the pages that follow from the code."""
     app.add_html_math_renderer("mathml", (visit_formula, None), (visit_display, None))
+    app.connect("autodoc-process-signature", shorten_arrays)
     app.connect("source-read", lead_to_pages)
     reference_pages.write_pages()
