@@ -6,7 +6,7 @@ Every record is a session of the simulated rig in which one thing is wrong. Some
 simulated rig itself; others are made in the samples of a sound session, as a wrong setting or a
 damaged signal would make them. For each, the script draws the response and the residual over
 frequency and time, and quotes on the page (``docs/fault_gallery.md``) what `analyze` says. With
-FOLDER, pictures and page go there. The whole takes two minutes on two processors.
+FOLDER, pictures and page go there. The whole takes three minutes of a processor.
 """
 
 import argparse
@@ -34,8 +34,6 @@ HERE = Path(__file__).parent
 PAGE = HERE.parent / "fault_gallery.md"
 AMPLITUDE_RAD = 0.0055
 """Amplitude at which the antenna's tip stays within the small slopes of the linear model."""
-TORQUE_NOISE_NM = 1e-3
-"""Noise of a good sensor, so that the pictures show the fault and not the noise."""
 REST_S, SWEEP_S, RING_DOWN_S = 1.0, 60.0, 9.0
 SEED = 4
 SOUND, BLUE, ORANGE, RED = "#A8A8A8", "#0072B2", "#E69F00", "#D55E00"
