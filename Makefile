@@ -7,7 +7,7 @@ unexport PYTHONDONTWRITEBYTECODE
 # Each worker takes what others have not begun: some tests take a second, some a millisecond.
 PYTEST := $(BIN)/python -m pytest -n auto --dist worksteal
 
-.PHONY: demo test test-further test-all test-fast check bench fuzz chaos endurance clean
+.PHONY: demo docs test test-further test-all test-fast check bench fuzz chaos endurance clean
 
 # A full paper session on the simulated rig, then its analysis.
 demo: $(VENV)/ready
@@ -31,6 +31,12 @@ test-fast: $(VENV)/ready
 # All tests, also what is shown once more at full length.
 test-all: $(VENV)/ready
 	$(PYTEST)
+
+# The documentation as a site, in build/site, and whether it is whole and complete without the internet.
+docs: $(VENV)/docs-ready
+	$(BIN)/sphinx-build --fail-on-warning --keep-going --quiet -d build/doctrees docs build/site
+	RIGD_SITE=build/site $(BIN)/python -m pytest -n 0 -q tests/docs/test_site.py
+	@echo "The documentation: build/site/index.html"
 
 check: $(VENV)/ready
 	$(BIN)/ruff check .
@@ -76,5 +82,9 @@ $(VENV)/ready: pyproject.toml plugins/rigd-netft/pyproject.toml
 	$(BIN)/python -m pip install --quiet --editable '.[all]' --editable plugins/rigd-netft --group dev
 	touch $@
 
+$(VENV)/docs-ready: $(VENV)/ready
+	$(BIN)/python -m pip install --quiet --group docs
+	touch $@
+
 clean:
-	rm -rf $(VENV) demo
+	rm -rf $(VENV) build demo

@@ -624,7 +624,7 @@ class TolerantEstimate:
     def covariance_json(self) -> dict[str, Any]:
         """Return names and covariance matrix of the beam parameters as a dict for JSON.
 
-        A name with the prefix "ln_" means the logarithm of the parameter.
+        A name with the prefix ``ln_`` means the logarithm of the parameter.
         """
         parameter_names = [
             f"ln_{parameter_name}" if parameter_name in LOGARITHMIC_PARAMETERS else parameter_name

@@ -215,7 +215,7 @@ class ResponseBand:
     response : ndarray of complex, shape (n,)
         Torque per angle in N·m/rad, without a delay between the channels.
     log_magnitude_std : ndarray, shape (n,)
-        Standard deviation of ln |response|, which is the relative one of the magnitude.
+        Standard deviation of ``ln |response|``, which is the relative one of the magnitude.
     phase_std_rad : ndarray, shape (n,)
         Standard deviation of the phase.
     """
@@ -243,8 +243,8 @@ def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
     Notes
     -----
     With g the derivatives of ln H by the determined parameters and C their covariance, the
-    variance of ln |H| is ``Re g C Re g'`` and that of the phase ``Im g C Im g'``. Parameters that
-    are fixed, or that the data do not determine, count as known.
+    variance of ``ln |H|`` is ``Re g C Re g'`` and that of the phase ``Im g C Im g'``. Parameters
+    that are fixed, or that the data do not determine, count as known.
     """
     delay_free_plant: Plant = replace(fit.plant, delay_s=0.0)
     # The delay changes the measured phase, but not that of beam and clamp.

@@ -1,4 +1,4 @@
-"""Rerun files (*.rrd), and the environment variables of Rerun's SDK.
+"""Rerun files (``*.rrd``), and the environment variables of Rerun's SDK.
 
 This module is quick to import, because the command line checks a file before it draws anything.
 """

@@ -129,7 +129,7 @@ FILES = {
         for hz, ratio in ((2.57, 0.0091), (16.01, 0.00415), (44.81, 0.00995))
     ]}),
 }  # fmt: skip
-"""What stands in the files that an excitation reads: of README, and of a first analysis."""
+"""Files that an excitation reads: of docs/run_sessions.md, and of a first analysis."""
 
 
 def test_every_kind_of_identification_is_shown():

@@ -1,19 +1,30 @@
-"""The how-tos of the README run as written."""
+"""README, how-tos and tutorials run as written."""
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from eds_files import eds_path
+
+from analysis import load
 
 PROJECT = Path(__file__).parents[2]
-README = (PROJECT / "README.md").read_text(encoding="utf-8")
+TUTORIALS = PROJECT / "docs" / "tutorials"
+HOW_TOS = [
+    PROJECT / "docs" / f"{name}.md"
+    for name in ("run_sessions", "check_a_rig", "daemon", "session_files", "analyse", "profiles")
+]
+"""Pages whose commands make one story, in this order."""
 
 
-def blocks(language):
-    return re.findall(rf"^```{language}\n(.*?)^```$", README, re.MULTILINE | re.DOTALL)
+def blocks(language, paths=HOW_TOS):
+    """Blocks of code in a language, in the order of the pages."""
+    text = "\n".join(path.read_text("utf-8") for path in paths)
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 def assert_went_well(process):
@@ -35,6 +46,8 @@ def of_one_session(shell):
 
 SHORTENED = """#!/bin/sh
 case "${0##*/} $*" in
+    "analyze export "*|"analyze import "*) ;;
+    "rigd run chirp --profile sim --fast "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run chirp --fast --output sessions "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
     "rigd run modes "*) set -- "$@" --duration 20 --ring-down 3 ;;
@@ -126,14 +139,45 @@ def test_every_other_how_to_runs_as_written(start, write_profile, tmp_path):
     assert len(list((tmp_path / "tryouts").glob("*.mcap"))) == 3
 
 
-def test_its_links_lead_somewhere():
-    for target in re.findall(r"\]\(([^)]+)\)", README):
-        if target.startswith("http"):
-            continue
-        name, _, anchor = target.partition("#")
-        assert (PROJECT / name).exists(), target
-        if anchor:
-            text = (PROJECT / name).read_text(encoding="utf-8") if name else README
-            titles = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
-            anchors = [re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles]
-            assert anchor in anchors, target
+@pytest.mark.process
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    ("page", "made"),
+    [
+        ("README.md", ["sessions/*-chirp.report/report.html"]),
+        ("docs/tutorials/first_session.md", ["first/report.html", "second/report.html"]),
+        ("docs/tutorials/own_beam.md", ["mine/report.html", "frf.mat", "model.mat"]),
+        ("docs/tutorials/own_rig.md", ["first/*-chirp.mcap"]),
+        ("docs/tutorials/campaign.md", ["campaign/*-chirp.mcap", "together/report.html"]),
+    ],
+)
+def test_what_a_beginner_does_runs_as_written(page, made, start, tmp_path):
+    shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
+    shutil.copy(eds_path("epos4_0170"), tmp_path / "drive.eds")
+    for number, content in enumerate(blocks("toml", [PROJECT / page])):
+        assert number == 0, "a page has one file to write"
+        (tmp_path / "beam.toml").write_text(content)
+    with start("bash", "-c", script_of(blocks("sh", [PROJECT / page]))) as process:
+        assert_went_well(process)
+    for pattern in made:
+        assert list(tmp_path.glob(pattern)), pattern
+
+
+def test_each_tutorial_is_run():
+    pages = {path.stem for path in TUTORIALS.glob("*.md")} - {"index"}
+    assert pages == set(re.findall(r"tutorials/(\w+)\.md", Path(__file__).read_text("utf-8")))
+
+
+def test_the_record_of_the_tutorials_is_small_and_whole():
+    path = TUTORIALS / "antenna.mcap"
+    assert path.stat().st_size < 3_000_000
+    record = load(path)
+    assert len(record.time_s) == 136_000
+    assert record.outcome == "complete"
+    assert not record.warnings
+
+
+def test_the_readme_is_short():
+    text = (PROJECT / "README.md").read_text("utf-8")
+    assert 600 <= len(text.split()) <= 800
+    assert text.index("wired STO") < text.index("rigd run chirp")
