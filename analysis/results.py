@@ -11,8 +11,6 @@ import math
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING, Any, Final, Literal
 
-from rigd.beam import Plant
-
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
@@ -23,6 +21,7 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
+    from rigd.beam import Plant
     from rigd.session import Validity
 
 _ORDER_NAMES: Final = frozenset({"alpha", "lambda"})
@@ -250,6 +249,8 @@ class RecordResult:
         else:
             # The Welch fits differ, and the largest slope of the tip among them is used.
             fitted_models = () if self.welch is None else self.welch.models
+            from rigd.beam import Plant
+
             fitted_dampings = [model.fit.damping for model in fitted_models]
             validity = _record_validity(
                 self.record, *(Plant(self.record.beam, damping) for damping in fitted_dampings)

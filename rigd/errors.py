@@ -19,6 +19,7 @@
      |    +-- MetadataError         --meta temperature_c=warm: the name's unit asks for a number
      |    +-- LibraryError          rigd list of a folder that does not exist
      |    +-- UnknownGroupError     --group names no group of this computer
+     |    +-- PluginError           an installed package cannot be used
      |    +-- WrongUseError         rigd inject with a fault that does not exist
      +-- FailureError          the same request may succeed later: exit code 1
      |    +-- DeviceError           the drive does not answer, or reports a fault
@@ -34,7 +35,7 @@
      |    +-- DaemonGoneError       the daemon was killed during a request
      |    +-- SessionError          a session file is damaged, or the disk is full
      |    +-- MissingExtraError     --live without the packages of rigd[live]
-    |    +-- RrdFileError          a recording for Rerun exists already
+     |    +-- RrdFileError          a recording for Rerun exists already
      |    +-- RerunError            Rerun's program cannot be run
      |    +-- EdsError, UnusableDriveError    the EDS file of a drive is invalid or insufficient
      |    +-- MotorEstimateError    the sessions do not determine the motor's data

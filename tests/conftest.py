@@ -183,9 +183,10 @@ def start_rigd(tmp_path):
     """Start `rigd` in an empty folder; it is killed if a test leaves it running."""
     started = []
 
-    def start(*arguments, folder=tmp_path):
+    def start(*arguments, folder=tmp_path, cold=False):
+        """A `cold` start is of a new interpreter, whose command line others may read."""
         started.append(
-            warm_start.start(
+            (subprocess.Popen if cold else warm_start.start)(
                 [RIGD, *map(str, arguments)],
                 cwd=folder,
                 stdout=subprocess.PIPE,

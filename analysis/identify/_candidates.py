@@ -145,8 +145,7 @@ class CandidateSet:
         """Refit the candidates for the beginning of a record to the record as it is now, longer.
 
         Each descent starts from the last estimate of the candidate. Return None if the residual of
-        the first candidate exceeds the noise, or if it includes nonlinear effects: then a full
-        search is needed.
+        the first candidate exceeds the noise: then a full search is needed.
 
         Parameters
         ----------
@@ -165,8 +164,6 @@ class CandidateSet:
             The record cannot be used.
         """
         first_candidate, *other_candidates = earlier
-        if first_candidate.effect_count:
-            return None  # nonlinear effects are searched for again, in the whole record
         unknowns = Unknowns.of(first_candidate.structure, measurement.nominal, free_settings(fixed))
         analysis = refit_record(measurement, unknowns, first_candidate.fit.plant, band_hz=band_hz)
         if analysis is None:

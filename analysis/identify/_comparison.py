@@ -437,6 +437,24 @@ class Comparison:
             with_new_hum._hum_torque_at(unknown_times_s) - self._hum_torque_at(unknown_times_s),
         )
 
+    def drag_response(
+        self, plant: Plant, poles_rad_s: Mapping[int, complex] | None = None
+    ) -> DragResponse:
+        """Return the response of a beam in air to the motion of the record.
+
+        Parameters
+        ----------
+        plant : Plant
+            Beam on which the drag acts.
+        poles_rad_s : mapping of int to complex, optional
+            Measured upper poles of modes, as for `DragResponse`. The motion then is the part of the
+            angle that is coherent with the reference.
+        """
+        # Drag acts on the whole motion. But the sensor's noise moves the motor as well, and drag of
+        # that motion is correlated with the noise. The damping of measured modes includes it.
+        angle_rad = self.angle_rad if poles_rad_s else self.angle_rad + self.incoherent_rad
+        return DragResponse(angle_rad, self.decimation.rate_hz, plant, poles_rad_s)
+
     def remove_drag_torque(
         self, plant: Plant, law: DragLaw, poles_rad_s: Mapping[int, complex] | None = None
     ) -> Comparison:
@@ -456,9 +474,7 @@ class Comparison:
         DragError
             The drag is too large for the time steps.
         """
-        # Drag acts on the whole motion, whether or not it followed a reference.
-        whole_angle_rad = self.angle_rad + self.incoherent_rad
-        drag_response = DragResponse(whole_angle_rad, self.decimation.rate_hz, plant, poles_rad_s)
+        drag_response = self.drag_response(plant, poles_rad_s)
         drag_torque = drag_response.torque(law, range(1, self.visible_modes + 1))
 
         def band(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:

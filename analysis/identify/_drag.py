@@ -29,7 +29,6 @@ from analysis.identify.drag_torque import (
     HALF_AIR_DENSITY_KG_PER_M3,
     DragError,
     DragLaw,
-    DragResponse,
 )
 from analysis.models import STRUCTURES
 from analysis.statistics import NORMAL_95
@@ -215,8 +214,7 @@ def small_drag_spectrum(
 
     `poles_rad_s` are measured upper poles by mode number, which replace those of the plant.
     """
-    whole_angle_rad = comparison.angle_rad + comparison.incoherent_rad
-    drag_response = DragResponse(whole_angle_rad, comparison.decimation.rate_hz, plant, poles_rad_s)
+    drag_response = comparison.drag_response(plant, poles_rad_s)
     return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
 
 

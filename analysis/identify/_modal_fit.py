@@ -317,9 +317,11 @@ class _ModalSearch:
             problem = search.problem()
             modal_model = problem.model(search.x)
             residual_spectrum = problem.residual(search.x, modal_model)
-            comparison = search.comparison.renewed(modal_model, search.noise).fill_unknown_torque(
-                modal_model
-            )
+            comparison = search.comparison
+            # A torque that the modal model lacks would change which part of the angle follows it.
+            if not (len(search.effect_spectra) or comparison.drag):
+                comparison = comparison.renewed(modal_model, search.noise)
+            comparison = comparison.fill_unknown_torque(modal_model)
             noise_power = smooth_power(residual_spectrum, finely=True)
             noise_power = noise_power_with_peaks(
                 residual_spectrum, noise_power, ~search.is_near_mode()

@@ -169,9 +169,9 @@ def fit_modes_with_drag(
         if suffices or is_negative or is_converged or not remaining:
             break
         try:
-            comparison = candidate_set.comparison.recompute_incoherent_torque(
-                fit_with_drag.model
-            ).remove_drag_torque(candidate_set.likeliest.plant, law, fit_with_drag.poles_rad_s)
+            comparison = candidate_set.comparison.remove_drag_torque(
+                candidate_set.likeliest.plant, law, fit_with_drag.poles_rad_s
+            )
         except DragError:
             return None
         assert comparison.drag is not None

@@ -139,12 +139,15 @@ class Selection:
         Fits of all structures, the one with the lowest BIC first.
     analysis : RecordAnalysis
         The same fits with their noise spectrum and frequencies.
+    linear_candidates : tuple of Candidate
+        Fits without drag and other effects, from which the selection of a longer record may start.
     """
 
     verdict: Verdict
     headline: Headline
     candidates: tuple[Candidate, ...]
     analysis: RecordAnalysis
+    linear_candidates: tuple[Candidate, ...]
 
     @property
     def fit(self) -> RecordFit:
@@ -274,7 +277,7 @@ def _select_with_known_impacts(
     earlier: Selection | None,
 ) -> _Assessment[Selection]:
     """Select the structure of a record. The impacts that the measurement states are fitted, too."""
-    earlier_candidates = earlier.candidates if earlier else ()
+    earlier_candidates = earlier.linear_candidates if earlier else ()
     refitted_candidates = (
         CandidateSet.refit_from_earlier(earlier_candidates, measurement, fixed, band_hz)
         if earlier_candidates
@@ -468,6 +471,7 @@ def _select_with_known_impacts(
     best_candidate = candidate_set.best
     selection = Selection(
         candidates=candidate_set.candidates,
+        linear_candidates=linear_candidates.candidates,
         headline=reported_headline,
         analysis=RecordAnalysis.of(
             (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison

@@ -72,7 +72,7 @@ class Plant:
     >>> plant = Plant(beam, Damping(zeta=7e-5), tip_mass_kg=1e-4)
     >>> poles = plant.poles(clamped_free_eigenvalues(2))[:, 0]
     >>> print(np.round(poles.imag / (2 * np.pi), 2))
-    [ 2.45 15.47]
+    [ 2.45 15.39]
     """
 
     beam: Beam

@@ -15,7 +15,7 @@ plugins_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 
 @plugins_app.callback()
 def plugins(context: typer.Context, as_json: AsJson = False) -> None:
-    """List what installed packages add to rigd, or make a package of your own.
+    """List what installed packages add, or make a package.
 
     A package adds a device by an entry point of the group rigd.devices. Each is imported and
     checked; one that cannot be used is named with the reason, and the command exits with 1.

@@ -28,7 +28,7 @@ _ENTRY_OVERHEAD_CHARACTERS: Final = 120
 """Number of characters that the text or JSON form adds to an entry, such as quotes and spaces."""
 _MAX_KEY_CHARACTERS: Final = 200
 """Maximum number of characters of a key that are shown."""
-_MAX_TEXT_CHARACTERS: Final = 10_000
+_MAX_TEXT_CHARACTERS: Final = 50_000
 """Maximum number of characters of a value that are shown."""
 _MAX_KEY_COLUMN_WIDTH: Final = 40
 """Maximum width in characters of the first column of the text form."""

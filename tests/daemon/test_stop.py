@@ -48,7 +48,7 @@ def test_a_session_in_the_foreground_is_stopped_from_another_folder(
         patch.setenv("XDG_RUNTIME_DIR", str(elsewhere))
         profile = write_profile("sim", patient=True)
         hold = ("hold", "--duration", "100", "--rest", "0.2", "--no-look")
-        run = start_rigd("run", *hold, "--profile", profile)
+        run = start_rigd("run", *hold, "--profile", profile, cold=True)
     assert eventually(lambda: run.poll() is not None or control_of(run.pid) == SESSION_NAME)
     assert run.poll() is None, run.communicate()
     code, out, err = stop_here("--profile", "sim")
@@ -93,7 +93,7 @@ def test_an_impostor_on_the_socket_is_not_believed(
     stop_here, start_rigd, runtime_folder, write_profile
 ):
     profile = write_profile("sim", patient=True)
-    daemon = start_rigd("serve", "--profile", profile, "--no-look")
+    daemon = start_rigd("serve", "--profile", profile, "--no-look", cold=True)
     path = socket_path("sim")
     assert eventually(lambda: answers(path) and control_of(daemon.pid) == IDLE_NAME)
     parameters = {"duration_s": 100.0, "rest_s": 0.2}

@@ -16,8 +16,9 @@ def without_delay(steps, candidates_of):
     return candidates_of(steps("IV", 0.1).measured(noise_nm=0.01, seed=8))
 
 
-def test_a_step_without_a_delay_names_nothing(without_delay):
-    assert select(without_delay.comparison.measurement).verdict.findings == ()
+def test_a_step_without_a_delay_names_at_most_the_drag_that_it_hardly_shows(without_delay):
+    findings = select(without_delay.comparison.measurement).verdict.findings
+    assert {finding.kind for finding in findings} <= {"air drag"}
 
 
 def test_a_delay_that_is_there_is_named_in_a_step(steps):

@@ -187,6 +187,8 @@ def sound_arguments(ground, words):
         "rigd simulate": ["--profile", "antenna_can", "--quiet"],
         "rigd inject": ["sensor_dead", "--profile", "antenna_can"],
         "rigd identify motor": [*simulated, "--fast", "--output", str(ground.folder / "out")],
+        "rigd plugins default": [], "rigd plugins show": ["netft"],
+        "rigd plugins new": ["probe", "--folder", "@/package"],
         "rigd profiles list": [], "rigd profiles show": ["sim"],
         "rigd profiles copy": ["sim", "mine"],
         "rigd profiles new": ["--eds", str(ground.eds), "--output", "@/new.toml"],

@@ -56,6 +56,7 @@ def record_result(make_signals, write_session, tmp_path_factory):
         headline_of_fit("VI", analysis.fits[TYPES.index("VI")], (1, 2, 3)),
         tuple(sorted(candidates, key=lambda each: each.bic)),
         analysis,
+        tuple(candidates),
     )  # fmt: skip
     return RecordResult(
         record,

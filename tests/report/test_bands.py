@@ -5,9 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import LOGARITHMIC_PARAMETERS
 from analysis.report.bands import loss_factors, response_band
-from rigd.beam import Beam, Damping, transfer
+from rigd.beam import LOGARITHMIC_PARAMETERS, Beam, Damping, transfer
 
 pytestmark = pytest.mark.fit
 

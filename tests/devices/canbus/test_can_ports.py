@@ -192,7 +192,7 @@ def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(monkeypatch):
     def refuse(*_):
         raise OSError(errno.EAFNOSUPPORT, "Address family not supported by protocol")
 
-    monkeypatch.setattr("rigd.devices.canbus.port.socket.socket", refuse)
+    monkeypatch.setattr("rigd.devices.canbus.adapters.socket.socket", refuse)
     with pytest.raises(DeviceError, match="this kernel has no CAN sockets") as refused:
         open_port(SETTINGS, None)
     assert "ip link" not in str(refused.value)
@@ -201,7 +201,7 @@ def test_a_kernel_without_can_is_not_told_to_bring_an_interface_up(monkeypatch):
 
 
 def test_a_bus_that_is_not_there_is_told_with_its_remedy(monkeypatch):
-    monkeypatch.setattr("rigd.devices.canbus.port.socket.socket", KernelSocket)
+    monkeypatch.setattr("rigd.devices.canbus.adapters.socket.socket", KernelSocket)
     with pytest.raises(DeviceError) as refused:
         open_port(SETTINGS, None)
     assert "rigd-none0" in str(refused.value)
