@@ -312,8 +312,9 @@ def _select_with_known_impacts(
         linear_candidates, modes_with_drag.modal_fit, band_hz
     ):
         is_linear_and_constant, modal_fit_with_effect = True, modes_with_drag.modal_fit
-        if small_linear_effect is not None and not small_linear_effect.significant_with(
-            modes_with_drag.modal_fit
+        if small_linear_effect is not None and (
+            small_linear_effect.kind == "air drag"
+            or not small_linear_effect.significant_with(modes_with_drag.modal_fit)
         ):
             small_linear_effect = None
     else:

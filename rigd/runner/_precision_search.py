@@ -45,7 +45,7 @@ _MAX_REPEATED_SCANS: Final = 2
 """Maximum number of times that the scan is repeated after failed fits."""
 _TIGHTENING_FACTOR: Final = 0.7
 """Factor on the requested deviations after a flagged estimate, for twice the information."""
-_CORRECTION_FACTOR_RANGE: Final = (0.5, 4.0)
+_CORRECTION_FACTOR_RANGE: Final = (0.5, 16.0)
 """Range of the ratio of reported to expected standard deviation that corrects the design."""
 _MODAL_QUANTITY_KEYS: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
 """Requested modal quantity → its key in the estimates of a mode."""
