@@ -173,7 +173,7 @@ def fit_modes_with_drag(
                 candidate_set.likeliest.plant, law, fit_with_drag.poles_rad_s
             )
         except DragError:
-            return None
+            break  # the last fit has the uncertainty of the drag, if not its exact torque
         assert comparison.drag is not None
         spectra = comparison.drag.by_law[:1]
         current = replace(current, comparison=comparison, drag_spectra=spectra)
