@@ -3,7 +3,18 @@
 The supervisor sends jobs and orders, the other processes answer (`rigd.engine.workers` names the
 messages that each sends):
 
-============  ======================================
+============  =============================================
+process       receives
+============  =============================================
+control       ControlJob, then SessionJob, Tare, Zero, Probe
+recorder      RecorderJob, FileHeader, Close
+live          LiveJob, LiveSession, LiveEnd of `rigd.live`
+touch         TouchJob
+fit           FitJob, FileHeader, RecordEnded
+page          the data that it shows, as a JSON document
+prediction    a job of `rigd.daemon.background`; so does plan
+============  =============================================
+
 A message is its length followed by one of these objects, pickled. In a session each is short enough
 for a pipe's buffer, so that no child ever waits for its supervisor. `multiprocessing.connection` is
 not used, because it would wait for the remainder of a message of which a hung child has written
