@@ -63,6 +63,9 @@ class OnlineEstimate:
         Reason why there is no fit; empty with a fit.
     validity : Validity
         Validity of the linear model for the record.
+    fit_in_air : RecordFit or None
+        If air drag was fitted, a fit without it, whose damping is that at the amplitude of the
+        record: from this fit the next excitation is planned.
     """
 
     tick: int
@@ -76,6 +79,7 @@ class OnlineEstimate:
     warnings: tuple[str, ...] = ()
     problem: str = ""
     validity: Validity = field(default_factory=Validity)
+    fit_in_air: RecordFit | None = None
 
     @property
     def doubt(self) -> str | None:
@@ -110,6 +114,8 @@ class OnlineEstimate:
         headline, analysis = self.headline, self.analysis
         if headline is None or analysis is None:
             return None
+        if self.fit_in_air is not None:
+            return self.fit_in_air
         fit = headline.with_both
         flagged_orders = {
             order_name for order_name in COEFFICIENT_OF if order_name in headline.flags
@@ -298,7 +304,13 @@ class OnlineEstimator:
         OnlineEstimate
             Estimate, or the reason why no fit is possible.
         """
-        from analysis.identify import Measurement, MeasurementError, fit_freest_alone, select
+        from analysis.identify import (
+            ORDER_ONE_STRUCTURE,
+            Measurement,
+            MeasurementError,
+            fit_freest_alone,
+            select,
+        )
         from analysis.record import RecordError
         from analysis.suited import record_band_hz
         from analysis.validity import record_validity
@@ -311,6 +323,7 @@ class OnlineEstimator:
             duration_s = record.time_s.size / record.rate_hz
             measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
             order_verdicts: tuple[OrderVerdict, ...] = ()
+            fit_in_air = None
             if whole:
                 last_selection = self._last_selection if from_last else None
                 selection = select(measurement, band_hz=band_hz, earlier=last_selection)
@@ -318,6 +331,12 @@ class OnlineEstimator:
                 headline, analysis = selection.headline, selection.analysis
                 findings = selection.verdict.findings
                 order_verdicts = (selection.verdict.alpha, selection.verdict.lambda_)
+                if any(finding.kind == "air drag" for finding in findings):
+                    fit_in_air = next(
+                        candidate.fit
+                        for candidate in selection.linear_candidates
+                        if candidate.structure is ORDER_ONE_STRUCTURE
+                    )
             else:
                 headline, findings, analysis = fit_freest_alone(measurement, band_hz)
         except (SessionError, RecordError, ArithmeticError, ValueError) as error:
@@ -344,5 +363,6 @@ class OnlineEstimator:
             analysis=analysis if has_modes else None,
             warnings=record.warnings,
             problem="" if has_modes else "No mode has been excited enough yet.",
+            fit_in_air=fit_in_air if has_modes else None,
             validity=record_validity(record.metadata, record.angle_rad, record.rate_hz, plant),
         )

@@ -45,6 +45,9 @@ _MAX_REPEATED_SCANS: Final = 2
 """Maximum number of times that the scan is repeated after failed fits."""
 _TIGHTENING_FACTOR: Final = 0.7
 """Factor on the requested deviations after a flagged estimate, for twice the information."""
+_TIP_SLOPE_MARGIN: Final = 0.85
+"""Fraction of the largest tip slope for which segments are designed. While the damping is not known
+precisely, the predicted slope is up to 24 % smaller than the slope of the segment."""
 _CORRECTION_FACTOR_RANGE: Final = (0.5, 16.0)
 """Range of the ratio of reported to expected standard deviation that corrects the design."""
 _MODAL_QUANTITY_KEYS: Final = {"damping": "damping_ratio", "frequency": "frequency_hz"}
@@ -343,7 +346,7 @@ class ExcitationPlanner:
             self._corrected_targets(estimate, angle_rad[:record_tick], estimates),
             self._preview,
             remaining_s - PAUSE_S,
-            tip_slope_rad=self._tip_slope_rad,
+            tip_slope_rad=_TIP_SLOPE_MARGIN * self._tip_slope_rad,
             through=self._modes_to_excite(estimates),
         )
         if not self.may_be_last and all(
