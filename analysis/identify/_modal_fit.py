@@ -141,8 +141,7 @@ class ModalFit(ModalEstimate):
         torque_spectra : ndarray of complex, shape (c, K)
             Torque spectra in N·m, not whitened.
         """
-        whitened = self._whiten(torque_spectra)
-        whitened -= (whitened @ self.span.T) @ self.span
+        whitened = self._outside_span(self._whiten(torque_spectra))
         projections = whitened @ self.residual.view(np.float64)
         squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
         cost_reductions: NDArray[np.float64] = projections**2 / squares
@@ -152,6 +151,11 @@ class ModalFit(ModalEstimate):
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
 
+    def _outside_span(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the part of whitened spectra that no parameter of the fit can imitate."""
+        outside_span: NDArray[np.float64] = whitened - (whitened @ self.span.T) @ self.span
+        return outside_span
+
     def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
         """Return the standard deviation that the size of an additional effect would have.
 
@@ -160,8 +164,7 @@ class ModalFit(ModalEstimate):
         torque_spectrum : ndarray of complex, shape (K,)
             Torque spectrum of the effect in N·m per unit of its size, not whitened.
         """
-        whitened = self._whiten(torque_spectrum)
-        remainder = whitened - (whitened @ self.span.T) @ self.span
+        remainder = self._outside_span(self._whiten(torque_spectrum))
         return 1 / math.sqrt(max(float(remainder @ remainder), np.finfo(float).tiny))
 
     def damping_std_ratios(
