@@ -129,10 +129,12 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     noise, and the model's torque is the encoder's quantisation.
     """
     angle = Measurement.of_record(record).angle_from_rest(highest_hz)
-    all_samples = slice(0, angle.size)
     band_hz = (0.0, highest_hz)
+    # Followed by its mirror image, the angle has no step at its end, to which the model would
+    # respond before it in so narrow a band.
+    mirrored_angle = np.concatenate([angle, angle[::-1]])
     modelled_nm, _ = TorquePredictor(
-        band_limited(angle, record.rate_hz, band_hz), record.rate_hz, all_samples
+        band_limited(mirrored_angle, record.rate_hz, band_hz), record.rate_hz, slice(0, angle.size)
     ).torque(plant)
     offset_nm = float(np.mean(record.torque_nm - modelled_nm))
     return TorqueInBand(

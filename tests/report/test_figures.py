@@ -277,3 +277,15 @@ def test_the_fit_in_per_cent_is_that_of_the_torque_in_time(record_result):
     found = whole.analysis.fit_percent(whole.fit)
     assert found == pytest.approx(expected, abs=0.3)
     assert 50 < found < 100
+
+
+@pytest.mark.fit
+def test_the_model_s_torque_has_no_step_where_the_record_ends_off_its_zero(record_result):
+    """A motor that is held where the sweep ended does not return after the record."""
+    whole = record_result.whole
+    record = whole.record
+    way = np.linspace(0.0, 1.0, record.angle_rad.size)
+    held_off_zero = replace(record, angle_rad=record.angle_rad - 0.008 * way**2 * (3 - 2 * way))
+    torque = torque_in_band(held_off_zero, whole.fit.plant, whole.band_hz[1])
+    last = slice(-round(0.5 * record.rate_hz), None)
+    assert np.abs(torque.modelled[last]).max() < 0.1 * np.abs(torque.measured).max()
