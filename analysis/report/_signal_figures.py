@@ -171,7 +171,7 @@ def signals_figure(record: Record, model: ShownModel, highest_hz: float) -> Figu
     )
     figure = style.new_figure(9.0, 6.8)
     grid = figure.add_gridspec(
-        2, len(intervals) or 1, left=0.095, right=0.985, top=0.91, bottom=0.07, hspace=0.3,
+        2, len(intervals) or 1, left=0.095, right=0.965, top=0.91, bottom=0.07, hspace=0.3,
         wspace=0.25, height_ratios=(4.0, 1.2),
     )  # fmt: skip
     upper_grid = grid[0, :].subgridspec(3, 1, hspace=0.4, height_ratios=(1.1, 1.3, 0.8))

@@ -33,7 +33,7 @@ def averaged():
 def test_a_touch_seen_through_a_mean_is_told_right(averaged, model):
     sensor_filter = SensorFilter(weights=(1 / 3,) * 3, spacing_s=1e-3)
     assert sensor_filter.weights_delay_s == 1e-3
-    stated = replace(model, torque_delay_s=1e-3)
+    stated = replace(model, plant=replace(model.plant, delay_s=1e-3))
     record = cut(averaged, 60)
     told = TouchEstimator(replace(stated, sensor_filter=sensor_filter), 1000.0).estimate(record)
     assert told.kind == "rigid"
