@@ -1,4 +1,4 @@
-"""p-values and quantiles of the distributions used in tests; the fit in per cent.
+"""p-values and quantiles of the distributions used in tests, limits of BIC; the fit in per cent.
 
 They use `scipy.special`, since `scipy.stats` takes four times as long to import. It is imported on
 first use, since a command that prints its help needs none.
@@ -17,6 +17,12 @@ NORMAL_95: Final = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""
 KOLMOGOROV_95: Final = 1.3581
 """95 % quantile of the Kolmogorov statistic times the square root of the number of values."""
+
+BIC_DECISIVE: Final = 10.0
+"""Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
+Statistical Association 90 (1995) 773-795)."""
+BIC_TIE: Final = 6.0
+"""Difference of BIC below which the data do not distinguish two structures."""
 
 _SMALLEST_TAIL: Final = 1e-290
 """Tail probability below which its logarithm is computed from an asymptotic expansion."""

@@ -13,9 +13,8 @@ from analysis.identify.headline import (
     ReportedMode,
     ReportedValue,
 )
-from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
-from analysis.statistics import student_t_quantile
+from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
 
 if TYPE_CHECKING:

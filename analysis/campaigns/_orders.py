@@ -9,9 +9,9 @@ from typing import TYPE_CHECKING, Final, Literal
 from analysis.campaigns.pooling import freest_estimate
 from analysis.identify import effective_reason, order_status_with_geometry_tolerance
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
-from analysis.identify.verdict import BIC_DECISIVE, too_few_modes
+from analysis.identify.verdict import too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES
-from analysis.statistics import student_t_quantile
+from analysis.statistics import BIC_DECISIVE, student_t_quantile
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence

@@ -21,7 +21,7 @@ from analysis.campaigns._orders import (
 from analysis.campaigns.pooling import freest_estimate
 from analysis.identify import loss_factors_with_geometry_tolerance, uniform_beam_refusal_reason
 from analysis.identify.sentences import uniformity
-from analysis.identify.verdict import BIC_DECISIVE, BIC_TIE
+from analysis.statistics import BIC_DECISIVE, BIC_TIE
 from rigd.units import interval_text
 
 if TYPE_CHECKING:

@@ -29,7 +29,7 @@ import numpy as np
 from analysis.identify._candidates import INTEGER_INTERNAL_ORDER
 from analysis.identify._refit import Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
-from analysis.identify.verdict import BIC_DECISIVE
+from analysis.statistics import BIC_DECISIVE
 from rigd.beam import CausalTransform, clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:

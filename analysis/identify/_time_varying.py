@@ -32,9 +32,8 @@ from analysis.identify._finding import Finding
 from analysis.identify._predictor import eigenvalues
 from analysis.identify._refit import DESCENT_EVALUATIONS, Refit
 from analysis.identify.residual_tests import SIGNIFICANT_STD
-from analysis.identify.verdict import BIC_DECISIVE
 from analysis.models import STRUCTURES
-from analysis.statistics import NORMAL_95
+from analysis.statistics import BIC_DECISIVE, NORMAL_95
 from rigd.beam import CausalTransform, ResponseGrid
 
 if TYPE_CHECKING:

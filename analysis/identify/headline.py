@@ -15,12 +15,11 @@ from types import MappingProxyType
 from typing import TYPE_CHECKING, Any, Final, Literal, Self
 
 from analysis.identify.verdict import (
-    BIC_DECISIVE,
     EXCLUSION_DEVIANCES,
     SECOND_DAMPING_REASON,
     WITH_DRAG_REASON,
 )
-from analysis.statistics import NORMAL_95
+from analysis.statistics import BIC_DECISIVE, NORMAL_95
 from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
 
 if TYPE_CHECKING:

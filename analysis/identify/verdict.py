@@ -23,13 +23,6 @@ if TYPE_CHECKING:
 Status = Literal["compatible", "fractional", "open", "not identifiable", "absent"]
 """Status of a damping order."""
 
-BIC_DECISIVE: Final = 10.0
-"""Difference of BIC from which the worse structure may be dismissed (Kass and Raftery, J. American
-Statistical Association 90 (1995) 773-795)."""
-
-BIC_TIE: Final = 6.0
-"""Difference of BIC below which the data do not distinguish two structures."""
-
 EXCLUSION_DEVIANCES: Final = (10.828, 13.816, 16.266, 18.467)
 """Deviance above that of the freest structure from which a simpler one is excluded, by the number
 of missing parameters (1 to 4): the 0.1 % limit of chi-square. A true structure is excluded once in

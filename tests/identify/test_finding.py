@@ -3,7 +3,7 @@
 import pytest
 
 from analysis.identify._finding import MODEL_INDEPENDENT_KINDS, Finding, doubted
-from analysis.identify._select import _mark_doubtful_findings
+from analysis.identify._model_check import mark_doubtful_findings
 
 
 @pytest.mark.parametrize(
@@ -41,7 +41,7 @@ def test_a_finding_on_a_flagged_parameter_is_no_fact():
         Finding(kind, "It is there (1 to 2; 95 %).", 1.0, (1.0, 2.0), parameters=(name,))
         for kind, name in (("delay", "delay_s"), ("tool inertia", "tool_inertia_kg_m2"))
     )
-    first, second = _mark_doubtful_findings(
+    first, second = mark_doubtful_findings(
         (late, tool),
         (),
         None,

@@ -7,8 +7,9 @@ import pytest
 
 from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
-from analysis.identify.verdict import BIC_TIE, SECOND_DAMPING_REASON
+from analysis.identify.verdict import SECOND_DAMPING_REASON
 from analysis.models import STRUCTURES, Structure
+from analysis.statistics import BIC_TIE
 from rigd.beam import Beam, Plant, clamped_free_eigenvalues
 from rigd.session import Validity
 

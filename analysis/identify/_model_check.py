@@ -1,0 +1,233 @@
+"""Check of a fitted model against its record: residual, findings, reasons against its numbers."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+from analysis.identify._diagnostics import findings, setting_findings, unexplained
+from analysis.identify._finding import doubted
+from analysis.identify._knock import impact_findings
+from analysis.identify._record_model import test_residual
+from analysis.identify._time_varying import established
+from analysis.identify._visible_modes import visible_modes
+from analysis.identify.headline import CONTRADICTED_FILE_REASON, UNEXPLAINED_REASON
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from analysis.identify._candidates import CandidateSet
+    from analysis.identify._finding import Finding
+    from analysis.identify._modal_fit import ModalFit
+    from analysis.identify._nonlinear import NonlinearForce
+    from analysis.identify._record_model import ResidualTests
+    from analysis.identify._step_in_time import StiffnessStep
+    from analysis.identify._time_varying import TemporalChange
+    from analysis.identify.headline import Headline
+
+MODES_WITHOUT_REDUNDANCY: Final = 2
+"""Number of visible modes up to which deviations from a uniform beam leave no degree of freedom."""
+
+_CLIPPED_TORQUE_REASON: Final = "the torque is clipped"
+"""Reason against all numbers if the torque is clipped."""
+
+_CONTRADICTING_KINDS: Final = frozenset({"sign", "unit", "implausible"})
+"""Findings that show that the record contradicts its file."""
+
+_CHANNEL_KINDS: Final = _CONTRADICTING_KINDS | {"clipping", "stop"}
+"""Findings that are reported even if the record contradicts its file."""
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ModelCheck:
+    """What residual and findings say about a model of a record.
+
+    Attributes
+    ----------
+    candidate_set : CandidateSet
+        Candidates of the model, the one of the reported numbers first.
+    modal_fit : ModalFit or None
+        Modal model; None if no mode is visible.
+    residual_tests : ResidualTests
+        Tests of the residual of the modal model, or of the first candidate without such a model.
+    findings : tuple of Finding
+        Findings on the record that need no comparison with reported numbers.
+    temporal_changes : tuple of TemporalChange
+        Changes along the record that are part of the model.
+    """
+
+    candidate_set: CandidateSet
+    modal_fit: ModalFit | None
+    residual_tests: ResidualTests
+    findings: tuple[Finding, ...]
+    temporal_changes: tuple[TemporalChange, ...] = ()
+
+    @classmethod
+    def of(
+        cls,
+        candidate_set: CandidateSet,
+        modal_fit: ModalFit | None,
+        band_hz: tuple[float, float],
+        nonlinear_forces: tuple[NonlinearForce, ...] = (),
+        temporal_changes: tuple[TemporalChange, ...] = (),
+    ) -> ModelCheck:
+        """Check a model with the nonlinear forces and the changes along the record that it has."""
+        residual_tests = test_residual(candidate_set, modal_fit, band_hz)
+        found = findings(candidate_set, nonlinear_forces, residual_tests.harmonics)
+        return cls(candidate_set, modal_fit, residual_tests, found, temporal_changes)
+
+    @property
+    def finding_kinds(self) -> frozenset[str]:
+        """Kinds of the findings."""
+        return frozenset(finding.kind for finding in self.findings)
+
+    @property
+    def contradicts_file(self) -> bool:
+        """Whether sign, unit or size of a channel contradict the file."""
+        return not _CONTRADICTING_KINDS.isdisjoint(self.finding_kinds)
+
+    @property
+    def model_reason(self) -> str | None:
+        """Reason why the record refutes the model; None if it does not."""
+        if self.contradicts_file:
+            return CONTRADICTED_FILE_REASON
+        if "harmonics" in self.finding_kinds or not self.residual_tests.is_noise:
+            return UNEXPLAINED_REASON
+        return None
+
+    @property
+    def clipped_reason(self) -> str | None:
+        """Reason against all numbers if the torque is clipped, else None."""
+        return _CLIPPED_TORQUE_REASON if "clipping" in self.finding_kinds else None
+
+    @property
+    def doubt_reason(self) -> str | None:
+        """Reason against every number; None if there is none."""
+        return self.model_reason or self.clipped_reason or self._change_reason
+
+    @property
+    def mode_doubt_reason(self) -> str | None:
+        """Reason against every mode; None if there is none.
+
+        With a fitted change along the record, the modes are those at the middle of the record.
+        """
+        if self.temporal_changes and self.temporal_changes[0].certain:
+            return self.doubt_reason
+        return self.model_reason or self.clipped_reason
+
+    @property
+    def _change_reason(self) -> str | None:
+        """Reason why changes along the record make every parameter doubtful, else None.
+
+        With a change along the record, the parameters of a mode are those at the time when the
+        sweep passed it.
+        """
+        is_single_sweep = self.candidate_set.comparison.measurement.is_single_sweep
+        if not self.temporal_changes or established(
+            self.temporal_changes, is_single_sweep=is_single_sweep
+        ):
+            return None
+        return f"{self.temporal_changes[0].name} would explain the record as well"
+
+    def reported_findings(
+        self,
+        headline: Headline,
+        effect_findings: tuple[Finding, ...] = (),
+        change_findings: tuple[Finding, ...] = (),
+        stiffness_step: StiffnessStep | None = None,
+    ) -> tuple[Finding, ...]:
+        """Return all findings, with the doubtful ones marked as not established.
+
+        Parameters
+        ----------
+        headline : Headline
+            Reported numbers.
+        effect_findings : tuple of Finding
+            Findings on effects that are fitted with the modes, and on causes of deviations.
+        change_findings : tuple of Finding
+            Findings on changes along the record, which state their certainty themselves.
+        stiffness_step : StiffnessStep or None
+            Step of the stiffness in time that may explain the residual.
+        """
+        if self.contradicts_file:
+            return tuple(finding for finding in self.findings if finding.kind in _CHANNEL_KINDS)
+        marked = mark_doubtful_findings(
+            (*self.findings, *self._setting_findings(headline), *effect_findings),
+            change_findings,
+            self.model_reason,
+            self.doubt_reason,
+            headline.flags,
+            only_harmonics_remain=self.residual_tests.is_noise,
+        )
+        impacts = impact_findings(
+            self.candidate_set.comparison.measurement.knocks,
+            explained=self.residual_tests.is_noise,
+        )
+        if self.residual_tests.is_noise:
+            return (*impacts, *marked)
+        residual_finding = unexplained(
+            self.residual_tests.whiteness,
+            self.residual_tests.input_relation,
+            self.candidate_set.best.fit.modes,
+            stiffness_step,
+        )
+        return (*impacts, *marked, residual_finding)
+
+    def _setting_findings(self, headline: Headline) -> tuple[Finding, ...]:
+        """Return findings on fitted settings, such as the delay, that differ from the file's.
+
+        Return none if the record cannot show such a difference.
+        """
+        if (
+            "implausible" in self.finding_kinds
+            or len(headline.visible_modes) < MODES_WITHOUT_REDUNDANCY
+        ):
+            return ()
+        return tuple(setting_findings(self.candidate_set, headline))
+
+
+def visible_mode_numbers(
+    candidate_set: CandidateSet, modal_fit: ModalFit | None
+) -> tuple[int, ...]:
+    """Return the numbers of the beam modes that are visible in a record, from 1."""
+    if modal_fit is None:
+        return visible_modes(candidate_set.comparison, candidate_set.noise, candidate_set.best.fit)
+    return modal_fit.visible
+
+
+def mark_doubtful_findings(
+    fitted_findings: tuple[Finding, ...],
+    change_findings: tuple[Finding, ...],
+    model_reason: str | None,
+    doubt_reason: str | None,
+    parameter_flags: Mapping[str, str],
+    *,
+    only_harmonics_remain: bool,
+) -> tuple[Finding, ...]:
+    """Return all findings, with the doubtful ones marked as not established.
+
+    `fitted_findings` are effects that were fitted with the beam. `change_findings` are changes
+    along the record, which already state their certainty. `model_reason` is the reason against the
+    model, `doubt_reason` the reason against all numbers, and `parameter_flags` are the reasons
+    against single parameters. With `only_harmonics_remain` the finding on harmonics is established.
+    """
+
+    def qualified(finding: Finding) -> Finding:
+        """Mark a finding as not established if a reason against it exists."""
+        parameter_flag = next(
+            (
+                parameter_flags[parameter_name]
+                for parameter_name in finding.parameters
+                if parameter_name in parameter_flags
+            ),
+            None,
+        )
+        finding_reason = doubt_reason or parameter_flag
+        if finding_reason is None or (finding.kind == "harmonics" and only_harmonics_remain):
+            return finding
+        return doubted(finding, finding_reason)
+
+    fitted_findings = tuple(map(qualified, fitted_findings))
+    if model_reason is not None:
+        change_findings = tuple(doubted(finding, model_reason) for finding in change_findings)
+    return (*fitted_findings, *change_findings)
