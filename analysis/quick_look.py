@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import os
 import signal
 import sys
@@ -21,11 +20,9 @@ from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
-from rigd.library.trend import change_between
-from rigd.printable import listed
+from rigd.estimates import change_between, modes_from_json, unseen_modes
 from rigd.runtime import raise_on_signals, use_one_thread
 from rigd.session import SessionError, Validity
-from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import (
     QUICK_LOOK_VERSION,
     last_quick_look,
@@ -41,8 +38,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Finding
-    from analysis.identify.headline import Headline, ReportedMode
+    from analysis.identify.headline import Headline
     from analysis.record import Record
+    from rigd.estimates import EstimatedMode
     from rigd.spectral import RunningEstimate, Segmentation
 
     Real = NDArray[np.float64]
@@ -57,9 +55,6 @@ to one band."""
 
 _HAMMING_WIDTH_BINS: Final = 1.30
 """Width of a Hamming window's main lobe at half power, in bins of a segment's transform."""
-
-_MODE_QUANTITIES: Final = ("frequency_hz", "damping_ratio")
-"""Quantities of a mode that are compared between sessions."""
 
 
 class QuickLookError(ValueError):
@@ -94,7 +89,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
     from analysis.results import finite
 
     started_s = time.monotonic()
-    mode_documents: list[dict[str, Any]] = []
+    modes: list[EstimatedMode] = []
     response_document, coherence_document, model_document = None, _empty_coherence(), None
     specimen, start_utc_ns, session_id, excitation = "", 0, path.stem, ""
     quality_flags: list[str] = []
@@ -111,11 +106,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         start_utc_ns = _parse_integer(metadata.get("start_utc_ns", ""))
         quality_flags += record.warnings
         headline, validity, remarks = _fit_headline(record)
-        mode_documents = (
-            []
-            if headline is None
-            else [_mode_document(reported_mode) for reported_mode in headline.modes]
-        )
+        modes = [] if headline is None else list(headline.modes)
         quality_flags += remarks
         response_document, coherence_document, remarks = _response_document(record)
         quality_flags += remarks
@@ -126,8 +117,8 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         if last is not None
         else _last_quick_look(path, specimen, start_utc_ns)
     )
-    if last_quick_look_document is not None and any(mode["shown"] for mode in mode_documents):
-        comparison = _compare_modes(mode_documents, last_quick_look_document)
+    if last_quick_look_document is not None and any(mode.shown for mode in modes):
+        comparison = _compare_modes(modes, last_quick_look_document)
     quick_look_document = {
         "version": QUICK_LOOK_VERSION,
         "file": path.name,
@@ -137,7 +128,7 @@ def make_quick_look(path: Path, last: Path | None = None) -> dict[str, Any]:
         "took_s": round(time.monotonic() - started_s, 2),
         "specimen": specimen,
         "excitation": excitation,
-        "modes": mode_documents,
+        "modes": [mode.as_json() for mode in modes],
         "validity": validity.as_json(),
         "coherence": coherence_document,
         "flags": quality_flags,
@@ -192,18 +183,6 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
     if not headline.modes:
         sentences.append("No modes: none lies in the excited band.")
     return headline, validity, sentences
-
-
-def _mode_document(mode: ReportedMode) -> dict[str, Any]:
-    """Return one mode (frequency, damping ratio, visibility) as a section of the JSON document."""
-    return {
-        "mode": mode.number,
-        "frequency_hz": mode.frequency_hz.as_json(),
-        "damping_ratio": mode.damping_ratio.as_json(),
-        "participation": None if mode.participation is None else mode.participation.as_json(),
-        "source": mode.source,
-        "shown": mode.shown,
-    }
 
 
 def _model_document(
@@ -387,45 +366,43 @@ def _last_quick_look(path: Path, specimen: str, before_utc_ns: int) -> dict[str,
         specimen,
         before_utc_ns=before_utc_ns,
         excluded_session=path.stem,
-        is_usable=lambda document: any(mode["shown"] for mode in document["modes"]),
+        is_usable=lambda document: any(mode.shown for mode in modes_from_json(document["modes"])),
     )
     return None if path_and_document is None else path_and_document[1]
 
 
-def _compare_modes(
-    modes: list[dict[str, Any]], other_document: Mapping[str, Any]
-) -> dict[str, Any]:
+def _compare_modes(modes: list[EstimatedMode], other_document: Mapping[str, Any]) -> dict[str, Any]:
     """Compare the modes of a session with those of an earlier one, if visible in both.
 
     Return the comparison as a section of the JSON document.
     """
-    other_modes = {mode["mode"]: mode for mode in other_document["modes"] if mode["shown"]}
+    other_modes = {
+        mode.number: mode for mode in modes_from_json(other_document["modes"]) if mode.shown
+    }
     compared_modes, changed_modes, unchanged_modes = [], [], []
     for mode in modes:
-        other_mode = other_modes.get(mode["mode"])
-        if other_mode is None or not mode["shown"]:
+        other_mode = other_modes.get(mode.number)
+        if other_mode is None or not mode.shown:
             continue
-        hz, damping_text = mode["frequency_hz"], mode["damping_ratio"]
-        change_hz = hz["value"] - other_mode["frequency_hz"]["value"]
-        other_damping_ratio = other_mode["damping_ratio"]["value"]
-        change_percent = (
-            100 * (damping_text["value"] / other_damping_ratio - 1)
-            if other_damping_ratio
-            else math.nan
+        frequency_change, damping_change = (
+            change_between(other_mode.frequency_hz, mode.frequency_hz),
+            change_between(other_mode.damping_ratio, mode.damping_ratio),
         )
+        change_hz = frequency_change.difference
+        change_percent = mode.damping_ratio.percent_above(other_mode.damping_ratio)
         is_significant = [
-            change_between(other_mode[other_name], mode[other_name]).significant is True
-            for other_name in _MODE_QUANTITIES
+            change.significant is True for change in (frequency_change, damping_change)
         ]
         compared_modes.append(
             {
-                "mode": mode["mode"],
+                "mode": mode.number,
                 "frequency_hz_change": change_hz,
                 "damping_ratio_change_percent": change_percent,
                 "significant": any(is_significant),
             }
         )
-        decimal_digits = decimals(hz["std"]) if hz["std"] else 4
+        std_hz = mode.frequency_hz.std
+        decimal_digits = decimals(std_hz) if std_hz else 4
         change_texts = (f"{change_hz:+.{decimal_digits}f} Hz", f"damping {change_percent:+.2g} %")
         significant_texts = [
             change_text
@@ -433,9 +410,9 @@ def _compare_modes(
             if is_different
         ]
         if significant_texts:
-            changed_modes.append(f"mode {mode['mode']} {', '.join(significant_texts)}")
+            changed_modes.append(f"mode {mode.number} {', '.join(significant_texts)}")
         else:
-            unchanged_modes.append(f"mode {mode['mode']} {', '.join(change_texts)}")
+            unchanged_modes.append(f"mode {mode.number} {', '.join(change_texts)}")
     other_name = Path(other_document["file"]).stem
     if not compared_modes:
         comparison_sentence = f"No mode can be compared with {other_name}."
@@ -464,25 +441,24 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     specimen_text = f" ({document['specimen']})" if document["specimen"] else ""
     # The intervals do not include scale of the torque, length and density of the beam.
     yield f"Quick look at {document['session_id']}{specimen_text}; ± 95 %, statistical only:"
-    shown_modes = [mode for mode in document["modes"] if mode["shown"]]
+    modes = modes_from_json(document["modes"])
+    shown_modes = [mode for mode in modes if mode.shown]
     for mode in shown_modes:
-        yield f"  {mode_line(mode)}"
+        yield f"  {mode.line()}"
     if shown_modes:
         validity = Validity.of_document(document.get("validity"))
         yield f"  {validity.sentence}"
         if validity.uniform_beam is not None:
             yield f"  {validity.uniform_beam.sentence}"
     doubts = dict.fromkeys(
-        value_flag
+        estimate.flag
         for mode in shown_modes
-        for quantity in _MODE_QUANTITIES
-        if (value_flag := mode[quantity]["flag"])
+        for estimate in (mode.frequency_hz, mode.damping_ratio)
+        if estimate.flag
     )
     yield from (f"  doubtful: {doubt_text}" for doubt_text in doubts)
-    hidden_modes = [str(mode["mode"]) for mode in document["modes"] if not mode["shown"]]
-    if hidden_modes:
-        mode_noun = "mode" if len(hidden_modes) == 1 else "modes"
-        yield f"  not visible in this record: {mode_noun} {listed(hidden_modes)}"
+    if hidden_modes := unseen_modes(modes):
+        yield f"  not visible in this record: {hidden_modes}"
     coherence = document["coherence"]
     if coherence["mean"] is not None:
         bands_text = ", ".join(

@@ -16,12 +16,13 @@ if TYPE_CHECKING:
     from pathlib import Path
 
     from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting
-    from analysis.identify.headline import Headline, ReportedValue
+    from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
     from rigd.beam import Plant
+    from rigd.estimates import Estimate
     from rigd.session import Validity
 
 _ORDER_NAMES: Final = frozenset({"alpha", "lambda"})
@@ -154,7 +155,7 @@ class WholeRecord:
         return frozenset(_ORDER_NAMES & self.headline.flags.keys())
 
     @property
-    def combined(self) -> dict[str, ReportedValue]:
+    def combined(self) -> dict[str, Estimate]:
         """Reported parameters that depend on a scale whose uncertainty the file states.
 
         Their standard uncertainties and intervals include the uncertainty of the scale.

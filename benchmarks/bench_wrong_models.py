@@ -19,7 +19,7 @@ from dataclasses import dataclass
 from wrong_models import DEFECTS, RIGS, Record
 
 from analysis.identify import Selection, select
-from analysis.identify.headline import ReportedValue
+from rigd.estimates import Estimate
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +57,7 @@ def errors_of(made: Record, selection: Selection) -> Iterator[tuple[str, float]]
         yield from _error(f"f{mode.number}", mode.frequency_hz, pole.imag / (2 * math.pi))
 
 
-def _error(name: str, quantity: ReportedValue, true: float) -> Iterator[tuple[str, float]]:
+def _error(name: str, quantity: Estimate, true: float) -> Iterator[tuple[str, float]]:
     if quantity.flag is None and quantity.std:
         yield name, (quantity.value - true) / quantity.std
 

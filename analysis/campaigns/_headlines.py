@@ -6,16 +6,11 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
 from analysis.identify import headline_json, replace_by_modal_model
-from analysis.identify.headline import (
-    ConditionalEstimate,
-    Estimates,
-    ReportedLossFactor,
-    ReportedMode,
-    ReportedValue,
-)
+from analysis.identify.headline import ConditionalEstimate, Estimates, ReportedLossFactor
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
+from rigd.estimates import Estimate, EstimatedMode
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -164,7 +159,7 @@ def _simpler_estimate(
             if order_name in COEFFICIENT_OF
         },
         parameters={
-            parameter.name: ReportedValue(parameter.value, parameter.std, parameter.interval)
+            parameter.name: Estimate(parameter.value, parameter.std, parameter.interval)
             for parameter in simpler_estimate.parameters
         },
     )
@@ -175,12 +170,12 @@ def _reported_parameters(
     pooled_estimate: PooledEstimate,
     orders: tuple[PooledOrder, ...],
     common_flag: str | None,
-) -> dict[str, ReportedValue]:
+) -> dict[str, Estimate]:
     """Return the pooled parameters with their flags."""
     is_mixed = campaign.homogeneity.is_mixed
     order_flags = _order_flags(orders)
     reported_parameters = {
-        parameter.name: ReportedValue(
+        parameter.name: Estimate(
             parameter.value,
             parameter.std,
             parameter.interval,
@@ -194,7 +189,7 @@ def _reported_parameters(
         if parameter_name not in reported_parameters and (
             parameter_name not in DAMPING_PARAMETERS or parameter_name in free_names
         ):
-            reported_parameters[parameter_name] = ReportedValue(
+            reported_parameters[parameter_name] = Estimate(
                 fixed_value, None, None, common_flag or _ON_BOUND_FLAG
             )
     return reported_parameters
@@ -223,26 +218,27 @@ def _reported_loss_factors(
 
 def _reported_modes(
     campaign: CampaignResult, pooled_estimate: PooledEstimate, common_flag: str | None
-) -> tuple[ReportedMode, ...]:
+) -> tuple[EstimatedMode, ...]:
     """Return frequency and damping ratio of each pooled mode, with their flags."""
     t, is_mixed = (
         student_t_quantile(0.95, pooled_estimate.sessions - 1),
         campaign.homogeneity.is_mixed,
     )
 
-    def reported_value(value: float, std: float, quantity: str) -> ReportedValue:
+    def reported_value(value: float, std: float, quantity: str) -> Estimate:
         """Return a quantity of a mode with its interval and flag."""
         value_flag = common_flag or (_MIXTURE_FLAG if is_mixed(quantity) else None)
-        return ReportedValue(value, std, (value - t * std, value + t * std), value_flag)
+        return Estimate(value, std, (value - t * std, value + t * std), value_flag)
 
     return tuple(
-        ReportedMode(
+        EstimatedMode(
             mode.number,
             reported_value(mode.frequency_hz, mode.frequency_std_hz, f"frequency_hz_{mode.number}"),
             reported_value(
                 mode.damping_ratio, mode.damping_ratio_std, f"damping_ratio_{mode.number}"
             ),
             shown=True,
+            source="beam",
         )
         for mode in pooled_estimate.modes
     )

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, Final, Literal
 import numpy as np
 
 from analysis.identify import SETTINGS, damping_size
-from analysis.identify.headline import ReportedLossFactor, ReportedValue
+from analysis.identify.headline import ReportedLossFactor
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
 from rigd.beam import LOGARITHMIC_PARAMETERS, Plant, undamped_frequencies_rad_s
+from rigd.estimates import Estimate
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -303,7 +304,7 @@ class PooledEstimate:
             if loss_factor is not None:
                 factor = math.exp(t * loss_factor.std / loss_factor.value)
                 interval = loss_factor.value / factor, loss_factor.value * factor
-                order_name = ReportedValue(loss_factor.value, loss_factor.std, interval)
+                order_name = Estimate(loss_factor.value, loss_factor.std, interval)
                 loss_factors.append(
                     ReportedLossFactor(damping, loss_factor.omega_rad_s, order_name)
                 )

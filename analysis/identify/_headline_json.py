@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from collections.abc import Iterable
 
     from analysis.identify._finding import Finding
-    from analysis.identify.headline import Estimates, ReportedMode
+    from analysis.identify.headline import Estimates
     from rigd.session import Validity
 
 
@@ -75,7 +75,7 @@ def headline_json(
             }
             for quantity in estimates.sizes
         ],
-        "modes": [_mode_json(quantity) for quantity in estimates.modes],
+        "modes": [quantity.as_json() for quantity in estimates.modes],
         "uniformity_percent": None
         if estimates.tolerant is None
         else 100 * estimates.tolerant.uniformity,
@@ -115,19 +115,6 @@ def headline_json(
     }
 
 
-def _mode_json(mode: ReportedMode) -> dict[str, Any]:
-    """Return frequency, damping and participation of a beam mode as a dictionary for JSON."""
-    participation = mode.participation
-    return {
-        "mode": mode.number,
-        "frequency_hz": mode.frequency_hz.as_json(),
-        "damping_ratio": mode.damping_ratio.as_json(),
-        "participation": None if participation is None else participation.as_json(),
-        "source": mode.source,
-        "shown": mode.shown,
-    }
-
-
 def _exact_json(exact_estimates: Estimates) -> dict[str, Any]:
     """Return the estimates for a beam that is uniform to 1e-5, for the JSON document."""
     return {
@@ -136,5 +123,5 @@ def _exact_json(exact_estimates: Estimates) -> dict[str, Any]:
             quantity_name: quantity.as_json()
             for quantity_name, quantity in exact_estimates.parameters.items()
         },
-        "modes": [_mode_json(quantity) for quantity in exact_estimates.modes],
+        "modes": [quantity.as_json() for quantity in exact_estimates.modes],
     }

@@ -15,8 +15,6 @@ from analysis.identify._uncertainty import damping_size
 from analysis.identify.headline import (
     DAMPING_PARAMETER_NAMES,
     Estimates,
-    ReportedMode,
-    ReportedValue,
     reported_loss_factor,
     symmetric_value,
 )
@@ -31,6 +29,7 @@ from analysis.identify.verdict import (
 from analysis.models import ORDER_RANGE, STRUCTURES
 from analysis.statistics import NORMAL_95
 from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
+from rigd.estimates import Estimate, EstimatedMode
 
 if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
@@ -136,19 +135,19 @@ def _reported_modes(
     half_width: float,
     *,
     from_beam: bool,
-) -> tuple[ReportedMode, ...]:
+) -> tuple[EstimatedMode, ...]:
     """Return the visible modes from the modal model, and the other modes from the beam.
 
     With `from_beam`, frequency and damping ratio of visible modes are also those of the beam.
     """
     visible = modal.visible
-    modes_by_number: dict[int, ReportedMode] = {
+    modes_by_number: dict[int, EstimatedMode] = {
         mode_estimate.number: mode_estimate for mode_estimate in estimates.modes
     }
     for mode_number in visible:
         modal_mode = modal.mode(mode_number)
         inertia_kg_m2, relative_std = modal.inertia(mode_number)
-        mode_estimate = ReportedMode(
+        mode_estimate = EstimatedMode(
             mode_number,
             symmetric_value(
                 modal_mode.frequency_hz, modal_mode.frequency_std_hz, doubt, half_width
@@ -176,7 +175,7 @@ def _reported_modes(
 
 def _reported_parameters(
     estimate: TolerantEstimate, doubt: str | None, *, refused: bool
-) -> dict[str, ReportedValue]:
+) -> dict[str, Estimate]:
     """Return the parameters of the beam with a tolerance of the geometry, flagged if undetermined.
 
     `doubt` is the reason against every number. With `refused`, stiffness, density, delay and
@@ -184,7 +183,7 @@ def _reported_parameters(
     by far more than the tolerance.
     """
     return {
-        parameter_name: ReportedValue(
+        parameter_name: Estimate(
             estimate.values[parameter_name],
             estimate.std[parameter_name],
             estimate.interval[parameter_name],

@@ -21,6 +21,7 @@ from analysis.identify.verdict import (
 )
 from analysis.statistics import BIC_DECISIVE, NORMAL_95
 from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
+from rigd.estimates import Estimate, EstimatedMode
 
 if TYPE_CHECKING:
     from collections.abc import Collection, Iterator, Mapping
@@ -84,48 +85,6 @@ _DAMPINGS: Final[tuple[Damping, Damping]] = ("internal", "external")
 
 
 @dataclass(frozen=True, slots=True)
-class ReportedValue:
-    """Estimated value with its uncertainty, and the reason why it may be invalid.
-
-    Attributes
-    ----------
-    value : float
-        Estimate in SI units.
-    std : float or None
-        Standard deviation. None if the data do not determine it.
-    interval_95 : tuple of float or None
-        95 % interval. None if the data do not determine it.
-    flag : str or None
-        Reason why the value is not a property of the antenna or the rig. None if it is one.
-    """
-
-    value: float
-    std: float | None
-    interval_95: tuple[float, float] | None
-    flag: str | None = None
-
-    def flagged(self, flag: str | None) -> ReportedValue:
-        """Return the value with a flag, unless it already has one.
-
-        Parameters
-        ----------
-        flag : str or None
-            Reason why the value is not valid. None changes nothing.
-        """
-        return self if flag is None else replace(self, flag=self.flag or flag)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return value, standard deviation, 95 % interval and flag as a JSON-ready dict."""
-        interval_list = None if self.interval_95 is None else list(self.interval_95)
-        return {
-            "value": self.value,
-            "std": self.std,
-            "interval_95": interval_list,
-            "flag": self.flag,
-        }
-
-
-@dataclass(frozen=True, slots=True)
 class ReportedLossFactor:
     """Loss factor of one damping at its pivot frequency, where it depends least on the order.
 
@@ -135,13 +94,13 @@ class ReportedLossFactor:
         "internal" or "external".
     omega_rad_s : float or None
         Pivot frequency in rad/s. None if the order is fixed: `size` is the coefficient then.
-    size : ReportedValue
+    size : Estimate
         Value of the loss factor, as in `DampingSize`.
     """
 
     damping: Damping
     omega_rad_s: float | None
-    size: ReportedValue
+    size: Estimate
 
     @property
     def order(self) -> str:
@@ -160,25 +119,6 @@ class ReportedLossFactor:
 
 
 @dataclass(frozen=True, slots=True)
-class ReportedMode:
-    """Reported frequency and damping ratio of one mode of the beam with locked hub."""
-
-    number: int
-    """Number of the mode, from 1."""
-    frequency_hz: ReportedValue
-    """Frequency of the free decay in hertz."""
-    damping_ratio: ReportedValue
-    """Fraction of the critical damping."""
-    shown: bool
-    """Whether the record shows the mode. If not, it is computed from the model."""
-    source: Literal["modal", "beam"] = "beam"
-    """Model that provides the numbers: the modal model, or the beam."""
-    participation: ReportedValue | None = None
-    """Effective inertia of the mode about the motor axis, in kg m². None for a mode from the
-    beam."""
-
-
-@dataclass(frozen=True, slots=True)
 class ConditionalEstimate:
     """Parameter estimates of a simpler structure, valid if this structure is true.
 
@@ -188,13 +128,13 @@ class ConditionalEstimate:
         Name of the structure in tables.
     fixed : mapping of str to float
         Assumed values of the orders "alpha" and "lambda".
-    parameters : mapping of str to ReportedValue
+    parameters : mapping of str to Estimate
         Estimates, by the names of `RecordFit`.
     """
 
     name: str
     fixed: Mapping[str, float]
-    parameters: Mapping[str, ReportedValue]
+    parameters: Mapping[str, Estimate]
 
 
 @dataclass(frozen=True, slots=True)
@@ -205,11 +145,11 @@ class Estimates:
     ----------
     name : str
         Name, in tables, of the freest structure that the data support.
-    parameters : mapping of str to ReportedValue
+    parameters : mapping of str to Estimate
         Parameters of the structure, by the names of `RecordFit`.
     sizes : tuple of ReportedLossFactor
         Loss factors of the dampings, the internal one first.
-    modes : tuple of ReportedMode
+    modes : tuple of EstimatedMode
         Modes of the beam with locked hub.
     structures : tuple of (str, str)
         Name of every fitted structure in tables, and its status: "selected" for the reported one,
@@ -230,9 +170,9 @@ class Estimates:
     """
 
     name: str
-    parameters: Mapping[str, ReportedValue]
+    parameters: Mapping[str, Estimate]
     sizes: tuple[ReportedLossFactor, ...]
-    modes: tuple[ReportedMode, ...]
+    modes: tuple[EstimatedMode, ...]
     structures: tuple[tuple[str, StructureStatus], ...]
     simpler: ConditionalEstimate | None
     drag_speed_m_s: float | None
@@ -364,7 +304,7 @@ def headline(
     )  # fmt: skip
     if candidate_set.drag is not None:
         drag_estimate = candidate_set.drag
-        reported_drag = ReportedValue(
+        reported_drag = Estimate(
             drag_estimate.value_m, drag_estimate.std_m, drag_estimate.interval_95_m, unexplained
         )
         loss_factors = (
@@ -560,7 +500,7 @@ def _reported_parameter(
     parameter_name: str,
     doubt_reason: str | None,
     order_interval: tuple[float, float] | None,
-) -> ReportedValue:
+) -> Estimate:
     """Return the reported value of one parameter of a fit, with its interval and flag."""
     is_free = parameter_name in fit.interval
     interval_95 = order_interval or fit.interval.get(parameter_name)
@@ -569,7 +509,7 @@ def _reported_parameter(
         invalid_reason = _AT_BOUND_FLAG
     if invalid_reason is None and is_free and interval_95 is None:
         invalid_reason = _NOT_IDENTIFIABLE_FLAG
-    return ReportedValue(
+    return Estimate(
         fit.parameters[parameter_name],
         fit.std[parameter_name] if is_free else 0.0,
         interval_95,
@@ -600,7 +540,7 @@ def reported_loss_factor(
     return ReportedLossFactor(
         damping,
         damping_size.omega_rad_s,
-        ReportedValue(damping_size.value, damping_size.std, interval_95, invalid_reason),
+        Estimate(damping_size.value, damping_size.std, interval_95, invalid_reason),
     )
 
 
@@ -621,24 +561,25 @@ def _modes_with_wider_uncertainty(fit: RecordFit, with_both: RecordFit) -> Itera
 
 def _reported_mode(
     mode_estimate: ModeEstimate, visible_numbers: Collection[int], invalid_reason: str | None
-) -> ReportedMode:
+) -> EstimatedMode:
     """Return the reported frequency and damping ratio of a mode, flagged if it is not visible."""
     is_visible_mode = mode_estimate.number in visible_numbers
     if invalid_reason is None and not is_visible_mode:
         invalid_reason = "computed from the model: the record does not show this mode"
-    return ReportedMode(
+    return EstimatedMode(
         mode_estimate.number,
         symmetric_value(mode_estimate.frequency_hz, mode_estimate.frequency_std_hz, invalid_reason),
         symmetric_value(
             mode_estimate.damping_ratio, mode_estimate.damping_ratio_std, invalid_reason
         ),
         is_visible_mode,
+        "beam",
     )
 
 
 def symmetric_value(
     estimated_value: float, std: float, invalid_reason: str | None, half_width: float = NORMAL_95
-) -> ReportedValue:
+) -> Estimate:
     """Return a reported value with a symmetric 95 % interval.
 
     Parameters
@@ -651,7 +592,7 @@ def symmetric_value(
         Half width of the interval, in standard deviations.
     """
     interval_half_width = half_width * std
-    return ReportedValue(
+    return Estimate(
         estimated_value,
         std,
         (estimated_value - interval_half_width, estimated_value + interval_half_width),

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from collections.abc import Mapping
 
     from analysis.identify._result import RecordFit
-    from analysis.identify.headline import ReportedValue
+    from rigd.estimates import Estimate
 
 _DENSITY_OVER_STIFFNESS: Final = "density_over_stiffness"
 _BENDING_STIFFNESS: Final = "bending_stiffness_n_m2"
@@ -72,20 +72,20 @@ def parameters_compensate_scales(fit: RecordFit) -> bool:
 
 
 def with_scale_uncertainty(
-    reported_parameters: Mapping[str, ReportedValue], scale_uncertainty: Mapping[str, float]
-) -> dict[str, ReportedValue]:
+    reported_parameters: Mapping[str, Estimate], scale_uncertainty: Mapping[str, float]
+) -> dict[str, Estimate]:
     """Add the uncertainties of the scales, such as length, to those of the parameters.
 
     Parameters
     ----------
-    reported_parameters : mapping of str to ReportedValue
+    reported_parameters : mapping of str to Estimate
         Parameters with statistical uncertainties, by the names of `RecordFit`.
     scale_uncertainty : mapping of str to float
         Relative standard uncertainties of "torque_scale" and "length", if stated.
 
     Returns
     -------
-    dict of str to ReportedValue
+    dict of str to Estimate
         Parameters that have an interval and depend on a scale of stated uncertainty, with the
         combined standard uncertainty and 95 % interval.
     """
@@ -120,8 +120,8 @@ def _relative_scale_uncertainty(
 
 
 def _with_scale_uncertainty(
-    reported_value: ReportedValue, relative_std: float, *, is_logarithmic: bool
-) -> ReportedValue:
+    reported_value: Estimate, relative_std: float, *, is_logarithmic: bool
+) -> Estimate:
     """Return a reported value whose uncertainty includes that of torque scale and length.
 
     `relative_std` is the relative uncertainty by these scales. Both are added in quadrature.

@@ -19,10 +19,11 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
-    from analysis.identify.headline import ConditionalEstimate, Headline, ReportedValue
+    from analysis.identify.headline import ConditionalEstimate, Headline
     from analysis.identify.profile_likelihood import Order
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
     from analysis.identify.verdict import OrderVerdict, Status
+    from rigd.estimates import Estimate
 
 # Sentences
 
@@ -283,7 +284,7 @@ def _conditional_sentence(simpler: ConditionalEstimate) -> str:
     )
 
 
-def _value_and_interval_text(reported_value: ReportedValue) -> str:
+def _value_and_interval_text(reported_value: Estimate) -> str:
     """Return a reported value with its 95 % interval as text, rounded to its uncertainty."""
     if reported_value.interval_95 is None or not reported_value.std:
         return f"{reported_value.value:.4g}"

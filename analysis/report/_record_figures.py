@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import ModeEstimate, RecordAnalysis
     from analysis.identify.headline import Headline
-    from analysis.report.bands import Estimate, ResponseBand
+    from analysis.report.bands import FittedPlant, ResponseBand
     from analysis.results import WholeRecord
     from rigd.spectral import FrequencyResponse
 
@@ -233,7 +233,7 @@ Smaller loss factors do not matter for the total."""
 
 def loss_figure(
     mode_estimates: Sequence[ModeEstimate],
-    loss_model: Estimate | None,
+    loss_model: FittedPlant | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     *,
@@ -246,7 +246,7 @@ def loss_figure(
     ----------
     mode_estimates : sequence of ModeEstimate
         Modes to draw as points.
-    loss_model : Estimate or None
+    loss_model : FittedPlant or None
         Beam whose loss factors are drawn; None: no beam explains the losses, and no curve is drawn.
     axis_hz : tuple of float
         Lowest and highest frequency of the axis, positive.
@@ -311,7 +311,7 @@ def loss_figure(
 
 def _draw_loss_factors(
     axes: Axes,
-    loss_model: Estimate | None,
+    loss_model: FittedPlant | None,
     axis_hz: tuple[float, float],
     supported_hz: tuple[float, float] | None,
     unsupported_orders: Collection[str],

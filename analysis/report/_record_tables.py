@@ -28,14 +28,9 @@ from rigd.printable import listed
 if TYPE_CHECKING:
     from collections.abc import Iterable, Iterator, Mapping
 
-    from analysis.identify.headline import (
-        Estimates,
-        Headline,
-        ReportedLossFactor,
-        ReportedMode,
-        ReportedValue,
-    )
+    from analysis.identify.headline import Estimates, Headline, ReportedLossFactor
     from analysis.results import WholeRecord
+    from rigd.estimates import Estimate, EstimatedMode
 
 _STRONG_CORRELATION: Final = 0.9
 """Least magnitude of a correlation of two parameters that is shown in bold."""
@@ -113,7 +108,7 @@ _MODE_COLUMNS: Final = (
 """Columns of a mode's frequency and damping ratio with their uncertainties."""
 
 
-def _mode_cells(mode: ReportedMode) -> tuple[Cell, ...]:
+def _mode_cells(mode: EstimatedMode) -> tuple[Cell, ...]:
     """Return the cells of a mode's frequency and damping ratio, without the mode's number."""
     return *_quantity_cells(mode.frequency_hz)[:2], *_quantity_cells(mode.damping_ratio, 100.0)
 
@@ -131,7 +126,7 @@ def _modes_source(headline: Headline) -> str:
     )
 
 
-def _inertia_cells(participation: ReportedValue | None) -> tuple[Cell, Cell]:
+def _inertia_cells(participation: Estimate | None) -> tuple[Cell, Cell]:
     """Return the cells of a mode's effective inertia and of its standard deviation."""
     if participation is None:
         return number_cell(None), number_cell(None)
@@ -408,8 +403,8 @@ def correlations_table(whole_record: WholeRecord) -> Table:
 
 def _parameter_row(
     parameter_name: str,
-    parameter: ReportedValue,
-    parameters_with_scales: Mapping[str, ReportedValue],
+    parameter: Estimate,
+    parameters_with_scales: Mapping[str, Estimate],
     *,
     is_fixed: bool,
 ) -> tuple[Entry, ...]:
@@ -472,7 +467,7 @@ def _loss_factor_row(headline: Headline, loss_factor: ReportedLossFactor) -> tup
     return (loss_factor.damping, loss_symbol, loss_factor.omega_rad_s, value_cell, *further_cells)
 
 
-def _quantity_cells(reported_value: ReportedValue, display_factor: float = 1.0) -> tuple[Cell, ...]:
+def _quantity_cells(reported_value: Estimate, display_factor: float = 1.0) -> tuple[Cell, ...]:
     """Return the cells of a quantity, its standard deviation and the ends of its interval."""
     return estimate_cells(
         (reported_value.value, reported_value.std, *_interval_ends(reported_value)),
@@ -481,12 +476,12 @@ def _quantity_cells(reported_value: ReportedValue, display_factor: float = 1.0) 
     )
 
 
-def _interval_ends(reported_value: ReportedValue) -> tuple[float | None, float | None]:
+def _interval_ends(reported_value: Estimate) -> tuple[float | None, float | None]:
     """Return the ends of a quantity's 95 % interval; None twice without an interval."""
     return reported_value.interval_95 or (None, None)
 
 
-def _reason_notes(reported_values: Iterable[ReportedValue]) -> tuple[str, ...]:
+def _reason_notes(reported_values: Iterable[Estimate]) -> tuple[str, ...]:
     """Return one note for each different reason for which values are marked as not reported."""
     flag_texts = dict.fromkeys(
         reported_value.flag for reported_value in reported_values if reported_value.flag is not None

@@ -22,9 +22,10 @@ if TYPE_CHECKING:
 
     from rich.console import RenderableType
 
-    from analysis.identify.headline import Headline, ReportedLossFactor, ReportedMode, ReportedValue
+    from analysis.identify.headline import Headline, ReportedLossFactor
     from analysis.report.table import Table
     from analysis.results import RecordResult, WholeRecord
+    from rigd.estimates import Estimate, EstimatedMode
 
 _WIDTH_CHARACTERS: Final = 120
 """Width of plain text in characters."""
@@ -258,13 +259,13 @@ def damping_sentences(headline: Headline) -> tuple[str, ...]:
     return tuple(damping_texts)
 
 
-def _mode_text(mode: ReportedMode) -> str:
+def _mode_text(mode: EstimatedMode) -> str:
     """Return a mode's damping ratio and frequency as text."""
     damping_ratio = mode.damping_ratio
     return f"{_percent_text(damping_ratio)} at {mode.frequency_hz.value:.4g} Hz"
 
 
-def _percent_text(damping_ratio: ReportedValue) -> str:
+def _percent_text(damping_ratio: Estimate) -> str:
     """Return a damping ratio in percent as text, with its interval unless it is flagged."""
     value_cell, lower_cell, upper_cell = estimate_cells(
         (damping_ratio.value, *(damping_ratio.interval_95 or (None, None))),

@@ -102,7 +102,7 @@ def excited_band_hz(record: Record, analysis: RecordAnalysis) -> Band | None:
     )
 
 
-class Estimate(Protocol):
+class FittedPlant(Protocol):
     """Fitted plant with the covariance of its parameters; a `RecordFit` is one."""
 
     @property
@@ -128,7 +128,7 @@ class Estimate(Protocol):
 
 @dataclass(frozen=True, slots=True)
 class NearlyUniformBeam:
-    """Beam estimated with a tolerance of its geometry, in the form of an `Estimate`.
+    """Beam estimated with a tolerance of its geometry, in the form of an `FittedPlant`.
 
     Attributes
     ----------
@@ -162,7 +162,7 @@ class NearlyUniformBeam:
         )
 
 
-def loss_estimate(whole_record: WholeRecord) -> Estimate | None:
+def loss_estimate(whole_record: WholeRecord) -> FittedPlant | None:
     """Return the beam whose loss factors are drawn; None if no beam explains the losses."""
     headline = whole_record.headline
     if headline.tolerant is not None:
@@ -230,12 +230,12 @@ class ResponseBand:
         return _logarithmic_limits(np.abs(self.response), self.log_magnitude_std)
 
 
-def response_band(fit: Estimate, frequency_hz: Real) -> ResponseBand:
+def response_band(fit: FittedPlant, frequency_hz: Real) -> ResponseBand:
     """Return a fit's frequency response with the uncertainty that follows from its covariance.
 
     Parameters
     ----------
-    fit : Estimate
+    fit : FittedPlant
         Fitted plant with the covariance of its parameters.
     frequency_hz : ndarray, shape (n,)
         Positive.
@@ -365,12 +365,12 @@ class LossFactors:
     total: LossFactor
 
 
-def loss_factors(fit: Estimate, frequency_hz: Real) -> LossFactors:
+def loss_factors(fit: FittedPlant, frequency_hz: Real) -> LossFactors:
     """Return internal, external and total loss factor of a fit, with their uncertainties.
 
     Parameters
     ----------
-    fit : Estimate
+    fit : FittedPlant
         Fitted plant with the covariance of its parameters.
     frequency_hz : ndarray, shape (n,)
         Positive.
@@ -456,7 +456,7 @@ def _loss_with_slopes(
     return quadrature_part / real_part, (1 / real_part, slope_by_order)
 
 
-def _rows_by_parameter(fit: Estimate, slopes_by_name: dict[str, Real], point_count: int) -> Real:
+def _rows_by_parameter(fit: FittedPlant, slopes_by_name: dict[str, Real], point_count: int) -> Real:
     """Return slopes as rows (k, n) in the order of the parameters in the fit's covariance.
 
     A parameter without slopes has a row of zeros.

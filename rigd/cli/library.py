@@ -18,11 +18,11 @@ from rigd.cli.options import (
     progress,
 )
 from rigd.printable import printable, readable_message
-from rigd.units import with_half_width
 
 if TYPE_CHECKING:
+    from rigd.estimates import Change, Estimate, EstimatedMode
     from rigd.library import SessionRow
-    from rigd.library.trend import ModeChange, ModeTrend, Quantity, TrendPoint
+    from rigd.library.trend import ModeTrend, TrendPoint
 
 _MAX_TEXT_WIDTH: Final = 24
 """Largest width of a text in a table, in characters."""
@@ -206,11 +206,10 @@ def _session_lines(session_rows: "list[SessionRow]") -> Iterator[str]:
             yield f"{printable(row.path.name)}: {row.problem}"
 
 
-def _mode_text(mode: dict[str, Any]) -> str:
+def _mode_text(mode: "EstimatedMode") -> str:
     """Format a mode's frequency and damping ratio; a "?" marks values that an analysis doubts."""
-    flag_mark = "?" if mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"] else ""
-    frequency_hz, damping = mode["frequency_hz"]["value"], mode["damping_ratio"]["value"]
-    return f"{frequency_hz:.4g} Hz {100 * damping:.3g} %{flag_mark}"
+    flag_mark = "?" if mode.flag else ""
+    return f"{mode.frequency_hz.value:.4g} Hz {100 * mode.damping_ratio.value:.3g} %{flag_mark}"
 
 
 def _validity_text(row: "SessionRow") -> str:
@@ -250,11 +249,11 @@ def _trend_lines(trends: "list[ModeTrend]") -> Iterator[str]:
                     _local_start(trend_point.row),
                     _quantity_text(trend_point.frequency_hz),
                     _change_text(
-                        trend_point.frequency_change, mode_trend.points[0].frequency_hz["value"]
+                        trend_point.frequency_change, mode_trend.points[0].frequency_hz.value
                     ),
                     _quantity_text(trend_point.damping_ratio, 100),
                     _change_text(
-                        trend_point.damping_change, mode_trend.points[0].damping_ratio["value"]
+                        trend_point.damping_change, mode_trend.points[0].damping_ratio.value
                     ),
                     _interval_plot(trend_point, lowest_hz, highest_hz),
                     _validity_text(trend_point.row),
@@ -276,7 +275,7 @@ def _frequency_limits(trend: "ModeTrend") -> tuple[float, float]:
     interval_ends_hz = [
         end
         for trend_point in trend.points
-        for end in trend_point.frequency_hz["interval_95"] or [trend_point.frequency_hz["value"]]
+        for end in trend_point.frequency_hz.interval_95 or [trend_point.frequency_hz.value]
     ]
     return min(interval_ends_hz), max(interval_ends_hz)
 
@@ -294,9 +293,9 @@ def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> 
             _PLOT_WIDTH - 1,
         )
 
-    frequency_value_hz = point.frequency_hz["value"]
+    frequency_value_hz = point.frequency_hz.value
     first_column, last_column = map(
-        column_of, point.frequency_hz["interval_95"] or (frequency_value_hz, frequency_value_hz)
+        column_of, point.frequency_hz.interval_95 or (frequency_value_hz, frequency_value_hz)
     )
     plot_characters = [
         "─" if first_column <= column_index <= last_column else " "
@@ -306,13 +305,12 @@ def _interval_plot(point: "TrendPoint", lowest_hz: float, highest_hz: float) -> 
     return "".join(plot_characters)
 
 
-def _quantity_text(quantity: "Quantity", scale: float = 1.0) -> str:
+def _quantity_text(estimate: "Estimate", scale: float = 1.0) -> str:
     """Format a value with the half-width of its 95 % interval; "?" marks a doubtful one."""
-    value_text = with_half_width(quantity["value"], quantity["interval_95"], scale)
-    return f"{value_text} ?" if quantity["flag"] else value_text
+    return estimate.text(scale) + (" ?" if estimate.flag else "")
 
 
-def _change_text(change: "ModeChange | None", first_value: float) -> str:
+def _change_text(change: "Change | None", first_value: float) -> str:
     """Format a mode's change in per cent of its first value; "*" marks a significant change."""
     if change is None or first_value == 0:
         return ""

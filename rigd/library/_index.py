@@ -222,7 +222,7 @@ def _column_values(row: SessionRow) -> list[object]:
         row_field.name: getattr(row, row_field.name) for row_field in fields(row)
     }
     values_by_name["start_utc"] = None if row.start_utc_ns is None else _iso_time(row.start_utc_ns)
-    values_by_name["modes"] = json.dumps(row.modes)
+    values_by_name["modes"] = json.dumps(row.mode_documents())
     values_by_name["validity"] = json.dumps(row.validity)
     values_by_name["meta"] = json.dumps(row.meta)
     values_by_name["report"] = row.report and os.fspath(row.report.relative_to(row.path.parent))

@@ -8,10 +8,11 @@ from math import isfinite
 from pathlib import Path
 from typing import Any, Final
 
+from rigd.estimates import EstimatedMode, modes_from_json
 from rigd.printable import printable
 from rigd.runtime import read_plain_file
 from rigd.session import Validity
-from rigd.session.quick_look import modes_of, read_quick_look
+from rigd.session.quick_look import read_quick_look
 
 SESSION_SUFFIX: Final = ".mcap"
 """File name suffix of a session file."""
@@ -33,7 +34,6 @@ _MOST_META_ENTRIES: Final = 100
 _MOST_COUNT_DIGITS: Final = 18
 """Number of digits that every count of up to 64 bits may have."""
 
-Mode = dict[str, Any]
 """Mode of a session as in JSON documents."""
 Document = dict[str, Any]
 """JSON object."""
@@ -82,11 +82,8 @@ class SessionRow:
     """Number of ticks with a late wake-up."""
     lost: int | None = None
     """Number of samples that were measured but not recorded."""
-    modes: tuple[Mode, ...] = ()
-    """Modes of the last report or, without a report, of the quick look.
-
-    A mode is an object with ``frequency_hz``, ``damping_ratio`` and ``participation`` (or None),
-    each with ``value``, ``std``, ``interval_95`` and ``flag``, and with ``source``."""
+    modes: tuple[EstimatedMode, ...] = ()
+    """Modes of the last report or, without a report, of the quick look."""
     validity: Document | None = None
     """Validity of the linear model for the modes, as `rigd.session.Validity.as_json`; None without
     modes."""
@@ -101,7 +98,19 @@ class SessionRow:
         """Return the row as a dictionary for JSON."""
         document = {row_field.name: getattr(self, row_field.name) for row_field in fields(self)}
         report_path = None if self.report is None else str(self.report)
-        return document | {"path": str(self.path), "report": report_path, "modes": list(self.modes)}
+        return document | {
+            "path": str(self.path),
+            "report": report_path,
+            "modes": self.mode_documents(),
+        }
+
+    def mode_documents(self) -> list[Document]:
+        """Return the modes as JSON objects, without their numbers."""
+        documents = [mode.as_json() for mode in self.modes]
+        return [
+            {key: value for key, value in document.items() if key not in ("mode", "shown")}
+            for document in documents
+        ]
 
 
 def read_row(
@@ -246,7 +255,7 @@ def _modes_of_results(quick_look: Path | None, report_folder: Path | None) -> Do
     )
 
 
-def _with_validity(modes: tuple[Mode, ...], document: object) -> Document:
+def _with_validity(modes: tuple[EstimatedMode, ...], document: object) -> Document:
     """Return modes with the validity that a document states; empty without modes."""
     if not modes:
         return {}
@@ -268,16 +277,9 @@ def _list_in_document(document: object, key: str) -> list[object]:
     return listed_value if isinstance(listed_value, list) else []
 
 
-def usable_modes(mode_list: object) -> tuple[Mode, ...]:
+def usable_modes(mode_list: object) -> tuple[EstimatedMode, ...]:
     """Return the modes of a list that are visible in the record and have finite numbers."""
-    return tuple(
-        {
-            quantity_key: mode_document[quantity_key]
-            for quantity_key in ("frequency_hz", "damping_ratio", "participation", "source")
-        }
-        for mode_document in modes_of(mode_list)
-        if mode_document["shown"]
-    )
+    return tuple(mode for mode in modes_from_json(mode_list) if mode.shown)
 
 
 def _finite_or_none(number: float) -> float | None:

@@ -1,34 +1,17 @@
 """Changes of a specimen's modes over its sessions, with a test of their significance."""
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass
-from math import hypot, log
+from math import log
 from typing import Any, Final
 
+from rigd.estimates import Change, Estimate, change_between
 from rigd.library._row import SessionRow
 
 _MOST_LOG_FREQUENCY_RATIO: Final = log(1.25)
 """Largest logarithm of the frequency ratio of the same mode in two sessions.
 
 Modes of a beam are further apart."""
-
-_SIGNIFICANCE_HALF_WIDTHS: Final = 3.0 / 1.96
-"""Ratio of three standard deviations to the half-width of a 95 % interval."""
-
-Quantity = Mapping[str, Any]
-"""Frequency or damping ratio of a mode: ``value``, ``std``, ``interval_95``, ``flag``."""
-
-
-@dataclass(frozen=True, slots=True)
-class ModeChange:
-    """Change of a mode's frequency or damping ratio between two sessions, and if significant."""
-
-    difference: float
-    """Value in the later session minus value in the earlier one, in the unit of the quantity."""
-    significant: bool | None
-    """Whether the difference exceeds three standard deviations.
-
-    None if this is unknown, because an interval is missing or a value is flagged."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,13 +20,13 @@ class TrendPoint:
 
     row: SessionRow
     """Session in the library."""
-    frequency_hz: Quantity
+    frequency_hz: Estimate
     """Natural frequency of the mode."""
-    damping_ratio: Quantity
+    damping_ratio: Estimate
     """Damping ratio of the mode."""
-    frequency_change: ModeChange | None
+    frequency_change: Change | None
     """Change of the frequency since the mode's first session; None for that session."""
-    damping_change: ModeChange | None
+    damping_change: Change | None
     """Change of the damping ratio since the mode's first session; None for that session."""
 
 
@@ -62,59 +45,15 @@ class ModeTrend:
                     "id": point.row.id,
                     "path": str(point.row.path),
                     "start_utc_ns": point.row.start_utc_ns,
-                    "frequency_hz": point.frequency_hz,
-                    "damping_ratio": point.damping_ratio,
+                    "frequency_hz": point.frequency_hz.as_json(),
+                    "damping_ratio": point.damping_ratio.as_json(),
                     "validity": point.row.validity,
-                    "frequency_change": _change_json(point.frequency_change),
-                    "damping_change": _change_json(point.damping_change),
+                    "frequency_change": point.frequency_change and point.frequency_change.as_json(),
+                    "damping_change": point.damping_change and point.damping_change.as_json(),
                 }
                 for point in self.points
             ]
         }
-
-
-def change_between(earlier_quantity: Quantity, later_quantity: Quantity) -> ModeChange:
-    """Return the change of a frequency or damping ratio between two sessions.
-
-    Parameters
-    ----------
-    earlier_quantity, later_quantity
-        Quantity in the earlier and in the later session.
-
-    Returns
-    -------
-    Change
-
-    Notes
-    -----
-    Both errors are independent. The half-width of the 95 % interval of the difference is the root
-    of the sum of the squared half-widths, each on the side of the other value. A change is
-    significant beyond three standard deviations, 1.53 times this half-width, because a trend has
-    many changes and one in twenty exceeds a 95 % interval by chance.
-
-    Examples
-    --------
-    >>> from rigd.library.trend import change_between
-    >>> before = {"value": 2.60, "interval_95": [2.59, 2.61]}
-    >>> change_between(before, {"value": 2.63, "interval_95": [2.62, 2.64]}).significant
-    True
-    """
-    difference = later_quantity["value"] - earlier_quantity["value"]
-    if any(
-        quantity.get("interval_95") is None or quantity.get("flag")
-        for quantity in (earlier_quantity, later_quantity)
-    ):
-        return ModeChange(difference, None)
-    lower_quantity, higher_quantity = (
-        (earlier_quantity, later_quantity)
-        if difference >= 0
-        else (later_quantity, earlier_quantity)
-    )
-    half_width_95 = hypot(
-        lower_quantity["interval_95"][1] - lower_quantity["value"],
-        higher_quantity["value"] - higher_quantity["interval_95"][0],
-    )
-    return ModeChange(difference, abs(difference) > _SIGNIFICANCE_HALF_WIDTHS * half_width_95 > 0.0)
 
 
 def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
@@ -136,11 +75,8 @@ def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
     for row in sorted(session_rows, key=lambda row: (row.start_utc_ns or 0, row.id)):
         assigned: set[int] = set()
         for mode in row.modes:
-            frequency_estimate, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
             distances = {
-                trend_index: abs(
-                    log(frequency_estimate["value"] / points[-1].frequency_hz["value"])
-                )
+                trend_index: abs(log(mode.frequency_hz.value / points[-1].frequency_hz.value))
                 for trend_index, points in enumerate(trends)
                 if trend_index not in assigned
             }
@@ -150,20 +86,13 @@ def mode_trends(session_rows: Iterable[SessionRow]) -> list[ModeTrend]:
                 trends.append([])
             assigned.add(nearest_trend)
             points = trends[nearest_trend]
-            changes: tuple[ModeChange | None, ModeChange | None] = (None, None)
+            changes: tuple[Change | None, Change | None] = (None, None)
             if points:
                 first_point = points[0]
                 changes = (
-                    change_between(first_point.frequency_hz, frequency_estimate),
-                    change_between(first_point.damping_ratio, damping_estimate),
+                    change_between(first_point.frequency_hz, mode.frequency_hz),
+                    change_between(first_point.damping_ratio, mode.damping_ratio),
                 )
-            points.append(TrendPoint(row, frequency_estimate, damping_estimate, *changes))
-    trends.sort(key=lambda points: float(points[0].frequency_hz["value"]))
+            points.append(TrendPoint(row, mode.frequency_hz, mode.damping_ratio, *changes))
+    trends.sort(key=lambda points: points[0].frequency_hz.value)
     return [ModeTrend(tuple(points)) for points in trends]
-
-
-def _change_json(change: ModeChange | None) -> dict[str, Any] | None:
-    """Return a change as a dictionary for JSON; None if there is none."""
-    if change is None:
-        return None
-    return {"difference": change.difference, "significant": change.significant}

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from rigd.engine.messages import FitReport, PlannedSegment, SearchEnded
 from rigd.engine.reference import ReferenceWriter
 from rigd.errors import RigdError
+from rigd.estimates import Estimate
 from rigd.excitation import BAND_HZ, PAUSE_S, SHORTEST_S, BeamEstimate, PrecisionSearch, Segment
 from rigd.excitation.experiment_design import expected_precisions, next_segment
 from rigd.excitation.targets import Target
@@ -102,14 +103,16 @@ def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[Targe
     """Yield the estimates of one requested quantity, one for each mode to which it applies."""
     quantity_key = _MODAL_QUANTITY_KEYS.get(target.quantity)
     if quantity_key is None:
-        yield _estimate_of_entry(target, document.get("parameters", {}).get(target.quantity))
+        parameters = document.get("parameters", {})
+        yield _target_estimate(target, Estimate.from_json(parameters.get(target.quantity)))
         return
     # The fit also reports modes above the band, which no segment excites.
     modes_in_band = [m for m in document["modes"] if (m["frequency_hz"]["value"] or 0.0) < BAND_HZ]
     matching_modes = [m for m in modes_in_band if target.mode in (None, m["mode"])]
     for mode_document in matching_modes:
-        target_estimate = _estimate_of_entry(
-            replace(target, mode=int(mode_document["mode"])), mode_document[quantity_key]
+        target_estimate = _target_estimate(
+            replace(target, mode=int(mode_document["mode"])),
+            Estimate.from_json(mode_document[quantity_key]),
         )
         yield (
             target_estimate
@@ -121,25 +124,19 @@ def _estimates_of(document: Mapping[str, Any], target: Target) -> Iterator[Targe
         yield TargetEstimate(target.quantity, target.mode, None, inf, target.std, missing_reason)
 
 
-def _estimate_of_entry(target: Target, entry: Mapping[str, Any] | None) -> TargetEstimate:
-    """Return the estimate of a requested quantity from its entry in the fit's document."""
+def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimate:
+    """Return the estimate of a requested quantity."""
     quantity_and_mode = target.quantity, target.mode
-    if entry is None or entry["value"] is None:
+    if estimate is None:
         return TargetEstimate(
             *quantity_and_mode, None, inf, target.std, "it is not part of what was found"
         )
-    estimated_value, estimated_std, doubt_text = (
-        float(entry["value"]),
-        entry["std"],
-        entry["flag"] or "",
-    )
-    target_std = target.std * (abs(estimated_value) if target.relative else 1.0)
     return TargetEstimate(
         *quantity_and_mode,
-        estimated_value,
-        inf if doubt_text or estimated_std is None else float(estimated_std),
-        target_std,
-        doubt_text,
+        estimate.value,
+        inf if estimate.flag or estimate.std is None else estimate.std,
+        target.std * (abs(estimate.value) if target.relative else 1.0),
+        estimate.flag or "",
     )
 
 

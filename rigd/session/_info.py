@@ -11,12 +11,12 @@ from typing import Any, Final, TypeVar
 
 import numpy as np
 
+from rigd.estimates import modes_from_json
 from rigd.printable import counts_text, grouped, listed, printable
 from rigd.session import limits
 from rigd.session._errors import SessionError
 from rigd.session._reader import ORDER_AND_FLAG_FIELDS, LoggedEvent, Session, read_session
 from rigd.session.layout import Status
-from rigd.session.online_fit import mode_line
 from rigd.session.quick_look import fit_of
 from rigd.session.touches import touch_line, touches_of
 from rigd.units import suffix_of, unit_of
@@ -396,9 +396,9 @@ def _outcome_rows(outcome: dict[str, str], *, is_whole: bool) -> Iterator[tuple[
     yield "outcome", f"{outcome_text}. {reason_text}" if reason_text else outcome_text
     for touch in touches_of(outcome):
         yield "touch", touch_line(touch).removeprefix("Touch ")
-    for mode in (fit_of(outcome) or {"modes": []})["modes"]:
-        if mode["shown"]:
-            yield "fit", mode_line(mode)
+    for mode in modes_from_json((fit_of(outcome) or {}).get("modes")):
+        if mode.shown:
+            yield "fit", mode.line()
     yield from (
         _rounded_row(key, outcome_value)
         for key, outcome_value in outcome.items()

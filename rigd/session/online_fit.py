@@ -1,45 +1,12 @@
-"""Text for the estimates of a session's fit while it runs, and for those of a quick look."""
+"""Text for the estimates of a session's fit while it runs."""
 
-from collections.abc import Iterable, Mapping
-from typing import Any, Final
+from collections.abc import Mapping
+from math import isnan
+from typing import Any
 
-from rigd.printable import listed
+from rigd.estimates import EstimatedMode, modes_from_json, unseen_modes
 from rigd.session._validity import Validity
-from rigd.units import decimals, with_half_width
-
-_KG_MM2_PER_KG_M2: Final = 1e6
-"""Conversion factor from kg m² to kg mm²."""
-
-
-def mode_line(mode: Mapping[str, Any]) -> str:
-    """Return one line of text with frequency, damping and inertia of an estimated mode.
-
-    Parameters
-    ----------
-    mode
-        Mode in the format of quick looks and online fits.
-
-    Examples
-    --------
-    >>> from rigd.session.online_fit import mode_line
-    >>> hz = {"value": 2.5699, "interval_95": [2.5687, 2.5711]}
-    >>> print(mode_line({"mode": 1, "frequency_hz": hz,
-    ...                  "damping_ratio": {"value": 0.00909, "interval_95": None}}))
-    mode 1: 2.5699 ± 0.0012 Hz, damping 0.909 %
-    """
-    hz, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
-    mode_text = (
-        f"mode {mode['mode']}: {with_half_width(hz['value'], hz['interval_95'])} Hz, "
-        "damping "
-        f"{with_half_width(damping_estimate['value'], damping_estimate['interval_95'], 100.0)} %"
-    )
-    inertia_estimate = mode.get("participation")
-    if inertia_estimate is None:
-        return mode_text
-    inertia_text = with_half_width(
-        inertia_estimate["value"], inertia_estimate["interval_95"], _KG_MM2_PER_KG_M2
-    )
-    return f"{mode_text}, inertia {inertia_text} kg·mm²"
+from rigd.units import decimals
 
 
 def estimate_lines(
@@ -60,62 +27,29 @@ def estimate_lines(
     validity = Validity.of_document(fit_document.get("validity")).short
     heading = f"± 95 %, statistical only; tip slope {validity}"
     report_lines = [f"After {fit_document['duration_s']:.1f} s ({heading}):"]
+    modes = modes_from_json(fit_document["modes"])
     earlier_modes = {
-        mode["mode"]: mode for mode in (earlier_document or {}).get("modes", ()) if mode["shown"]
+        mode.number: mode
+        for mode in modes_from_json((earlier_document or {}).get("modes"))
+        if mode.shown
     }
-    for mode in fit_document["modes"]:
-        if mode["shown"]:
-            change_text = (
-                _change_text(earlier_modes[mode["mode"]], mode)
-                if mode["mode"] in earlier_modes
-                else ""
-            )
-            doubt_text = mode["damping_ratio"]["flag"] or mode["frequency_hz"]["flag"]
-            report_lines.append(
-                f"  {mode_line(mode)}{change_text}"
-                f"{f' (doubtful: {doubt_text})' if doubt_text else ''}"
-            )
-    unseen_text = unseen_modes(fit_document["modes"])
-    if unseen_text:
+    for mode in modes:
+        if mode.shown:
+            earlier_mode = earlier_modes.get(mode.number)
+            change_text = "" if earlier_mode is None else _change_text(earlier_mode, mode)
+            doubt_text = f" (doubtful: {mode.flag})" if mode.flag else ""
+            report_lines.append(f"  {mode.line()}{change_text}{doubt_text}")
+    if unseen_text := unseen_modes(modes):
         report_lines.append(f"  not visible so far: {unseen_text}")
     if uniform_beam := Validity.of_document(fit_document.get("validity")).uniform_beam:
         report_lines.append(f"  {uniform_beam.sentence}")
     return [*report_lines, *findings]
 
 
-def unseen_modes(modes: Iterable[Mapping[str, Any]]) -> str:
-    """Return text that names the modes that are not visible in the record so far.
-
-    It is empty if the record shows all modes.
-
-    Parameters
-    ----------
-    modes
-        Modes in the format of the online fit's estimates.
-
-    Examples
-    --------
-    >>> from rigd.session.online_fit import unseen_modes
-    >>> unseen_modes([{"mode": n, "shown": n == 1} for n in (1, 2, 3)])
-    'modes 2 and 3'
-    """
-    unseen_numbers = [str(mode["mode"]) for mode in modes if not mode.get("shown", True)]
-    return (
-        f"mode{'s' if len(unseen_numbers) > 1 else ''} {listed(unseen_numbers)}"
-        if unseen_numbers
-        else ""
-    )
-
-
-def _change_text(earlier_mode: Mapping[str, Any], mode: Mapping[str, Any]) -> str:
+def _change_text(earlier_mode: EstimatedMode, mode: EstimatedMode) -> str:
     """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
-    hz, damping_estimate = mode["frequency_hz"], mode["damping_ratio"]
-    shift_hz = hz["value"] - earlier_mode["frequency_hz"]["value"]
-    earlier_damping = earlier_mode["damping_ratio"]["value"]
-    decimal_digits = decimals(hz["std"]) if hz["std"] else 4
-    relative_change = (
-        f", {100 * (damping_estimate['value'] / earlier_damping - 1):+.2g} %"
-        if earlier_damping
-        else ""
-    )
-    return f"; change {shift_hz:+.{decimal_digits}f} Hz{relative_change}"
+    change_hz = mode.frequency_hz.value - earlier_mode.frequency_hz.value
+    decimal_digits = decimals(mode.frequency_hz.std) if mode.frequency_hz.std else 4
+    change_percent = mode.damping_ratio.percent_above(earlier_mode.damping_ratio)
+    percent_text = "" if isnan(change_percent) else f", {change_percent:+.2g} %"
+    return f"; change {change_hz:+.{decimal_digits}f} Hz{percent_text}"

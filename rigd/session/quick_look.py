@@ -12,6 +12,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, Final
 
+from rigd.estimates import Estimate, modes_from_json
 from rigd.printable import printable
 from rigd.session._validity import Validity
 from rigd.units import finite_number
@@ -27,8 +28,6 @@ _MAX_FILE_BYTES: Final = 1 << 20
 """Maximum length in bytes of a quick look that is read."""
 _NONBLOCKING_FLAGS: Final = getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 """Flags for opening a file without blocking: a pipe then reads as empty."""
-_MAX_MODES: Final = 20
-"""Maximum number of modes that are read from a document."""
 _MAX_TEXT_CHARACTERS: Final = 1000
 """Maximum number of characters of a text that are read from a document."""
 _MAX_FILES_READ: Final = 200
@@ -37,7 +36,6 @@ _TEXT_KEYS: Final = ("file", "session_id", "specimen", "excitation")
 _TIME_KEYS: Final = ("start_utc_ns", "made_utc_ns")
 _LINE_LIST_KEYS: Final = ("flags", "text")
 _PARSING_ERRORS: Final = (OSError, ValueError, TypeError, KeyError, OverflowError, RecursionError)
-_MODE_SOURCES: Final = ("modal", "beam")
 _CURVE_KEYS: Final = ("frequency_hz", "magnitude", "phase_rad")
 _CONFIDENCE_BAND_KEYS: Final = ("magnitude_low_95", "magnitude_high_95")
 
@@ -80,7 +78,7 @@ def read_quick_look(path: Path) -> Document | None:
         return dict(document) | {
             **{key_name: _checked_text(document.get(key_name) or "") for key_name in _TEXT_KEYS},
             **{key_name: int(document.get(key_name) or 0) for key_name in _TIME_KEYS},
-            "modes": modes_of(document.get("modes")),
+            "modes": [mode.as_json() for mode in modes_from_json(document.get("modes"))],
             "validity": Validity.of_document(document.get("validity")).as_json(),
             "response": _valid_response(document.get("response")),
             "model": _valid_curves(document.get("model"), (*_CURVE_KEYS, *_CONFIDENCE_BAND_KEYS)),
@@ -166,50 +164,6 @@ def _file_beginning(path: Path) -> bytes:
         return opened_file.read(_MAX_FILE_BYTES)
 
 
-def modes_of(documents: object) -> list[Document]:
-    """Return the valid modes of the beam from the JSON list of a quick look or a report.
-
-    Parameters
-    ----------
-    documents
-        Value of the key ``modes`` of a document from any source.
-
-    Returns
-    -------
-    list of dict
-        For each mode: ``mode`` (its number), ``shown`` (whether the record shows it), ``source``
-        ("modal", "beam" or None), and ``frequency_hz``, ``damping_ratio`` and ``participation``
-        (kg m², or None), each with ``value``, ``std``, ``interval_95`` and ``flag``. Modes without
-        finite numbers or without a positive frequency are left out.
-    """
-    return list(_valid_modes(documents)) if isinstance(documents, list) else []
-
-
-def _valid_modes(mode_documents: list[object]) -> Iterator[Document]:
-    """Yield the entries of a list of JSON values that validly describe a mode of the beam."""
-    for mode_index, mode in enumerate(mode_documents[:_MAX_MODES], start=1):
-        if isinstance(mode, dict):
-            mode_number, is_shown = mode.get("mode", mode_index), mode.get("shown") is not False
-            frequency_estimate, damping_estimate = (
-                _valid_estimate(mode.get(k)) for k in ("frequency_hz", "damping_ratio")
-            )
-            if (
-                type(mode_number) is int
-                and frequency_estimate is not None
-                and frequency_estimate["value"] > 0
-                and damping_estimate is not None
-            ):
-                mode_source = mode.get("source")
-                yield {
-                    "mode": mode_number,
-                    "shown": is_shown,
-                    "frequency_hz": frequency_estimate,
-                    "damping_ratio": damping_estimate,
-                    "participation": _valid_estimate(mode.get("participation")),
-                    "source": mode_source if mode_source in _MODE_SOURCES else None,
-                }
-
-
 def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     """Return the result of the fit that was made during a session, or None if there is none.
 
@@ -222,8 +176,8 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
     -------
     dict or None
         ``duration_s`` of the fitted record, ``problem``, ``validity`` from `Validity.as_json`,
-        ``modes`` from `modes_of`, ``parameters`` by name, and ``findings``. For a session that
-        ended when a precision was reached, ``search`` contains the ``reason`` of its end, and
+        ``modes`` and ``parameters`` by name as in `rigd.estimates`, and ``findings``. For a session
+        that ended when a precision was reached, ``search`` contains the ``reason`` of its end, and
         ``targets`` with name, quantity, mode, value, and estimated and requested deviation.
     """
     try:
@@ -233,7 +187,7 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
         )
         duration_s = finite_number(fit_document["duration_s"])
         parameter_estimates = {
-            _checked_text(parameter_name): _valid_estimate(estimate_document)
+            _checked_text(parameter_name): Estimate.from_json(estimate_document)
             for parameter_name, estimate_document in fit_document.get("parameters", {}).items()
         }
         search_document = fit_document.get("search") or {}
@@ -241,11 +195,11 @@ def fit_of(outcome: Mapping[str, str] | None) -> Document | None:
             "duration_s": max(duration_s or 0.0, 0.0),
             "problem": _checked_text(fit_document.get("problem") or ""),
             "validity": Validity.of_document(fit_document.get("validity")).as_json(),
-            "modes": modes_of(fit_document.get("modes")),
+            "modes": [mode.as_json() for mode in modes_from_json(fit_document.get("modes"))],
             "parameters": {
-                parameter_name: estimate_document
-                for parameter_name, estimate_document in parameter_estimates.items()
-                if estimate_document is not None
+                parameter_name: estimate.as_json()
+                for parameter_name, estimate in parameter_estimates.items()
+                if estimate is not None
             },
             "findings": [
                 _checked_text(text_line) for text_line in fit_document.get("findings") or []
@@ -276,30 +230,6 @@ def _valid_targets(documents: object) -> Iterator[Document]:
                     "mode": mode if type(mode) is int else None,
                     **target_numbers,
                 }
-
-
-def _valid_estimate(estimate_document: object) -> Document | None:
-    """Return an estimate with value, standard deviation and interval, or None if it is invalid."""
-    if (
-        not isinstance(estimate_document, dict)
-        or (estimated_value := finite_number(estimate_document.get("value"))) is None
-    ):
-        return None
-    interval_bounds = estimate_document.get("interval_95")
-    confidence_interval = (
-        [finite_number(end) for end in interval_bounds]
-        if isinstance(interval_bounds, list) and len(interval_bounds) == 2
-        else None
-    )
-    flag_text = estimate_document.get("flag")
-    return {
-        "value": estimated_value,
-        "std": finite_number(estimate_document.get("std")),
-        "interval_95": None
-        if confidence_interval is None or None in confidence_interval
-        else confidence_interval,
-        "flag": _checked_text(flag_text) if isinstance(flag_text, str) else None,
-    }
 
 
 def _valid_response(response_document: object) -> Document | None:

@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 import numpy.typing as npt
 
+from rigd.estimates import Estimate, EstimatedMode, modes_from_json, unseen_modes
 from rigd.session import Validity
-from rigd.session.online_fit import unseen_modes
-from rigd.units import suffix_of, unit_of, with_half_width, with_percentage
+from rigd.units import suffix_of, unit_of, with_percentage
 from rigd.view._session_info import plain
 from rigd.view.plots import GREY, ORANGE, SKY_BLUE, TIMELINE, Plot, PlotCurve, Source, Values
 
@@ -39,7 +39,7 @@ class _Quantity:
     name: str
     """Name of the quantity in the target precisions of a search."""
     key: str
-    """Key of the quantity in the JSON document of a mode."""
+    """Name of the quantity among the attributes of an `EstimatedMode`."""
     suffix: str
     """Suffix of the plot's component name in Rerun, which ends in the unit."""
     title: str
@@ -140,29 +140,26 @@ def fit_record(fit: Fit | None, mode_count: int) -> npt.NDArray[Any]:
         (target_precision["quantity"], target_precision["mode"]): target_precision["asked_std"]
         for target_precision in _targets(fit)
     }
-    for mode in fit.get("modes", ()):
-        for quantity in _QUANTITIES if mode["mode"] <= mode_count else ():
-            estimate = mode[quantity.key]
-            interval = estimate["interval_95"]
-            if not mode.get("shown", True) or estimate["flag"] or interval is None:
+    for mode in modes_from_json(fit.get("modes")):
+        for quantity in _QUANTITIES if mode.number <= mode_count else ():
+            estimate: Estimate = getattr(mode, quantity.key)
+            if not mode.shown or estimate.flag or estimate.interval_95 is None:
                 continue
-            mode_estimate, (lower_limit, upper_limit) = estimate["value"], interval
-            target_std = target_stds.get((quantity.name, mode["mode"]))
+            lower_limit, upper_limit = estimate.interval_95
+            target_std = target_stds.get((quantity.name, mode.number))
             target_half_width = np.nan
-            if target_std is not None and estimate["std"]:
-                target_half_width = (
-                    target_std * (upper_limit - lower_limit) / (2.0 * estimate["std"])
-                )
+            if target_std is not None and estimate.std:
+                target_half_width = target_std * (upper_limit - lower_limit) / (2.0 * estimate.std)
             field_values = np.array(
                 [
-                    mode_estimate - target_half_width,
-                    mode_estimate + target_half_width,
+                    estimate.value - target_half_width,
+                    estimate.value + target_half_width,
                     lower_limit,
                     upper_limit,
-                    mode_estimate,
+                    estimate.value,
                 ]
             )
-            fit_values[quantity.field(mode["mode"])] = quantity.factor * field_values
+            fit_values[quantity.field(mode.number)] = quantity.factor * field_values
     return fit_values
 
 
@@ -209,13 +206,13 @@ def fit_table(fit: Fit | None) -> str:
         paragraphs.append(
             f"**Fit of the first {fit['duration_s']:.1f} s** (± 95 %, statistical only)"
         )
-    mode_rows = [_mode_row(mode) for mode in fit.get("modes", ()) if mode.get("shown", True)]
+    modes = modes_from_json(fit.get("modes"))
+    mode_rows = [_mode_row(mode) for mode in modes if mode.shown]
     if mode_rows:
         paragraphs.append(
             _markdown_table("mode", "frequency (Hz)", "damping ratio (%)", table_rows=mode_rows)
         )
-    modes_not_visible = unseen_modes(fit.get("modes", ()))
-    if modes_not_visible:
+    if modes_not_visible := unseen_modes(modes):
         paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if mode_rows:
         validity = Validity.of_document(fit.get("validity"))
@@ -223,12 +220,12 @@ def fit_table(fit: Fit | None) -> str:
         if validity.uniform_beam is not None:
             paragraphs.append(validity.uniform_beam.sentence)
     table_rows = [
-        _parameter_row(*parameter_item) for parameter_item in fit.get("parameters", {}).items()
+        _parameter_row(name, estimate)
+        for name, document in fit.get("parameters", {}).items()
+        if (estimate := Estimate.from_json(document)) is not None
     ]
     if table_rows:
-        paragraphs.append(
-            _markdown_table("parameter", "value", table_rows=[row for row in table_rows if row])
-        )
+        paragraphs.append(_markdown_table("parameter", "value", table_rows=table_rows))
     paragraphs += [plain(sentence) for sentence in fit.get("findings", ())[:_MOST_FINDINGS]]
     return "\n\n".join(paragraphs)
 
@@ -264,30 +261,26 @@ def _target_row(target_precision: Mapping[str, Any]) -> tuple[str, ...]:
     )
 
 
-def _mode_row(mode_document: Mapping[str, Any]) -> tuple[str, ...]:
+def _mode_row(mode: EstimatedMode) -> tuple[str, ...]:
     """Return the table row of a mode: its number, frequency and damping ratio with intervals."""
-    frequency, damping_ratio = mode_document["frequency_hz"], mode_document["damping_ratio"]
     return (
-        str(mode_document["mode"]),
-        with_half_width(frequency["value"], frequency["interval_95"]) + _doubt_suffix(frequency),
-        with_half_width(damping_ratio["value"], damping_ratio["interval_95"], 100.0)
-        + _doubt_suffix(damping_ratio),
+        str(mode.number),
+        mode.frequency_hz.text() + _doubt_suffix(mode.frequency_hz),
+        mode.damping_ratio.text(100.0) + _doubt_suffix(mode.damping_ratio),
     )
 
 
-def _parameter_row(parameter_name: str, estimate: Mapping[str, Any]) -> tuple[str, ...]:
+def _parameter_row(parameter_name: str, estimate: Estimate) -> tuple[str, ...]:
     """Return the table row of a fitted parameter: its name, and its value with interval."""
-    parameter_value, interval_95 = estimate["value"], estimate["interval_95"]
-    if parameter_value is None:
-        return ()
+    interval_95 = estimate.interval_95
     # Small numbers, such as zeta, have a power of ten, the same for value and interval.
     magnitude = (
-        abs(parameter_value)
+        abs(estimate.value)
         if interval_95 is None
-        else max(abs(parameter_value), (interval_95[1] - interval_95[0]) / 2.0)
+        else max(abs(estimate.value), (interval_95[1] - interval_95[0]) / 2.0)
     )
     power_of_ten = 0 if magnitude == 0 or magnitude >= 1e-2 else int(np.floor(np.log10(magnitude)))
-    value_text = with_half_width(parameter_value, interval_95, 10.0**-power_of_ten)
+    value_text = estimate.text(10.0**-power_of_ten)
     if power_of_ten:
         value_text = f"({value_text})·10{str(power_of_ten).translate(_SUPERSCRIPTS)}"
     parameter_label = parameter_name.removesuffix(suffix_of(parameter_name)).replace("_", " ")
@@ -300,9 +293,9 @@ _SUPERSCRIPTS: Final = str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸
 """Translation table from digits and the minus sign to their superscript characters."""
 
 
-def _doubt_suffix(estimate: Mapping[str, Any]) -> str:
-    """Return why an estimate is doubtful, in brackets; an empty text if it is not."""
-    return f" (doubtful: {plain(estimate['flag'])})" if estimate.get("flag") else ""
+def _doubt_suffix(estimate: Estimate) -> str:
+    """Return the text appended to a doubtful estimate; empty for an estimate without a flag."""
+    return f" (doubtful: {plain(estimate.flag)})" if estimate.flag else ""
 
 
 def send_table(stream: "RecordingStream", fit: Fit | None) -> None:

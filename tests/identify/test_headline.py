@@ -5,10 +5,11 @@ from types import SimpleNamespace
 
 import pytest
 
-from analysis.identify.headline import ReportedValue, structures
+from analysis.identify.headline import structures
 from analysis.identify.profile_likelihood import LikelihoodProfile
 from analysis.identify.verdict import ORDER_NOT_DETERMINED_REASON, order_verdict
 from analysis.models import STRUCTURES
+from rigd.estimates import Estimate
 
 ALPHA = LikelihoodProfile(
     "alpha", "VI", (0.8, 0.9, 1.0), (9.0, 0.0, 12.0), 0.9, (0.9,), (0.85, 0.95), False, False, 0.0
@@ -31,7 +32,7 @@ class Fitted:
 
 
 def test_the_first_flag_stays():
-    number = ReportedValue(0.98, 0.01, (0.96, 1.0))
+    number = Estimate(0.98, 0.01, (0.96, 1.0))
     assert number.flagged(None) is number
     told = number.flagged(ORDER_NOT_DETERMINED_REASON).flagged("part of the record is unexplained")
     assert told.flag == ORDER_NOT_DETERMINED_REASON

@@ -7,7 +7,6 @@ import pytest
 
 from analysis.identify import fit_record
 from analysis.identify.drag_torque import DragLaw, DragResponse
-from analysis.identify.headline import ReportedValue
 from analysis.identify.scales import (
     SCALE_EXPONENTS,
     density_check,
@@ -16,6 +15,7 @@ from analysis.identify.scales import (
 )
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant, ResponseGrid
+from rigd.estimates import Estimate
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)
 DAMPING = Damping(zeta=7.1e-5, alpha=0.9, gamma=5.5e-2, lambda_=0.594)
@@ -108,15 +108,15 @@ def test_fits_to_scaled_data_go_with_the_scales(fits):
 def test_intervals_include_the_scales_in_quadrature():
     def told(value, relative):
         ends = value * math.exp(-1.96 * relative), value * math.exp(1.96 * relative)
-        return ReportedValue(value, relative * value, ends)
+        return Estimate(value, relative * value, ends)
 
     parameters = {
         "zeta": told(7e-5, 0.02),
         "gamma": told(0.05, 0.003),
         "density_over_stiffness": told(0.052, 4e-5),
         "bending_stiffness_n_m2": told(0.09, 7e-4),
-        "tool_inertia_kg_m2": ReportedValue(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
-        "tip_mass_kg": ReportedValue(1e-3, None, None, "the record does not determine it"),
+        "tool_inertia_kg_m2": Estimate(1e-6, 2e-6, (0.0, 1e-6 + 1.96 * 2e-6)),
+        "tip_mass_kg": Estimate(1e-3, None, None, "the record does not determine it"),
     }
     found = with_scale_uncertainty(
         parameters, {"torque_scale": 0.01, "length": 0.002, "density": 0.1}
@@ -148,7 +148,7 @@ def test_intervals_with_scales_hold_the_truth(fits):
     _, wrong = fits
     uncertainty = {"torque_scale": 0.03, "length": 0.02}
     parameters = {
-        name: ReportedValue(value, wrong.std[name], wrong.interval[name])
+        name: Estimate(value, wrong.std[name], wrong.interval[name])
         for name, value in wrong.parameters.items()
     }
     truth = {

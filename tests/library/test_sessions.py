@@ -29,8 +29,8 @@ def test_what_file_look_and_report_say_stands_in_the_row(
     assert row.duration_s == 1.01
     assert row.meta == {"temperature_c": 21.4, "batch": "7"}
     assert row.report == last / "report.html"
-    assert [each["frequency_hz"]["value"] for each in row.modes] == [2.61, 16.3]
-    assert row.modes[0]["damping_ratio"]["interval_95"] == pytest.approx([0.0045, 0.0055])
+    assert [each.frequency_hz.value for each in row.modes] == [2.61, 16.3]
+    assert row.modes[0].damping_ratio.interval_95 == pytest.approx([0.0045, 0.0055])
 
 
 def test_modes_come_with_the_validity_of_their_source(
@@ -62,7 +62,7 @@ def test_without_a_report_the_modes_are_of_the_look(record_briefly, write_quick_
     modes = [mode(2.5) | {"shown": True}, mode(16.3) | {"shown": False}]
     write_quick_look(record_briefly("first"), *modes)
     (row,) = list_sessions(tmp_path)
-    assert [each["frequency_hz"]["value"] for each in row.modes] == [2.5]
+    assert [each.frequency_hz.value for each in row.modes] == [2.5]
     assert row.report is None
 
 

@@ -5,12 +5,14 @@ from pathlib import Path
 import pytest
 from library_folders import DAY_NS, mode, quantity
 
+from rigd.estimates import Estimate, change_between, modes_from_json
 from rigd.library import SessionRow
-from rigd.library.trend import change_between, mode_trends
+from rigd.library.trend import mode_trends
 
 
 def row(day, *modes):
-    return SessionRow(f"day-{day}", Path(f"day-{day}.mcap"), 0, day * DAY_NS, modes=modes)
+    found = tuple(modes_from_json(list(modes)))
+    return SessionRow(f"day-{day}", Path(f"day-{day}.mcap"), 0, day * DAY_NS, modes=found)
 
 
 @pytest.mark.parametrize(
@@ -27,7 +29,7 @@ def row(day, *modes):
     ],
 )
 def test_a_change_is_significant_beyond_three_standard_deviations(before, after, beyond):
-    change = change_between(before, after)
+    change = change_between(Estimate.from_json(before), Estimate.from_json(after))
     assert change.difference == pytest.approx(after["value"] - before["value"])
     assert change.significant is beyond
 

@@ -2,7 +2,8 @@
 
 import json
 
-from rigd.session.online_fit import estimate_lines, mode_line
+from rigd.estimates import modes_from_json
+from rigd.session.online_fit import estimate_lines
 
 
 def quantity(value, half, flag=None) -> dict:
@@ -43,7 +44,7 @@ def test_lines_tell_modes_changes_doubts_and_findings():
     ]
     assert "change" not in "".join(estimate_lines(now))
     assert "tip slope unknown" in estimate_lines(before)[0]
-    assert mode_line(now["modes"][0]) in estimate_lines(now)[1]
+    assert modes_from_json(now["modes"])[0].line() in estimate_lines(now)[1]
 
 
 def test_lines_tell_why_there_is_no_estimate():

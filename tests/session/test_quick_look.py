@@ -10,11 +10,11 @@ from hypothesis import strategies as st
 from library_folders import mode, quantity
 from online_fits import online_fit
 
+from rigd.estimates import modes_from_json
 from rigd.session import BeamUniformity, Validity
 from rigd.session.quick_look import (
     fit_of,
     last_quick_look,
-    modes_of,
     quick_look_path,
     read_quick_look,
 )
@@ -131,12 +131,14 @@ def test_modes_without_their_numbers_are_left_out(tmp_path, modes):
     given = [*modes, whole] if isinstance(modes, list) else modes
     found = read_quick_look(write(tmp_path, "a", modes=given))["modes"]
     assert found == ([whole] if isinstance(modes, list) else [])
-    assert modes_of(given) == found
+    assert [each.as_json() for each in modes_from_json(given)] == found
 
 
 def test_an_interval_without_two_numbers_is_none():
-    (found,) = modes_of([mode(2.5) | {"frequency_hz": quantity(2.5, 0.1) | {"interval_95": [2]}}])
-    assert (found["frequency_hz"]["interval_95"], found["mode"], found["shown"]) == (None, 1, True)
+    (found,) = modes_from_json(
+        [mode(2.5) | {"frequency_hz": quantity(2.5, 0.1) | {"interval_95": [2]}}]
+    )
+    assert (found.frequency_hz.interval_95, found.number, found.shown) == (None, 1, True)
 
 
 @pytest.mark.parametrize(
