@@ -3,11 +3,15 @@
 Each rig has a beam whose density and stiffness differ from the profile's by up to a fifth, one of
 the seven structures of damping with modes of 0.1 to 3 %, torque noise of 3 to 20 mN·m. Four in
 five are no uniform beam in a vacuum: a clamp that gives way, a mass at the tip, both, or drag of
-the air. Each is asked for the damping of its modes as precisely as the modal model of a chirp of
-136 s would state it within the same range of slopes, by ``rigd run until --fast`` as an operator
-types it, and every number that is stated without a flag is compared with the truth.
+the air. With ``--uneven`` density and stiffness wander along the beam by 0.3 to 5 %, half of the
+beams are in air, and the rig is that of `finite_element_rig.py`.
+
+Each is asked for the damping of its modes as precisely as the modal model of a chirp of 136 s would
+state it within the same range of slopes, by ``rigd run until --fast`` as an operator types it, and
+every number that is stated without a flag is compared with the truth.
 
     python benchmarks/bench_until.py --rigs 100 --jsonl results.jsonl
+    python benchmarks/bench_until.py --rigs 20 --uneven
     python benchmarks/bench_until.py --table results.jsonl
 """
 
@@ -23,8 +27,12 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import finite_element_rig
 import numpy as np
+from defect_records import DampingLaw
+from finite_element_beam import FiniteElementBeam
 from numpy.typing import NDArray
+from random_defects import scaled_smoothly
 
 from rigd.beam import Beam, Damping, Plant, modes
 from rigd.beam.tip import SMALL_SLOPE_RAD, tip_motion
@@ -45,6 +53,9 @@ EXTRAS = ("uniform", "clamp", "mass", "clamp and mass", "drag")
 BAND_HZ = 50.0
 _ABSENT = 1e-7
 """A coefficient of damping that changes nothing."""
+HIGHEST_HZ = 450.0
+"""Highest mode of a beam of finite elements."""
+DRAG_POINTS = 64
 PROFILE = Path(__file__).parents[1] / "hw_profiles" / "sim.toml"
 
 
@@ -64,6 +75,8 @@ class Rig:
     clamp_compliance_rad_per_nm: float = 0.0
     tip_mass_kg: float = 0.0
     air_drag_m: float = 0.0
+    uneven_percent: float = 0.0
+    """Standard deviation of density and of stiffness along the beam."""
 
     @property
     def damping(self) -> Damping:
@@ -81,6 +94,18 @@ class Rig:
 
     def truth(self) -> dict[str, dict[str, float]]:
         """Frequencies and damping ratios of the modes in the band."""
+        if self.uneven_percent:
+            beam = self.modal_beam()
+            pairs = zip(beam.omega_rad_s, beam.damping_ratio, strict=True)
+            return {
+                f"{name} {number}": float(value)
+                for number, (omega, ratio) in enumerate(pairs, start=1)
+                if omega < 2 * np.pi * BAND_HZ
+                for name, value in (
+                    ("frequency", omega * np.sqrt(1 - ratio**2) / (2 * np.pi)),
+                    ("damping", ratio),
+                )
+            }
         plant = Plant(
             self.beam(),
             self.damping,
@@ -94,6 +119,50 @@ class Rig:
                 found[f"frequency {pole.mode}"] = frequency_hz
                 found[f"damping {pole.mode}"] = -pole.at_rad_s.real / abs(pole.at_rad_s)
         return found
+
+    def modal_beam(self) -> finite_element_rig.ModalBeam:
+        """Beam of finite elements whose density and stiffness wander along it.
+
+        Its modes have the damping ratios of those of a uniform beam.
+        """
+        stated, rng = self.beam(), np.random.default_rng([self.number, 1])
+        waves = np.arange(1, 6, dtype=float)
+        wandering = []
+        for value in (stated.density_kg_per_m, stated.bending_stiffness_n_m2):
+            cosines, sines = rng.normal(size=(2, waves.size)) / waves
+            scale = 0.01 * self.uneven_percent / np.sqrt(np.sum(cosines**2 + sines**2) / 2)
+            wandering.append(scaled_smoothly(value, waves, scale * cosines, scale * sines))
+        law = DampingLaw(0.0, 1.0, 0.0, 1.0)
+        beam = FiniteElementBeam(stated.length_m, *wandering, law.elastic, law.medium)
+        omega, share = beam.shares()
+        within = omega < 2 * np.pi * HIGHEST_HZ
+        position_m = (np.arange(DRAG_POINTS) + 0.5) * stated.length_m / DRAG_POINTS
+        shape = beam.shapes_at(position_m)[within]
+        density = wandering[0](position_m)
+        piece_m = stated.length_m / DRAG_POINTS
+        ratios = [mode.damping_ratio for mode in modes(stated, self.damping, int(within.sum()))]
+        return finite_element_rig.ModalBeam(
+            omega[within],
+            np.clip(ratios, 1e-4, 0.1),
+            share[within],
+            piece_m * shape @ density,
+            float(piece_m * density @ position_m**2),
+            beam.mass_moment_kg_m,
+            position_m,
+            shape,
+            self.air_drag_m,
+        )
+
+
+def draw_uneven(number: int, seed: int) -> Rig:
+    """Draw a rig whose beam is not uniform; every second one is in air."""
+    rng = np.random.default_rng([seed, number, 2])
+    rig = replace(
+        draw(number, seed), clamp_compliance_rad_per_nm=0.0, tip_mass_kg=0.0, air_drag_m=0.0
+    )
+    uneven_percent = float(np.exp(rng.uniform(np.log(0.3), np.log(5.0))))
+    drag_m = float(rng.uniform(3e-4, 2.3e-3)) if number % 2 else 0.0
+    return replace(rig, uneven_percent=uneven_percent, air_drag_m=drag_m)
 
 
 def draw(number: int, seed: int) -> Rig:
@@ -158,6 +227,12 @@ def profile_of(rig: Rig, folder: Path) -> Path:
         "tip_mass_kg": rig.tip_mass_kg,
         "air_drag_m": rig.air_drag_m,
     }
+    if rig.uneven_percent:
+        more = {}
+        name = finite_element_rig.NAME
+        text = re.sub(r'(?m)^(drive|sensor) = "sim"', rf'\1 = "{name}"', text)
+        rig.modal_beam().write(folder / "beam.npz")
+        text += f'\n[{name}]\nfile = "{folder / "beam.npz"}"\n'
     lines = [f'{k} = {{ value = {float(v)!r}, source = "assumed" }}' for k, v in more.items() if v]
     text = text.replace("[simulation]\n", "[simulation]\n" + "\n".join(lines) + "\n")
     path = folder / f"rig{rig.number}.toml"
@@ -176,7 +251,9 @@ def run(rig: Rig, at_most_s: float, options: list[str]) -> dict[str, Any]:
             "--json", "--seed", str(rig.number), "--profile", str(profile_of(rig, folder)),
             "--output", name, *options,
         ]  # fmt: skip
-        environment = os.environ | {"XDG_RUNTIME_DIR": name}
+        finite_element_rig.install(folder)
+        path = os.pathsep.join([name, str(Path(__file__).parent)])
+        environment = os.environ | {"XDG_RUNTIME_DIR": name, "PYTHONPATH": path}
         done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
         try:
             [session] = json.loads(done.stdout)["sessions"]
@@ -282,17 +359,19 @@ def main() -> None:
     parser.add_argument("--rigs", type=int, default=7)
     parser.add_argument("--first", type=int, default=0, help="number of the first rig")
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--uneven", action="store_true", help="beams that are not uniform")
     parser.add_argument("--at-most", type=float, default=120.0)
     parser.add_argument("--jsonl", type=Path, help="where each result is added")
     parser.add_argument("--table", type=Path, help="show what is there, run nothing")
     parser.add_argument("options", nargs="*", help="more options of rigd run until, after --")
     chosen = parser.parse_args()
+    drawn = draw_uneven if chosen.uneven else draw
     results = []
     if chosen.table:
         results = [json.loads(line) for line in chosen.table.read_text("utf-8").splitlines()]
     else:
         for number in range(chosen.first, chosen.first + chosen.rigs):
-            result = run(draw(number, chosen.seed), chosen.at_most, chosen.options)
+            result = run(drawn(number, chosen.seed), chosen.at_most, chosen.options)
             results.append(result)
             if chosen.jsonl:
                 with chosen.jsonl.open("a", encoding="utf-8") as file:

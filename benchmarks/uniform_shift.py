@@ -3,7 +3,9 @@
 The true modal constants of a rig (logarithms of frequency and damping ratio, logarithm and phase of
 the residue) are fitted by those of Eq. 25, weighted by the standard deviations that the analyzer
 gives for the modes; noise has no part in it. The shift is the largest difference between a fitted
-parameter and the true one, over the parameter's standard deviation by the same weights.
+parameter and the true one, over the parameter's standard deviation by the same weights. With a
+tolerance of the geometry, as headlines have it, each logarithm of a frequency has that standard
+deviation more, and each logarithm of a residue three times as much.
 """
 
 from __future__ import annotations
@@ -25,7 +27,9 @@ _SCALES = np.array([0.1, 0.05, 0.1, 0.05, 1e-3, 1e-2, 1e-4])
 _ITERATIONS = 40
 
 
-def headline_shift(truth: dict[str, Any], headline: dict[str, Any]) -> float | None:
+def headline_shift(
+    truth: dict[str, Any], headline: dict[str, Any], uniformity: float
+) -> float | None:
     """Return the largest shift of a parameter in standard deviations.
 
     Parameters
@@ -34,6 +38,8 @@ def headline_shift(truth: dict[str, Any], headline: dict[str, Any]) -> float | N
         Document of `DefectRecord.truth`.
     headline : dict
         Document of the analyzer, for the standard deviations of its modes.
+    uniformity : float
+        Tolerance of the geometry; 0: exact geometry.
 
     Returns
     -------
@@ -48,7 +54,10 @@ def headline_shift(truth: dict[str, Any], headline: dict[str, Any]) -> float | N
         stds = _relative_stds(mode, headline)
         if mode["visible"] and stds is not None:
             modes.append(mode)
-            weights.append([1 / stds[0], 1 / stds[1], 1 / stds[1], 1 / stds[1]])
+            frequency, loss = math.hypot(stds[0], uniformity), stds[1]
+            weights.append(
+                [1 / frequency, 1 / loss, 1 / math.hypot(loss, 3 * uniformity), 1 / loss]
+            )
     if len(modes) < 2:
         return None
     measured = np.array([_constants(_frequency(m), m["damping_ratio"], _residue(m)) for m in modes])

@@ -141,8 +141,10 @@ def test_a_number_far_off_is_wrong_unless_it_has_a_flag(
     headline["exact_geometry"]["parameters"]["alpha"] = quantity(1.2, 1e-3)
     found = score_document(truth, headline, 1.0)
     assert not found.wrong
-    assert replace(found, shift=None).moved
-    assert not replace(found, shift=0.5).moved
+    assert found.moved_exactly
+    assert not found.moved
+    assert not replace(found, exact_shift=0.5).moved_exactly
+    assert replace(found, shift=1.5).moved
 
 
 def test_values_within_a_range_of_truths_are_right(truth: dict[str, Any], headline: dict[str, Any]):
@@ -307,13 +309,18 @@ def test_limits(truth: dict[str, Any], headline: dict[str, Any]):
 def test_a_uniform_beam_is_not_shifted_and_others_are(
     truth: dict[str, Any], headline: dict[str, Any]
 ):
-    assert headline_shift(truth, headline) == pytest.approx(0.0, abs=0.05)
+    assert headline_shift(truth, headline, 0.0) == pytest.approx(0.0, abs=0.05)
     slightly = copy.deepcopy(truth)
     slightly["modes"][2]["damping_ratio"] *= 1.003
-    shift = headline_shift(slightly, headline)
+    shift = headline_shift(slightly, headline, 0.0)
     assert shift is not None
     assert 0.3 < shift < 10
+    slightly["modes"][2]["frequency_hz"] *= 1.0005
+    exact, with_tolerance = (headline_shift(slightly, headline, each) for each in (0.0, 1e-3))
+    assert exact is not None
+    assert with_tolerance is not None
+    assert with_tolerance < 1 < exact
     slightly["modes"][2]["frequency_hz"] *= 1.01
-    assert headline_shift(slightly, headline) == math.inf
+    assert headline_shift(slightly, headline, 0.0) == math.inf
     slightly["linear_constant"] = False
-    assert headline_shift(slightly, headline) is None
+    assert headline_shift(slightly, headline, 0.0) is None
