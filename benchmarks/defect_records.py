@@ -78,6 +78,20 @@ class DampingLaw:
         return force
 
 
+def clamp_stiffness(clamp: tuple[float, float], s: Complex) -> Complex:
+    """Rotational stiffness of a clamp, given at rest, with its loss factor at 100 rad/s."""
+    stiffness, loss = clamp
+    found: Complex = stiffness * (1 + loss * (s / 100.0) ** 0.2 / np.sin(0.1 * np.pi))
+    return found
+
+
+def clamp_loss_factor(clamp: tuple[float, float], omega_rad_s: Real) -> Real:
+    """Loss factor that a clamp adds to every mode: its part in the energy is 4 EI / (k L)."""
+    stiffness = clamp_stiffness(clamp, 1j * omega_rad_s)
+    found: Real = -4 * STIFFNESS_N_M2 / LENGTH_M * (1 / stiffness).imag
+    return found
+
+
 @dataclass(frozen=True, slots=True)
 class TrueMode:
     """A mode of a rig: of its free decay with locked hub, and its residue in N·m/s.
@@ -205,7 +219,9 @@ class Defect:
     beam : FiniteElementBeam
     channel : TorqueChannel
     alpha_range : tuple of float, optional
-        Slopes of the material's loss over frequency, where it has no single order.
+        Slopes of the loss of material and clamp over frequency, where it has no single order.
+    clamp : tuple of (nm_per_rad, loss_factor), optional
+        Elastic clamp. The modes do not tell its loss from that of the material.
     effects : tuple of str
         What the analyzer may state of this rig, in its words, whatever the size.
     constant_nm : float
@@ -223,6 +239,7 @@ class Defect:
     beam: FiniteElementBeam
     channel: TorqueChannel = TorqueChannel()
     alpha_range: tuple[float, float] | None = None
+    clamp: tuple[float, float] | None = None
     effects: tuple[str, ...] = ()
     constant_nm: float = 0.0
     step: tuple[float, float] | None = None
@@ -233,6 +250,9 @@ class Defect:
 
         The two are equal where the rig has a single value. A property that varies along the beam,
         or in time, has the range of its local values. What the rig does not have is left out.
+
+        A mass at the tip and an elastic clamp act on all modes alike, as density and stiffness do:
+        these have the range up to the value of the uniform beam with the same modes.
         """
         law, channel = self.damping, self.channel
         x = np.linspace(0.0, LENGTH_M, _LOCAL_POINTS + 1)[:-1] + LENGTH_M / (2 * _LOCAL_POINTS)
@@ -245,11 +265,19 @@ class Defect:
         changed = (1.0, stiffer, 1.0 + (self.step[1] if self.step else 0.0))
         gains = (1.0, 1.0 + channel.cubic)
         low, high = stiffness.min() * min(changed), stiffness.max() * max(changed)
+        heavier = 4 * self._tip_mass_kg / (DENSITY_KG_PER_M * LENGTH_M)
+        softer = 4 * STIFFNESS_N_M2 / (LENGTH_M * self.clamp[0]) if self.clamp else 0.0
         found = {
             "gamma": (law.gamma * STIFFNESS_N_M2 / high, law.gamma * STIFFNESS_N_M2 / low),
             "lambda": (law.lambda_, law.lambda_),
-            "density_over_stiffness": (over.min() / max(changed), over.max() / min(changed)),
-            "bending_stiffness_n_m2": (low * min(gains), high * max(gains)),
+            "density_over_stiffness": (
+                over.min() / max(changed),
+                over.max() / min(changed) * (1 + heavier + softer),
+            ),
+            "bending_stiffness_n_m2": (
+                low * min(gains) * (1 - softer),
+                high * max(gains) * (1 + softer),
+            ),
             "tool_inertia_kg_m2": (channel.tool_inertia_kg_m2,) * 2,
         }
         if self.alpha_range is not None:
@@ -258,13 +286,17 @@ class Defect:
             found |= {"alpha": (law.alpha, law.alpha), "zeta": (law.zeta, law.zeta)}
         if not channel.resonance_hz:
             found["delay_s"] = (channel.delay_s, channel.delay_s)
-        tips = [mass.mass_kg for mass in self.beam.masses if mass.position_m == LENGTH_M]
-        found["tip_mass_kg"] = (sum(tips),) * 2
+        found["tip_mass_kg"] = (self._tip_mass_kg,) * 2
         found["drag_m"] = (DRAG_COEFFICIENT * self.drag_m,) * 2
         if self.beam.root_nm_per_rad is not None:
             springs = self.beam.root_nm_per_rad(2j * np.pi * np.array([FIRST_HZ, LAST_HZ])).real
             found["root_nm_per_rad"] = (springs.min(), springs.max())
         return {name: (float(least), float(most)) for name, (least, most) in found.items()}
+
+    @property
+    def _tip_mass_kg(self) -> float:
+        masses = self.beam.masses
+        return sum((mass.mass_kg for mass in masses if mass.position_m == LENGTH_M), start=0.0)
 
     @property
     def parameters(self) -> dict[str, float]:
@@ -311,6 +343,7 @@ class DefectRecord:
                 "gamma": law.gamma,
                 "lambda": law.lambda_,
                 "relaxations": [list(pair) for pair in law.relaxations],
+                "clamp": self.defect.clamp and list(self.defect.clamp),
             },
         }
 

@@ -15,6 +15,9 @@ from dataclasses import asdict, dataclass, replace
 from statistics import median
 from typing import Any, Literal
 
+import numpy as np
+from defect_records import clamp_loss_factor
+
 Range = tuple[float, float]
 Document = dict[str, Any]
 
@@ -296,15 +299,19 @@ def _scored_sizes(entries: Iterable[Document], truth: Document) -> list[ScoredNu
         omega = entry["omega_rad_s"]
         internal = entry["damping"] == "internal"
         names = ("zeta", "alpha") if internal else ("gamma", "lambda", "density_over_stiffness")
-        if omega is None or any(
-            name not in ranges or ranges[name][0] != ranges[name][1] for name in names
+        clamp = law.get("clamp") if internal else None
+        if omega is None or (
+            clamp is None
+            and any(name not in ranges or ranges[name][0] != ranges[name][1] for name in names)
         ):
             continue
         coefficient, order = law[names[0]], law[names[1]]
         lost = coefficient * omega**order * math.sin(order * math.pi / 2)
         if not internal:
             lost /= _STATED_OVER * omega**2
-        numbers.append(_scored(f"{entry['damping']} size", "size", entry, (lost, lost)))
+        # The loss of a clamp acts as one of the material does.
+        more = 0.0 if clamp is None else float(clamp_loss_factor(tuple(clamp), np.array(omega)))
+        numbers.append(_scored(f"{entry['damping']} size", "size", entry, (lost, lost + more)))
     return numbers
 
 

@@ -18,6 +18,8 @@ from defect_records import (
     DefectRecord,
     NoiseSpectrum,
     TorqueChannel,
+    clamp_loss_factor,
+    clamp_stiffness,
     simulate,
 )
 from finite_element_beam import Complex, FiniteElementBeam, PointMass, Profile, Real
@@ -264,13 +266,22 @@ def _clamp(generator: Generator, law: DampingLaw) -> Defect:
     stiffness, loss = _size(generator, 10.0, 1000.0), float(generator.uniform(0.0, 0.15))
 
     def spring(s: Complex) -> Complex:
-        found: Complex = stiffness * (1 + loss * (s / 100.0) ** 0.2 / np.sin(0.1 * np.pi))
-        return found
+        return clamp_stiffness((stiffness, loss), s)
 
-    beam = make_beam(law, root_nm_per_rad=spring)
-    size = {"root_nm_per_rad": stiffness, "loss": loss}
-    effects = ("elastic clamp", "lossy clamp")
-    return Defect("clamp", size, True, law, beam, effects=effects)
+    omega = 2 * np.pi * np.geomspace(2.5, 45.0, 200)
+    lost = law.elastic(1j * omega).imag + clamp_loss_factor((stiffness, loss), omega)
+    slope = np.gradient(np.log(lost), np.log(omega))
+    slopes = float(min(slope.min(), law.alpha)), float(max(slope.max(), law.alpha))
+    return Defect(
+        "clamp",
+        {"root_nm_per_rad": stiffness, "loss": loss},
+        True,
+        law,
+        make_beam(law, root_nm_per_rad=spring),
+        alpha_range=slopes,
+        clamp=(stiffness, loss),
+        effects=("elastic clamp", "lossy clamp"),
+    )
 
 
 def _sensor_resonance(generator: Generator, law: DampingLaw) -> Defect:

@@ -139,6 +139,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
     )
     nominal_plant = used_sessions[0].nominal
     assert nominal_plant is not None
+    beam_test = uniform_beam_test(modal_estimate, nominal_plant)
     stated_uniformities = tuple(sorted({session.uniformity for session in used_sessions}))
     tolerant_fit = None
     if stated_uniformities[-1]:
@@ -147,7 +148,12 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
         widened_estimate = replace(
             modal_estimate, joint_covariance=variance_factor * pooled_constants.covariance
         )
-        tolerant_fit = tolerant_estimate(widened_estimate, nominal_plant, stated_uniformities[-1])
+        tolerant_fit = tolerant_estimate(
+            widened_estimate,
+            nominal_plant,
+            stated_uniformities[-1],
+            is_uniform=beam_test.status != "refused",
+        )
     return PooledModal(
         model=modal_estimate.model,
         numbers=common_modes,
@@ -156,7 +162,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
         sessions=len(used_sessions),
         between_std=pooled_constants.between_std[: modal_estimate.constants.size],
         stated=stated_uniformities,
-        uniform_beam=uniform_beam_test(modal_estimate, nominal_plant),
+        uniform_beam=beam_test,
         tolerant=tolerant_fit,
     )
 

@@ -204,16 +204,17 @@ def _beam_findings(candidate_set: CandidateSet, headline: Headline) -> Iterator[
         (percent_size,) = to_uncertainty(
             (abs(relative_deviation),), (interval_high - interval_low) / 2, 100
         )
+        other_causes = _equivalent_causes(candidate_set, setting_name)
         yield Finding(
             kind="beam data",
             sentence=(
                 f"{description} is {percent_size} % "
                 f"{'higher' if relative_deviation > 0 else 'lower'} than the file states "
-                f"({interval_text(deviation_interval, 100, '+')} %; 95 "
-                f"%){_equivalent_causes(candidate_set, setting_name)}."
+                f"({interval_text(deviation_interval, 100, '+')} %; 95 %){other_causes}."
             ),
             value=relative_deviation,
-            interval=(interval_low, interval_high),
+            # An interval would claim that it is the beam.
+            interval=None if other_causes else (interval_low, interval_high),
             remedy="Weigh and measure the link again, or take the value found.",
             parameters=(setting_name,),
         )
@@ -225,7 +226,7 @@ def _equivalent_causes(candidate_set: CandidateSet, setting_name: Setting) -> st
     Return an empty string if there are none.
     """
     if setting_name == "bending_stiffness_n_m2":
-        return ", or the torque's gain is"
+        return ", or the torque's gain is, or the clamp gives way"
     fit, stated_beam = candidate_set.best.fit, candidate_set.comparison.measurement.beam
     tip_mass_effect = (
         math.log(fit.plant.beam.density_over_stiffness / stated_beam.density_over_stiffness) / 4

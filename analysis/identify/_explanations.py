@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._step_in_time import StiffnessStep
     from analysis.identify.uniform_beam import UniformBeamTest
-    from rigd.beam import Plant
+    from rigd.beam import Damping, Plant
 
 _CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)
 """Additional standard deviation of all modal constants in successive descents.
@@ -94,6 +94,8 @@ class CauseFit:
     chi_square, p_value : float
         Misfit of the modal constants with this cause, and the probability of a larger misfit by
         chance.
+    damping : Damping
+        Damping of the beam with this cause.
     plant : Plant or None
         Plant with this cause; None if a `Plant` cannot represent it.
     """
@@ -104,6 +106,7 @@ class CauseFit:
     unit: str
     chi_square: float
     p_value: float
+    damping: Damping
     plant: Plant | None = None
 
     def as_json(self) -> dict[str, Any]:
@@ -211,6 +214,7 @@ def _fit_cause(
         unit=size_unit,
         chi_square=chi_square,
         p_value=p_value,
+        damping=plant.damping,
         plant=cause.plant(cause_unknowns.tolist(), plant) if cause.plant else None,
     )
 

@@ -32,8 +32,11 @@ from rigd.beam import BEAM_PARAMETERS, COEFFICIENT_OF
 from rigd.estimates import Estimate, EstimatedMode
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from analysis.identify._explanations import CauseFit
     from analysis.identify._modal_model import ModalEstimate
-    from analysis.identify.headline import ReportedLossFactor, StructureStatus
+    from analysis.identify.headline import Headline, ReportedLossFactor, StructureStatus
     from analysis.identify.profile_likelihood import LikelihoodProfile, Order
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
@@ -56,6 +59,10 @@ def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
         return None
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
+
+_CONTRADICTION_STDS: Final = 3.0
+"""Distance of a number with a cause from the reported one, in standard deviations by the side of
+the 95 % interval that faces it, from which the cause makes the reported number doubtful."""
 
 _EstimatesT = TypeVar("_EstimatesT", bound=Estimates)
 """Type variable for `Estimates` or a subclass, which `replace_by_modal_model` takes and returns."""
@@ -126,6 +133,57 @@ def replace_by_modal_model(
         ),
         tolerant=tolerant,
     )
+
+
+def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) -> Headline:
+    """Return the headline with flags on internal damping that differs with a cause of the modes.
+
+    The reported numbers are those of a nearly uniform beam. A cause that explains the modes as well
+    may need another damping. External damping has a flag anyway if the beam is not uniform.
+
+    Parameters
+    ----------
+    headline : Headline
+        Reported numbers.
+    causes : sequence of CauseFit
+        Simple causes that each explain the modes.
+    """
+    parameters = {
+        name: _flag_contradicted(
+            estimate, [(getattr(cause.damping, name), cause.words) for cause in causes]
+        )
+        if name in ("zeta", "alpha")
+        else estimate
+        for name, estimate in headline.parameters.items()
+    }
+    sizes = [
+        loss_factor
+        if loss_factor.damping != "internal" or loss_factor.omega_rad_s is None
+        else replace(
+            loss_factor,
+            size=_flag_contradicted(
+                loss_factor.size,
+                [
+                    (cause.damping.internal_loss_factor(loss_factor.omega_rad_s), cause.words)
+                    for cause in causes
+                ],
+            ),
+        )
+        for loss_factor in headline.sizes
+    ]
+    return replace(headline, parameters=parameters, sizes=tuple(sizes))
+
+
+def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:
+    """Return an estimate with a flag if a cause, given by value and words, has another value."""
+    if estimate.interval_95 is None:
+        return estimate
+    low, high = estimate.interval_95
+    for value, words in rivals:
+        half_width = high - estimate.value if value > estimate.value else estimate.value - low
+        if abs(value - estimate.value) > _CONTRADICTION_STDS / NORMAL_95 * half_width:
+            return estimate.flagged(f"{words} would explain the modes, too, with {value:.3g}")
+    return estimate
 
 
 def _reported_modes(

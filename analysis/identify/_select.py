@@ -20,6 +20,7 @@ from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts
 from analysis.identify._modal_headline import (
+    flag_contradicted_damping,
     order_verdict_with_geometry_tolerance,
     replace_by_modal_model,
 )
@@ -64,6 +65,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._data import Measurement
+    from analysis.identify._explanations import CauseFit
     from analysis.identify._finding import Finding
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._result import RecordFit
@@ -288,13 +290,28 @@ def _select_with_known_impacts(
     if check.doubt_reason is not None:
         reported_headline = reported_headline.doubted(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
+    effect_findings, cause_flags = model.findings, dict[str, str]()
+    if uniform_beam_refused and check.model_reason is None:
+        assert modal_fit is not None
+        assert beam_test is not None
+        causes, cause_findings = _explain_deviations(
+            measurement, leading_candidates, modal_fit, beam_test
+        )
+        effect_findings += cause_findings
+        earlier_flags = reported_headline.flags
+        reported_headline = flag_contradicted_damping(reported_headline, causes)
+        cause_flags = {
+            name: flag
+            for name, flag in reported_headline.flags.items()
+            if name not in earlier_flags
+        }
     if reported_headline.tolerant is not None:
         alpha_verdict, lambda_verdict = (
             order_verdict_with_geometry_tolerance(
                 each.order,
                 reported_headline.tolerant,
                 each,
-                check.doubt_reason,
+                check.doubt_reason or cause_flags.get(each.order),
                 refused=uniform_beam_refused,
             )
             for each in order_profiles
@@ -302,16 +319,6 @@ def _select_with_known_impacts(
         order_verdicts = alpha_verdict, lambda_verdict
     if "nonlinear stiffness" in check.finding_kinds:
         reported_headline = reported_headline.with_stiffness_law_flag()
-    effect_findings = model.findings
-    if (
-        modal_fit is not None
-        and beam_test is not None
-        and uniform_beam_refused
-        and check.model_reason is None
-    ):
-        effect_findings += _explain_deviations(
-            measurement, leading_candidates, modal_fit, beam_test
-        )
     all_findings = check.reported_findings(
         reported_headline,
         effect_findings,
@@ -377,20 +384,20 @@ def _explain_deviations(
     candidate_set: CandidateSet,
     modal_fit: ModalFit,
     beam_test: UniformBeamTest,
-) -> tuple[Finding, ...]:
-    """Return a finding that names simple causes of the deviations from a uniform beam.
+) -> tuple[tuple[CauseFit, ...], tuple[Finding, ...]]:
+    """Return simple causes of the deviations from a uniform beam, and the finding that names them.
 
-    Return no finding with only two modes, which leave no degree of freedom for this test.
+    Return none with only two modes, which leave no degree of freedom for this test.
     """
     if len(modal_fit.visible) <= MODES_WITHOUT_REDUNDANCY:
-        return ()
-    deviation_causes = explanations(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
+        return (), ()
+    causes = explanations(modal_fit, measurement.nominal, measurement.axis_tilt_deg)
     stiffness_step = (
         best_stiffness_step(candidate_set.comparison, modal_fit)
         if measurement.is_single_sweep
         else None
     )
-    return (explanation_finding(beam_test, deviation_causes, stiffness_step),)
+    return causes, (explanation_finding(beam_test, causes, stiffness_step),)
 
 
 def _add_modal_model(
@@ -410,7 +417,11 @@ def _add_modal_model(
         exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
-            check.modal_fit, measurement.nominal, measurement.uniformity, measurement.axis_tilt_deg
+            check.modal_fit,
+            measurement.nominal,
+            measurement.uniformity,
+            measurement.axis_tilt_deg,
+            is_uniform=beam_test.status != "refused",
         )
     return replace_by_modal_model(
         exact_headline,

@@ -103,6 +103,13 @@ _WIDER_TOLERANCE: Final = 3e-3
 _LOOSE_TOLERANCE: Final = 0.05
 """Relative frequency tolerance at which frequencies and residues have almost no weight."""
 
+_INTEGRAL_TOLERANCE_RATIO: Final = 3
+"""Relative tolerance of residues, and of damping ratios if the beam is not uniform, over that of
+the frequencies. They are integrals over a mode's shape, which vary more than its frequency."""
+
+_LOSS_TOLERANCE: Final = 0.01
+"""Relative tolerance of the damping ratios of a beam so uneven that only its losses are data."""
+
 _MIN_VISIBLE_MODES: Final = 2
 """Smallest number of visible modes for an estimate with tolerance."""
 
@@ -146,6 +153,8 @@ class UniformBeamProblem:
     tilt_deg : float, optional
         Inclination of the plane of motion along the resting beam, as the file states it, in
         degrees.
+    loss_tolerance : float
+        Relative standard deviation of each damping ratio, in addition to the noise.
     """
 
     def __init__(
@@ -155,6 +164,7 @@ class UniformBeamProblem:
         nominal: Plant,
         uniformity: float = 0.0,
         tilt_deg: float | None = None,
+        loss_tolerance: float = 0.0,
     ) -> None:
         constant_rows = fit.rows(modes)
         mode_count = len(modes)
@@ -164,7 +174,10 @@ class UniformBeamProblem:
         self.measured = fit.constants[constant_rows]
         tolerance_std = np.zeros((mode_count, len(MODE_CONSTANT_NAMES)))
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
-        tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = 3 * uniformity
+        tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_damping_ratio")] = loss_tolerance
+        tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = (
+            _INTEGRAL_TOLERANCE_RATIO * uniformity
+        )
         self.covariance = fit.covariance[np.ix_(constant_rows, constant_rows)] + np.diag(
             tolerance_std.ravel() ** 2
         )
@@ -677,12 +690,18 @@ def uniform_beam_test(
 
 
 def tolerant_estimate(
-    fit: ModalEstimate, nominal: Plant, uniformity: float, tilt_deg: float | None = None
+    fit: ModalEstimate,
+    nominal: Plant,
+    uniformity: float,
+    tilt_deg: float | None = None,
+    *,
+    is_uniform: bool,
 ) -> TolerantEstimate | None:
     """Estimate damping and beam parameters from the modal constants, with a tolerance.
 
     If a uniform beam with the stated tolerance does not predict the constants, a wider tolerance is
-    used. If that fails, too, only damping ratios and residue phases are used.
+    used. If that fails, too, only damping ratios and residue phases are used. What makes a beam
+    uneven changes its losses as well: if it is not uniform, damping ratios have a tolerance, too.
 
     Parameters
     ----------
@@ -695,6 +714,8 @@ def tolerant_estimate(
     tilt_deg : float, optional
         Inclination of the plane of motion along the resting beam, as the file states it, in
         degrees.
+    is_uniform : bool
+        Whether a uniform beam predicts the modes (`uniform_beam_test`).
 
     Returns
     -------
@@ -711,7 +732,16 @@ def tolerant_estimate(
         ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
     )
     for estimate_basis, frequency_tolerance, least_p_value in tolerance_attempts:
-        problem = UniformBeamProblem(fit, mode_numbers, nominal, frequency_tolerance, tilt_deg)
+        loss_tolerance = (
+            0.0
+            if is_uniform
+            else _LOSS_TOLERANCE
+            if estimate_basis == "losses"
+            else _INTEGRAL_TOLERANCE_RATIO * frequency_tolerance
+        )
+        problem = UniformBeamProblem(
+            fit, mode_numbers, nominal, frequency_tolerance, tilt_deg, loss_tolerance
+        )
         minima = problem.minima()
         # With the loose tolerance frequencies and residues do not count as data.
         constant_count = problem.compared // (2 if estimate_basis == "losses" else 1)
@@ -736,7 +766,9 @@ def tolerant_estimate(
     if not orders_excluding_one:
         return beam_estimate
     if estimate_basis == "geometry":
-        problem = UniformBeamProblem(fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg)
+        problem = UniformBeamProblem(
+            fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg, loss_tolerance
+        )
         minima = problem.minima()
     best_minimum = minima[0]
     order_one_deviances = {

@@ -84,6 +84,10 @@ class Damping:
     lambda_: Annotated[float, Ge(0), Lt(2)] = 1.0
     """Fractional order of the external damping."""
 
+    def internal_loss_factor(self, omega_rad_s: float) -> float:
+        """Return the loss factor of the internal damping at an angular frequency in rad/s."""
+        return float(self.zeta * omega_rad_s**self.alpha * np.sin(self.alpha * np.pi / 2))
+
 
 # Transfer function
 
