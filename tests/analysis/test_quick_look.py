@@ -18,6 +18,7 @@ from analysis.quick_look import QuickLookError, make_quick_look, write_quick_loo
 from analysis.record import load_record
 from analysis.results import whole_record
 from rigd.beam import transfer
+from rigd.estimates import modes_from_json
 from rigd.session.quick_look import quick_look_path
 
 
@@ -141,16 +142,15 @@ def test_a_change_counts_from_three_standard_deviations_on():
     before = look_with(2.5, 16.0, 44.0)
     now = look_with(2.5 + 4.1e-3, 16.0 + 4.4e-3)
     now["modes"][1]["damping_ratio"] = estimated(0.0105, 1e-4)
-    against = quick_look._compare_modes(now["modes"], before)
+    against = quick_look._compare_modes(modes_from_json(now["modes"]), before)
     assert [mode["significant"] for mode in against["modes"]] == [False, True]
     assert against["sentence"] == (
         "Significant change against before: mode 2 +0.0044 Hz, damping +5 %."
     )
     before["modes"][1]["frequency_hz"]["flag"] = "part of the record is unexplained"
     now["modes"][1]["damping_ratio"]["interval_95"] = None
-    assert not any(
-        m["significant"] for m in quick_look._compare_modes(now["modes"], before)["modes"]
-    )
+    against = quick_look._compare_modes(modes_from_json(now["modes"]), before)
+    assert not any(mode["significant"] for mode in against["modes"])
 
 
 @pytest.mark.parametrize(

@@ -105,6 +105,16 @@ def test_an_external_order_of_an_uneven_beam_is_no_fact():
     assert flags["lambda"] is not None
 
 
+@pytest.mark.further
+@pytest.mark.fit
+def test_an_internal_order_that_a_taper_contradicts_is_flagged():
+    found = judge(DefectTask(200019, None, command_line=False, documents=None))
+    assert (found.kind, found.gate) == ("taper", "refused")
+    assert not found.wrong
+    flags = {number.name: number.flag for number in found.numbers}
+    assert "from root to tip would explain the modes, too" in flags["alpha"]
+
+
 @pytest.mark.fit
 def test_a_record_is_judged_from_the_document(tmp_path: Path):
     found = judge(DefectTask(0, "none", command_line=False, documents=tmp_path))
