@@ -70,7 +70,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Seven thousand tests stay to the end: no garbage collection need look at them."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 
