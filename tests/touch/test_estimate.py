@@ -195,6 +195,17 @@ def test_a_touch_that_is_noticed_late_is_looked_for_in_what_precedes(estimator, 
         assert touch_s == pytest.approx(struck[name].touch_s, abs=5e-4)
 
 
+def test_a_touch_that_is_noticed_a_tenth_of_a_second_late_is_looked_for_as_well(estimator, struck):
+    """In the longest time before a detection in which a touch is looked for."""
+    noticed = 90
+    record = cut(struck["middle"], 50, noticed=noticed)
+    estimate = estimator.estimate(record, scan=False)
+    touch_s = estimate.time_s.value + begin_s(struck["middle"], noticed)
+    assert estimate.kind == "rigid"
+    assert abs(estimate.x_m.value - OBSTACLES["middle"].x_m) < 4 * estimate.x_m.std
+    assert touch_s == pytest.approx(struck["middle"].touch_s, abs=5e-4)
+
+
 def test_the_same_record_gives_the_same_answer(estimator, told, struck):
     again = estimator.estimate(cut(struck["soft"], 100))
     assert again.as_dict() == told["soft"].as_dict()
