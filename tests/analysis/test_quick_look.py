@@ -241,6 +241,18 @@ def test_what_cannot_be_analysed_says_why(write_session, short_signals, signals_
 
 
 @pytest.mark.fit
+def test_a_record_that_contradicts_its_file_has_no_band_of_a_model(
+    write_session, make_signals, tmp_path
+):
+    signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
+    turned = replace(signals, torque_nm=-signals.torque_nm)
+    look = make_quick_look(write_session(tmp_path / "turned.mcap", turned))
+    assert look["model"] is None
+    assert look["response"] is not None
+    assert all(mode["frequency_hz"]["flag"] for mode in look["modes"])
+
+
+@pytest.mark.fit
 @pytest.mark.process
 def test_the_text_is_for_a_terminal(chirps):
     paths, (_, look) = chirps
