@@ -4,6 +4,7 @@ import atexit
 import contextlib
 import fcntl
 import gc
+import io
 import json
 import os
 import shutil
@@ -17,14 +18,13 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-import numpy as np
 import pytest
 import warm_start
 from hypothesis import settings
+from PIL import Image
 
 from rigd import testing
 from rigd.runtime import use_one_thread
-from rigd.session.layout import SAMPLE_DTYPE
 
 pytest_plugins = [
     "browsers", "library_folders", "paper_sweeps", "patient_drives",
@@ -35,7 +35,8 @@ pytest_plugins = [
 # Nothing of what collecting makes is garbage: see `pytest_collection_finish`.
 gc.disable()
 
-# As in the commands; threads would fight each other where tests run in parallel.
+# As in the commands, before anything here imports numpy; threads would fight each other.
+assert "numpy" not in sys.modules
 use_one_thread()
 
 # A shell that starts a command in the background has it, and all that it starts, ignore these.
@@ -69,7 +70,6 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
 
 def pytest_collection_finish(session: pytest.Session) -> None:
     """Seven thousand tests stay to the end: no garbage collection need look at them."""
-    gc.collect()
     gc.freeze()
     gc.enable()
 
@@ -236,6 +236,25 @@ def analyze_here(tmp_path, monkeypatch):
     return partial(run_here, app)
 
 
+@pytest.fixture(scope="session")
+def without_drawing():
+    """A context in which reports have blank pictures: drawing takes longer than all the rest."""
+    picture = io.BytesIO()
+    Image.new("L", (1, 1)).save(picture, "png")
+    blank = {"png": picture.getvalue(), "svg": b'<svg xmlns="http://www.w3.org/2000/svg"/>'}
+
+    def savefig(_figure, stream, *, format, **_options):  # noqa: A002
+        stream.write(blank[format])
+
+    @contextlib.contextmanager
+    def entered():
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr("matplotlib.figure.Figure.savefig", savefig)
+            yield
+
+    return entered
+
+
 def run_here(app, *arguments) -> Done:
     from typer.testing import CliRunner
 
@@ -357,6 +376,9 @@ def analysed(tmp_path):
 @pytest.fixture
 def make_samples():
     """Make samples (n,) at 1 kHz from a tick on, at rest but for the fields given."""
+    import numpy as np
+
+    from rigd.session.layout import SAMPLE_DTYPE
 
     def make(n: int, first_tick: int = 0, **fields) -> np.ndarray:
         samples = np.zeros(n, SAMPLE_DTYPE)

@@ -82,10 +82,15 @@ def test_the_quick_estimate_is_that_of_the_file(session):
     assert live.findings == found
 
 
-def test_an_estimate_depends_on_what_was_before_its_tick_alone(session):
+@pytest.fixture(scope="module")
+def of_four_seconds(session):
+    return fed(session).estimate(4000)
+
+
+def test_an_estimate_depends_on_what_was_before_its_tick_alone(session, of_four_seconds):
     early = OnlineEstimator(session.metadata, session.segments)
     early.feed(session.samples[:4000])
-    asked, early = fed(session).estimate(4000), early.estimate()
+    asked, early = of_four_seconds, early.estimate()
     assert asked.headline.modes == early.headline.modes
     assert asked.tick == early.tick == 4000
     assert asked.duration_s == 4.0
@@ -121,7 +126,7 @@ def test_a_fit_that_fails_is_a_problem_of_this_estimate_alone(session, monkeypat
         estimate = fit.estimate()
     assert estimate.problem.startswith("The record so far cannot be fitted")
     assert "Singular matrix" in estimate.problem
-    assert fit.estimate().problem == ""
+    assert fit.estimate(4000).problem == ""
 
 
 def with_mass_at_tip(signals, tip_kg, damping=PAPER_DAMPING):
@@ -221,8 +226,8 @@ def test_what_still_runs_was_not_cut_short(of_nine_seconds):
     assert estimate.doubt is None
 
 
-def test_one_mode_alone_tells_no_order(session):
-    told = fed(session).estimate(4000).headline
+def test_one_mode_alone_tells_no_order(of_four_seconds):
+    told = of_four_seconds.headline
     assert told.visible_modes == (1,)
     assert all(told.parameters[n].flag for n in {"alpha", "lambda"} & told.parameters.keys())
     assert told.modes[0].damping_ratio.flag is None

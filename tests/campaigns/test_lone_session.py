@@ -18,8 +18,8 @@ QUICK = (
 
 
 @pytest.fixture
-def run_here(in_this_process, analyze_here):
-    with in_this_process():
+def run_here(in_this_process, without_drawing, analyze_here):
+    with in_this_process(), without_drawing():
         yield lambda *arguments: analyze_here(*arguments, *QUICK)
 
 

@@ -233,6 +233,12 @@ def test_exact_values_are_withheld_where_a_uniform_beam_is_refused(sessions_of, 
     assert "1 is excluded" not in " ".join(exact.sentences)
 
 
+def test_a_beam_far_from_uniform_has_numbers_by_its_losses_alone(sessions_of, verdict_of):
+    text = " ".join(verdict_of(sessions_of(4, TRUE + 40 * UNEVEN)).sentences)
+    assert "by damping ratios and residue phases alone: the frequencies are not those of" in text
+    assert "each mode lies where" not in text
+
+
 def test_with_a_uniformity_of_0_the_numbers_are_the_narrow_ones(sessions_of, verdict_of):
     found = verdict_of(sessions_of(8, uniformity=0.0))
     assert found.lambda_.exact is None

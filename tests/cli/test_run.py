@@ -367,7 +367,10 @@ def test_a_name_that_appears_meanwhile_is_not_overwritten(start_rigd, patient, t
 
 @pytest.mark.parametrize(
     ("victim", "words"),
-    [("rigd.engine.control_process", "control process"), ("rigd.engine.recorder", "")],
+    [
+        ("rigd.engine.control_process", "control process"),
+        further("rigd.engine.recorder", ""),  # as tests/runner/test_rig.py
+    ],
 )
 def test_a_killed_process_ends_the_session_safely(start_rigd, patient, tmp_path, victim, words):
     process = start_rigd("run", "chirp", "--duration", "60", "--profile", patient)

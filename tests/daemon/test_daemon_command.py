@@ -112,7 +112,10 @@ def request(command, **fields):
 
 def recording():
     progress = request("status")["progress"]
-    return progress is not None and progress["phase"] == "running" and progress["tick"] > 0
+    if progress is None or progress["phase"] != "running" or progress["tick"] < 100:
+        return False
+    assert progress["time_left_s"] == round((progress["total"] - progress["tick"]) / 1000, 1)
+    return True
 
 
 def control_process():

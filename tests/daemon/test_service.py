@@ -527,7 +527,12 @@ def test_status_tells_of_progress_processes_and_topics(operated):
     assert {p["name"]: p["state"] for p in status["rig"]["processes"]} == {
         "control": "running", "recorder": "running", "supervisor": "running",
     }  # fmt: skip
-    assert [t["name"] for t in status["rig"]["topics"]][-1] == "/rig/sample"
+    topics = status["rig"]["topics"]
+    assert topics[-1]["name"] == "/rig/sample"
+    assert topics[-1]["rate_hz"] > 0.0
+    idle_hz = [topic["rate_hz"] for topic in topics if not topic["written"]]
+    assert idle_hz
+    assert not any(idle_hz)
     assert [(h["from"], h["to"]) for h in status["history"]] == [
         ("idle", "ready"), ("ready", "running"),
     ]  # fmt: skip

@@ -75,6 +75,17 @@ def test_a_folder_whose_parent_others_can_write_to_is_refused(runtime_folder):
     assert LockFile("rig-a", for_all_users=False).path.parent == runtime_folder / "rigd"
 
 
+def test_a_folder_of_another_user_is_refused_unless_it_is_shared(runtime_folder, monkeypatch):
+    folder = runtime_folder / "rigd"
+    folder.mkdir(mode=0o700)
+    owner = os.getuid() or 4711
+    os.chown(folder, owner, -1)
+    assert not folder_fault(folder)
+    monkeypatch.setattr("os.getuid", lambda: owner + 1)
+    assert f"{folder} belongs to another user ({owner})" in folder_fault(folder)
+    assert not folder_fault(folder, shared=True)
+
+
 def test_a_lock_follows_no_link(runtime_folder):
     held = LockFile("rig-a", for_all_users=False)
     held.path.parent.mkdir(parents=True)

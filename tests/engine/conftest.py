@@ -118,11 +118,15 @@ class FakeParent:
 
 
 def strict(profile):
-    """The limits on missed ticks that a rig would have; the recorder may lag until it loses."""
+    """The limits on missed ticks that a rig would have; the recorder may lag until it loses.
+
+    The ways from and to rest are as short as they may be.
+    """
     limits = replace(
         profile.limits, missed_ticks_in_a_row=50, missed_percent=2.0, recorder_lag_s=100.0
     )
-    return replace(profile, limits=limits)
+    brief = replace(profile.session, tare_s=0.5, return_s=0.3)
+    return replace(profile, limits=limits, session=brief)
 
 
 class Session:

@@ -20,7 +20,7 @@ from rigd.profile import load_profile
 from rigd.sim import StuckReadings
 
 RATE_HZ = 1000.0
-BEFORE_RECORD = 1500
+BEFORE_RECORD = 1000
 """Ticks of tare and settling."""
 ENCODER = r"Net torque while the encoder|Torque that the sudden stop of the encoder"
 BY_OBSTACLES = r"Tracking error|Torque command|After the record: Drift of"

@@ -263,7 +263,7 @@ def test_two_of_three_angles_may_not_be_old(make_session):
 def test_old_readings_before_the_record_do_not_count(make_session):
     session = make_session()
     session.drive.stale_at, session.drive.stale_pattern = 0, (False, True, True)
-    session.clock = StopAt(1_500_000_000, lambda: setattr(session.drive, "stale_at", None))
+    session.clock = StopAt(1_000_000_000, lambda: setattr(session.drive, "stale_at", None))
     session.run()
     assert session.finished.outcome == "complete"
     assert session.finished.counts["stale_angles"] <= 2
@@ -436,7 +436,7 @@ def test_a_lost_sample_ends_the_session_and_is_counted(make_session):
 
     session = make_session(excitation=hold(rate_hz=profile.rig.rate_hz, duration_s=20.0))
     session.clock = ReaderWakes(
-        17_504_000_000, lambda: read_late.append(session.channels.samples.take(1000))
+        17_004_000_000, lambda: read_late.append(session.channels.samples.take(1000))
     )
     session.run()
     session.assert_safe()
@@ -498,7 +498,7 @@ def test_a_sample_lost_in_the_last_tick_is_a_fault_too(make_session):
 
 def test_ticks_missed_up_to_the_end_are_judged_like_all_others(make_session):
     # The last 100 ticks of the record and some beyond.
-    session = make_session(clock=LateAt({6_402_000_000: 150_000_000}))
+    session = make_session(clock=LateAt({5_902_000_000: 150_000_000}))
     session.run()
     session.assert_safe()
     assert session.finished.outcome == "fault"

@@ -45,15 +45,13 @@ def accepts(port: int) -> bool:
     return True
 
 
-def test_first_line_is_where_the_view_is(publisher):
+def test_first_line_is_where_the_view_is_which_is_on_loopback(publisher):
     assert isinstance(publisher.answer, LiveAddress)
     address = publisher.address
     assert (address.rig, address.pid) == ("rig under test", publisher.process.pid)
     assert find("rig under test") == address
     assert all(accepts(port) for port in publisher.ports)
-
-
-def test_nothing_is_open_beyond_loopback(publisher):
+    # And nothing is open beyond loopback.
     assert eventually(lambda: page(publisher))
     pids = publisher.process.pid, publisher.server_pid
     listening = {end.local for pid in pids for end in listeners(pid)}
@@ -148,8 +146,15 @@ def test_two_rigs_have_a_view_each(publisher, start_producer, start_publisher, a
     assert all(accepts(port) for port in other.ports | own)
 
 
-def test_ends_with_its_input_and_takes_the_server_along(publisher):
+def test_ends_with_its_input_alone_and_takes_the_server_along(publisher):
+    """An interrupt is the supervisor's business."""
     server = publisher.server_pid
+    for number in (signal.SIGINT, signal.SIGTERM):
+        os.kill(publisher.process.pid, number)
+        os.kill(server, signal.SIGINT)
+        time.sleep(0.3)
+        assert publisher.process.poll() is None
+        assert not has_ended(server)
     own = listeners(publisher.process.pid) | listeners(server)
     assert len(own) == 3
     assert publisher.end() == (0, "", "")
@@ -167,16 +172,6 @@ def test_stays_open_for_as_long_as_asked(start_publisher):
     assert page(publisher)
     assert publisher.process.wait(300.0) == 0
     assert time.monotonic() - began_s >= 2.5
-
-
-def test_interrupt_is_the_supervisors_business(publisher):
-    server = publisher.server_pid
-    for number in (signal.SIGINT, signal.SIGTERM):
-        os.kill(publisher.process.pid, number)
-        os.kill(server, signal.SIGINT)
-        time.sleep(0.3)
-        assert publisher.process.poll() is None
-        assert not has_ended(server)
 
 
 def test_a_killed_publisher_leaves_no_server(publisher):

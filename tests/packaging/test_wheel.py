@@ -10,6 +10,7 @@ from importlib.metadata import Distribution, distribution
 from pathlib import Path
 
 import pytest
+from cases import further
 from packaging.requirements import Requirement
 
 from rigd.testing import chirp_signals, write_session
@@ -124,7 +125,7 @@ def test_the_analyser_needs_no_extra(bare, tmp_path):
     ("command", "subject", "extra"),
     [
         (("rigd", "run", "chirp", "--fast", "--live"), "--live", "live"),
-        (("rigd", "serve", "--profile", "sim", "--web"), "The page", "rig"),
+        further(("rigd", "serve", "--profile", "sim", "--web"), "The page", "rig"),
         (("rigd", "check", "--profile", "sim"), "This command", "rig"),
         (("rigd", "run", "chirp", "--profile", "antenna_can"), "The rig antenna_can", "rig"),
         (("analyze", "session.mcap", "--rerun", "session.rrd"), "--rerun", "live"),

@@ -45,7 +45,7 @@ def test_noise_free_fits_return_the_parameters_of_table_3(
         assert fit.cost < 1e-15
 
 
-@settings(max_examples=50)
+@settings(max_examples=25)
 @given(
     name=st.sampled_from(list(STRUCTURES)),
     weighting=st.sampled_from([*WEIGHTINGS, "omega^-0.5"]),

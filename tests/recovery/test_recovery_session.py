@@ -1,7 +1,6 @@
 """A session whose file cannot be written any more stops safely and keeps what it has."""
 
 import json
-import os
 import resource
 import shutil
 import subprocess
@@ -10,6 +9,7 @@ import time
 from pathlib import Path
 
 import pytest
+import warm_start
 
 from rigd.session import read_session, recover
 
@@ -50,12 +50,11 @@ def test_a_file_that_cannot_grow_ends_the_session(tmp_path):
 def test_a_folder_that_is_removed_ends_the_session(write_profile, tmp_path):
     folder = tmp_path / "sessions"
     where = ("--profile", write_profile("sim", patient=True), "--output", folder)
-    process = subprocess.Popen(
+    process = warm_start.start(
         [RIGD, "run", "hold", "--json", "--duration", "60", "--rest", "0", *where],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
-        env=os.environ,
     )
     try:
         deadline = time.monotonic() + 300.0

@@ -12,16 +12,12 @@ pytestmark = pytest.mark.fit
 
 
 @pytest.fixture(scope="module")
-def done(write_session, make_signals, tmp_path_factory):
+def done(write_session, make_signals, tmp_path_factory, without_drawing):
     folder = tmp_path_factory.mktemp("record")
     path = write_session(folder / "a.mcap", make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3))
-    result = CliRunner().invoke(
-        app,
-        [
-            str(path), "--method", "record", "--band", "1,20", "--weights", "omega",
-            "--figures", "png", "--json", str(folder / "a.json"),
-        ],
-    )  # fmt: skip
+    options = ("--method", "record", "--band", "1,20", "--weights", "omega", "--figures", "png")
+    with without_drawing():
+        result = CliRunner().invoke(app, [str(path), *options, "--json", str(folder / "a.json")])
     assert result.exit_code == 0, result.stderr
     return result, folder, json.loads((folder / "a.json").read_text())
 
@@ -63,13 +59,14 @@ def test_the_band_is_the_whole_record_s(done):
 
 @pytest.mark.parametrize("method", ["all", further("record")])
 def test_warnings_are_told_where_welch_s_fits_are_not_made(
-    write_session, make_signals, tmp_path, monkeypatch, method
+    write_session, make_signals, tmp_path, monkeypatch, without_drawing, method
 ):
     """They went to page and JSON alone."""
     monkeypatch.chdir(tmp_path)
     signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
     write_session("a.mcap", signals, metadata={"excitation": "touch"})
     brief = ("--band", "1,20", "--figures", "png")
-    result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method, *brief])
+    with without_drawing():
+        result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method, *brief])
     assert result.stdout.count("Warning: The session is a touch") == 1
     assert result.output.count("Welch fits left out") == (method == "all")

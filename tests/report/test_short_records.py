@@ -44,8 +44,9 @@ def test_what_there_is_is_reported(cut, analyze_here, tmp_path):
 
 
 @pytest.mark.fit
-def test_too_short_for_the_whole_record_is_told(cut, analyze_here):
-    result = analyze_here(cut(1200), *ONE_FIT, "--report", "r")
+def test_too_short_for_the_whole_record_is_told(cut, analyze_here, without_drawing):
+    with without_drawing():
+        result = analyze_here(cut(1200), *ONE_FIT, "--report", "r")
     assert result.returncode == 0
     assert "1.2 s of record are too short for the band" in result.stderr
     alone = analyze_here(cut(1200), "--method", "record", "--report", "alone")

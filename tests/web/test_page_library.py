@@ -75,6 +75,8 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert 'attachment; filename="first.mcap"' in head
     assert get(served, "/api/sessions/first/look")[2]["response"] == two
     assert get(served, "/api/sessions/second/look")[0] == 404
+    (served.folder / "folder.mcap").mkdir()
+    assert get(served, "/api/sessions/folder/file.mcap")[0] == 404
     status, head, body = get(served, "/api/sessions/first/report/")
     assert (status, body[-8:]) == (200, b"A report")
     assert "sandbox" in head

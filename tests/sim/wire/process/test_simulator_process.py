@@ -12,6 +12,7 @@ from pathlib import Path
 
 import pytest
 import serial
+import warm_start
 from cases import further
 
 from rigd.devices.contracts import DeviceError
@@ -20,25 +21,12 @@ from rigd.sim.wire import WrongUseError, parse_fault
 
 pytestmark = pytest.mark.process
 
-RUN = (
-    "import typer\n"
-    "from rigd.cli.simulate import inject, simulate\n"
-    "app = typer.Typer(pretty_exceptions_enable=False)\n"
-    "app.command()(simulate)\n"
-    "app.command()(inject)\n"
-    "app()\n"
-)
+RIGD = Path(sys.executable).parent / "rigd"
 START_S = 60.0
 
 
-def command(*arguments):
-    return [sys.executable, "-c", RUN, *map(str, arguments)]
-
-
 def rigd(*arguments):
-    return subprocess.run(
-        command(*arguments), capture_output=True, text=True, timeout=300, check=False
-    )
+    return warm_start.run([RIGD, *arguments], capture_output=True, text=True, timeout=300)
 
 
 class Simulator:
@@ -48,8 +36,8 @@ class Simulator:
         self.profile = profile
         number = len(list(folder.glob("*.jsonl")))
         self.log = folder / f"{profile}-{number}.jsonl"
-        self.process = subprocess.Popen(
-            command("simulate", "--profile", profile, "--log", self.log, *options),
+        self.process = warm_start.start(
+            [RIGD, "simulate", "--profile", profile, "--log", self.log, *map(str, options)],
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
             text=True,

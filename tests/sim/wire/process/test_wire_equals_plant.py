@@ -5,14 +5,15 @@ gauges' resolution: pairing, order, scaling and every delay, through the drivers
 """
 
 import re
-import subprocess
 import sys
 import time
 from dataclasses import replace
 from pathlib import Path
+from subprocess import DEVNULL
 
 import numpy as np
 import pytest
+import warm_start
 from cases import further
 
 from rigd.devices import open_devices
@@ -30,13 +31,7 @@ AND_A_HUM = '0.0, source = "assumed" }\nhum_nm = { value = 0.02, source = "assum
 AND_A_DRIFT = (
     '0.0, source = "assumed" }\nstiffness_drift_per_s = { value = -1e-3, source = "assumed" }  # '
 )
-RUN = (
-    "import sys\n"
-    "from rigd.profile import load_profile\n"
-    "from rigd.sim.wire import SimulatorOptions, run_simulator\n"
-    "options = SimulatorOptions(lock_step=True, quiet=True)\n"
-    "sys.exit(run_simulator(load_profile(sys.argv[1]).rig, options))\n"
-)
+RIGD = Path(sys.executable).parent / "rigd"
 
 
 def torque_nm(tick):
@@ -68,7 +63,8 @@ def simulated_profile(tmp_path, monkeypatch):
             text = edit(text, key, value)
         path = tmp_path / "still.toml"
         path.write_text(text)
-        processes.append(subprocess.Popen([sys.executable, "-c", RUN, str(path)]))
+        command = [RIGD, "simulate", "--profile", path, "--lock-step"]
+        processes.append(warm_start.start(command, stdout=DEVNULL, stderr=DEVNULL))
         while find_simulator("still") is None:
             assert processes[-1].poll() is None
             time.sleep(0.01)
@@ -175,7 +171,7 @@ def bare(rig, ticks):
         further("antenna_serial", {"filter": '"triangle"', "sensor:delay_s": "1.0e-3"}),
         ("antenna_serial", {}),
         ("antenna_can", {"force_noise_n": AND_AN_OBSTACLE}),
-        ("antenna_serial", {"force_noise_n": AND_AN_OBSTACLE}),
+        further("antenna_serial", {"force_noise_n": AND_AN_OBSTACLE}),
         further("antenna_can", {"force_noise_n": AND_A_DRIFT}),
         further("antenna_serial", {"force_noise_n": AND_A_DRIFT}),
     ],
@@ -195,7 +191,7 @@ def test_the_wire_changes_nothing(simulated_profile, name, changes):
     assert max(abs(change[5]) for change in changes) > 0.02
 
 
-@pytest.mark.parametrize("name", ["antenna_can", "antenna_serial"])
+@pytest.mark.parametrize("name", [further("antenna_can"), "antenna_serial"])
 def test_a_hum_comes_over_the_wire(simulated_profile, name):
     rig = simulated_profile(name, {"force_noise_n": AND_A_HUM})
     ticks = 120
