@@ -51,6 +51,9 @@ def test_files_of_the_project_that_are_named_exist(path):
         assert TO_BE_MADE.search(name) or (PROJECT / name).exists(), name
 
 
+COMMAND = re.compile(r"(rigd|analyze) (?!.*[─│])")
+
+
 def shell_lines(path):
     """Lines for a shell in a document; those that continue are joined."""
     text = path.read_text("utf-8").replace("\\\n", " ")
@@ -58,8 +61,8 @@ def shell_lines(path):
     for language, block in blocks:
         for line in block.splitlines():
             # Without a language stand commands that a test does not run, and drawings.
-            if language in ("sh", "bash") or re.match(r"(rigd|analyze) (?!.*[─│])", line):
-                yield line
+            if language in ("sh", "bash", "console") or COMMAND.match(line):
+                yield line.removeprefix("$ ").partition(" [--")[0]
 
 
 def commands(line):
