@@ -17,12 +17,12 @@ def install(folder, package, version, code, entry_points):
     (metadata / "entry_points.txt").write_text(entry_points)
 
 
-def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd"), environment=None):
+def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd")):
     """Run rigd with the packages of a folder; return exit code, output and errors."""
     done = subprocess.run(
         [sys.executable, *program, *map(str, arguments)],
         cwd=cwd or folder, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": str(folder)} | (environment or {}),
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, map(str, (folder,))))},
     )  # fmt: skip
     return done.returncode, done.stdout, done.stderr
 
