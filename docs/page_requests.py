@@ -214,19 +214,15 @@ def command_schemas() -> Document:
 
 
 def page_rows(document: Document) -> list[tuple[str, ...]]:
-    """Return a row for each request: method and path, what it does, parameters, replies."""
-    return [
-        (
-            f"`{method.upper()} {path}`",
-            described["summary"],
-            ", ".join(
-                f"`{each['name']}`" for each in described["parameters"] if each["in"] == "query"
-            ),
-            {1: "yes", 2: "but for `stop` and `predict`"}.get(
-                len(described.get("security", ())), ""
-            ),
-            ", ".join(described["responses"]),
-        )
-        for path, methods in document["paths"].items()
-        for method, described in methods.items()
-    ]
+    """Return a row for each request: method and path, what it does, whether it needs the token."""
+    rows = []
+    for path, methods in document["paths"].items():
+        for method, described in methods.items():
+            queries = [each for each in described["parameters"] if each["in"] == "query"]
+            names = ", ".join(f"`{each['name']}`" for each in queries)
+            text = f"{described['summary']} Query: {names}." if names else described["summary"]
+            token = {0: "", 1: "yes", 2: "but for `stop` and `predict`"}
+            rows.append(
+                (f"`{method.upper()} {path}`", text, token[len(described.get("security", ()))])
+            )
+    return rows

@@ -87,6 +87,12 @@ def module_names(module: ModuleType) -> list[str]:
     defined.analyze()
     own = {name for name in defined.tagorder if "." not in name}
     own |= {name for scope, name in defined.attr_docs if not scope}
+    own -= {
+        each.asname or each.name
+        for node in ast.walk(ast.parse(inspect.getsource(module)))
+        if isinstance(node, ast.ImportFrom)
+        for each in node.names
+    }
     values = vars(module)
     return [
         name
@@ -295,7 +301,7 @@ def describe_default(default: object) -> str:
 
 # Requests
 
-PAGE_COLUMNS = ("request", "what it does", "query", "needs the token", "replies")
+PAGE_COLUMNS = ("request", "what it does", "needs the token")
 
 
 def json_text(document: dict[str, Any]) -> str:
