@@ -51,18 +51,15 @@ def test_files_of_the_project_that_are_named_exist(path):
         assert TO_BE_MADE.search(name) or (PROJECT / name).exists(), name
 
 
-COMMAND = re.compile(r"(rigd|analyze) (?!.*[─│])")
-
-
 def shell_lines(path):
     """Lines for a shell in a document; those that continue are joined."""
     text = path.read_text("utf-8").replace("\\\n", " ")
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     for language, block in blocks:
         for line in block.splitlines():
-            # Without a language stand commands that a test does not run, and drawings.
-            if language in ("sh", "bash", "console") or COMMAND.match(line):
-                yield line.removeprefix("$ ").partition(" [--")[0]
+            # Other blocks have commands that a test does not run (console), output and drawings.
+            if language in ("sh", "bash") or re.match(r"(rigd|analyze) (?!.*[─│])", line):
+                yield line
 
 
 def commands(line):
