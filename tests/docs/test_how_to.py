@@ -236,6 +236,8 @@ def test_a_how_to_by_itself_runs_as_written(page, start, tmp_path):
         assert list(tmp_path.glob(pattern)), pattern
 
 
+@pytest.mark.process
+@pytest.mark.further  # what is exported is tested in tests/exchange
 def test_matlab_s_lines_read_what_is_exported(analyze_here, tmp_path):
     page = [PROJECT / "docs" / "export_to_matlab.md"]
     shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
