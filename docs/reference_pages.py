@@ -17,6 +17,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin, get_typ
 
 import annotated_types
 import typer
+from page_requests import page_document, page_rows
 from sphinx.pycode import ModuleAnalyzer
 
 from analysis.cli.app import app as analyze_app
@@ -34,10 +35,13 @@ LONGEST_VALUE = 100
 def write_pages(folder: Path = GENERATED) -> None:
     """Write all pages; files that would not change keep their times, so builds stay short."""
     interfaces = public_interfaces()
+    page = page_document()
     pages = {
         "commands.txt": commands_text(),
         "profile_keys.txt": profile_text(),
-        "socket_requests.txt": requests_text(),
+        "socket_requests.json": json_text(_protocol._REQUESTS.json_schema()),
+        "page_requests.json": json_text(page),
+        "page_requests.txt": table(PAGE_COLUMNS, page_rows(page)),
         "python.txt": interfaces_text(list(interfaces)),
     }
     pages |= {f"python/{name}.rst": python_page(name, names) for name, names in interfaces.items()}
@@ -83,6 +87,12 @@ def module_names(module: ModuleType) -> list[str]:
     defined.analyze()
     own = {name for name in defined.tagorder if "." not in name}
     own |= {name for scope, name in defined.attr_docs if not scope}
+    own -= {
+        each.asname or each.name
+        for node in ast.walk(ast.parse(inspect.getsource(module)))
+        if isinstance(node, ast.ImportFrom)
+        for each in node.names
+    }
     values = vars(module)
     return [
         name
@@ -291,8 +301,9 @@ def describe_default(default: object) -> str:
 
 # Requests
 
+PAGE_COLUMNS = ("request", "what it does", "needs the token")
 
-def requests_text() -> str:
-    """Return the JSON schema of a request on the control socket."""
-    schema = json.dumps(_protocol._REQUESTS.json_schema(), indent=2, ensure_ascii=False)
-    return f"```json\n{schema}\n```\n"
+
+def json_text(document: dict[str, Any]) -> str:
+    """Return a schema as text."""
+    return json.dumps(document, indent=2, ensure_ascii=False) + "\n"

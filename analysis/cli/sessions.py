@@ -116,6 +116,11 @@ def latest_session(folder: Path = Path("sessions")) -> Path:
     from rigd.errors import UserError
     from rigd.library import list_sessions
 
+    if not folder.exists():
+        raise NoSessionsError(
+            f"--latest: there is no folder {folder}; record a session (rigd run), or name a folder "
+            "of session files: analyze --latest FOLDER."
+        )
     try:
         sessions = list_sessions(folder)
     except UserError as error:

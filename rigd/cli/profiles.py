@@ -135,6 +135,8 @@ def new(
     filled in. Missing features of the drive need your confirmation. Without a terminal there are no
     questions and confirmations, and the missing values are listed. No file is ever overwritten.
 
+    Without an EDS file, begin with a copy: rigd profiles copy antenna_can my_rig.
+
     Example: rigd profiles new --eds drive.eds --output my_rig.toml
     """
     from rigd.devices.eds import read_eds

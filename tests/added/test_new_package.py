@@ -1,9 +1,11 @@
 """A package that `rigd plugins new` makes passes its own tests, and is a device of rigd."""
 
 import os
+import re
 import subprocess
 import sys
 import tomllib
+from pathlib import Path
 
 import pytest
 from packages import rigd_with
@@ -11,30 +13,63 @@ from typer.testing import CliRunner
 
 from rigd.cli.app import app
 
+PROJECT = Path(__file__).parents[2]
 
-@pytest.mark.process
-def test_a_new_package_passes_its_tests_and_joins(tmp_path):
-    folder = tmp_path / "own"
-    code, output, errors = rigd_with(tmp_path, "plugins", "new", "mysensor", "--folder", folder)
+
+@pytest.fixture(scope="module")
+def package(tmp_path_factory):
+    """Folder of a new package, as pip would install it."""
+    folder = tmp_path_factory.mktemp("package") / "own"
+    code, output, errors = rigd_with(
+        folder.parent, "plugins", "new", "mysensor", "--folder", folder
+    )
     assert code == 0, output + errors
-    # As pip would install it.
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
     metadata = folder / f"{project['name']}-{project['version']}.dist-info"
     metadata.mkdir()
     ((group, names),) = project["entry-points"].items()
     lines = [f"[{group}]", *(f"{name} = {reference}" for name, reference in names.items())]
     (metadata / "entry_points.txt").write_text("\n".join(lines))
+    return folder
+
+
+@pytest.mark.process
+def test_a_new_package_passes_its_tests_and_joins(package, tmp_path):
     done = subprocess.run(
         [sys.executable, "-P", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error",
-         folder / "tests"],
-        cwd=folder, env=os.environ | {"PYTHONPATH": str(folder)},
+         package / "tests"],
+        cwd=package, env=os.environ | {"PYTHONPATH": str(package)},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
     assert "9 passed" in done.stdout
-    code, output, _ = rigd_with(folder, "plugins", "show", "mysensor", cwd=tmp_path)
+    code, output, _ = rigd_with(package, "plugins", "show", "mysensor", cwd=tmp_path)
     assert code == 0
     assert '# address of the instrument\nhost = "…"\n' in output
+
+
+@pytest.mark.process
+@pytest.mark.further
+def test_it_runs_as_its_page_says(package, runtime_folder, tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
+    (section,) = blocks("toml")
+    lines = "".join(blocks("sh")).splitlines()
+    assert [line.partition(" ")[0] for line in lines] == ["rigd"] * 4
+    for line in lines:
+        arguments = line.replace("--duration 20", "--duration 2 --no-look").split()[1:]
+        code, output, errors = rigd_with(package, *arguments, cwd=tmp_path)
+        assert code == 0, output + errors
+        if arguments[:2] == ["profiles", "copy"]:
+            (profile,) = tmp_path.rglob("lab.toml")
+            text, chosen = re.subn(r'\nsensor = ".*"', '\nsensor = "mysensor"', profile.read_text())
+            assert chosen == 1
+            profile.write_text(text + section)
+    assert list(tmp_path.glob("sessions/*-chirp.mcap"))
+
+
+def blocks(language):
+    page = (PROJECT / "docs" / "your_own_device.md").read_text("utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize("name", ["Upper", "cia402", "a b", "../x"])

@@ -57,7 +57,7 @@ def shell_lines(path):
     blocks = re.findall(r"^```(\w*)\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
     for language, block in blocks:
         for line in block.splitlines():
-            # Without a language stand commands that a test does not run, and drawings.
+            # Other blocks have commands that a test does not run (console), output and drawings.
             if language in ("sh", "bash") or re.match(r"(rigd|analyze) (?!.*[─│])", line):
                 yield line
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import pytest
 from eds_files import eds_path
+from scipy.io import loadmat
 
 from analysis import load
 
@@ -46,18 +47,67 @@ def of_one_session(shell):
 
 SHORTENED = """#!/bin/sh
 case "${0##*/} $*" in
-    "analyze export "*|"analyze import "*) ;;
+    "analyze export "*|"analyze import "*|"analyze touch "*) ;;
     "rigd run chirp --profile sim --fast "*) set -- "$@" --duration 30 --ring-down 3 ;;
     "rigd run chirp --fast --output sessions "*) set -- "$@" --duration 30 --ring-down 3 ;;
+    "rigd run chirp --repeat 20 "*) set -- "$@" --fast --duration 30 --ring-down 3 --repeat 2 ;;
+    "rigd run chirp --amplitude "*) set -- "$@" --fast --duration 30 --ring-down 3 --repeat 2 ;;
+    "rigd run chirp"|"rigd run chirp --there-and-back "*|"rigd run chirp --watch-fit")
+        set -- "$@" --fast --duration 30 --ring-down 3 ;;
     "rigd run multisine "*) set -- "$@" --period 2 --duration 6 ;;
-    "rigd run modes "*) set -- "$@" --duration 20 --ring-down 3 ;;
+    "rigd run modes "*) set -- "$@" --fast --duration 20 --ring-down 3 ;;
+    "rigd run move "*|"rigd run touch "*|"rigd run until "*) set -- "$@" --fast ;;
     "analyze "*"-chirp.mcap") set -- "$@" --types VI --weights omega --figures png ;;
     "analyze "*) set -- "$@" --types VI --figures png ;;
 esac
 exec "FOLDER/${0##*/}" "$@"
 """
-"""Stands before both programs: the same commands, but for sessions of minutes and a second time
-that everything is fitted."""
+"""Stands before both programs: the same commands, but for sessions of minutes, real time, and a
+second time that everything is fitted."""
+
+OTHER_PAGES = {
+    "campaigns": [
+        "sessions/campaign.report/report.html", "both_ways/campaign.report/report.html"
+    ],
+    "touch": ["sessions/*-touch.mcap", "model.json", "touches/report.html"],
+    "moves": ["sessions/*-move.mcap"],
+    "simulated_obstacles": ["tryouts/*-step.mcap"],
+    "better_experiments": ["sessions/*-modes.mcap"],
+    "until": ["sessions/*-until.mcap"],
+    "export_to_matlab": ["frf.mat"],
+}  # fmt: skip
+"""How-tos that run in a folder of their own, with files that they make."""
+
+RUN_ELSEWHERE = {
+    "exchange": "exchange/test_exchange_document.py",
+    "python_api": "api/test_api.py",
+    "opening_sessions": "docs/test_layouts.py",
+    "library": "library/test_library_document.py",
+    "your_own_device": "added/test_new_package.py",
+}
+"""How-tos with a test of their own."""
+
+NOT_RUN = {
+    "python3 -m venv env": "installs from the package index; .ci/release installs what is built",
+    "rigd plugins new mysensor": "installs a package; added/test_new_package.py does the same",
+    "python -m pytest rigd-mysensor/tests": "added/test_new_package.py",
+    "rigd check --profile lab": "on the bench",
+    "rigd bench": "three minutes; bench",
+    "rigd bench --seconds 10": "three minutes; bench",
+    "rigd serve --profile sim --web --output sessions": "packaging/test_automation.py, web",
+    "ssh -L 8720:127.0.0.1:8720 rig-computer": "needs another computer",
+    "ssh -L 9090:127.0.0.1:9090 -L 9876:127.0.0.1:9876 rig-computer": "needs another computer",
+    "rigd run chirp --live          # in one terminal": "needs a screen; live, cli",
+    "sudo useradd --system --user-group --groups dialout rigd": "changes the computer",
+    "python tests/endurance/run_starved.py --minutes 10 --busy 4    "
+    "# with programs that use all processor time": "make endurance",
+    "python -m analysis.quick_look sessions/20261122-184457-chirp-02.mcap [--last EARLIER.mcap]":
+        "every session of the other pages makes one; report",
+    "pip install 'rigd[dask]'": "needs other computers; campaigns",
+    "$ rigd run until --alpha 0.002": "is refused; cli/test_until.py",
+}  # fmt: skip
+"""First lines of the blocks ``console`` in tutorials and how-tos, with the reason or the test that
+shows the same."""
 
 
 # That the programs understand all commands is in test_documents.py.
@@ -161,6 +211,77 @@ def test_what_a_beginner_does_runs_as_written(page, made, start, tmp_path):
         assert_went_well(process)
     for pattern in made:
         assert list(tmp_path.glob(pattern)), pattern
+
+
+@pytest.mark.process
+@pytest.mark.timeout(900)
+@pytest.mark.parametrize(
+    "start", [pytest.param("short sessions", marks=pytest.mark.further)], indirect=True
+)
+@pytest.mark.parametrize("page", OTHER_PAGES)
+def test_a_how_to_by_itself_runs_as_written(page, start, tmp_path):
+    shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
+    paths = [PROJECT / "docs" / f"{page}.md"]
+    shells = blocks("sh", paths)
+    if page in ("touch", "moves"):  # a session and its analysis, which the reader has
+        shutil.copy(TUTORIALS / "antenna.mcap", tmp_path / "session.mcap")
+    if page == "moves":
+        shells.insert(0, "analyze session.mcap --json model.json")
+    commands = [("bash", "-c", script_of(shells))]
+    commands += [(sys.executable, "-c", code) for code in blocks("python", paths)]
+    for command in commands:
+        with start(*command) as process:
+            assert_went_well(process)
+    for pattern in OTHER_PAGES[page]:
+        assert list(tmp_path.glob(pattern)), pattern
+
+
+@pytest.mark.process
+@pytest.mark.further  # what is exported is tested in tests/exchange
+def test_matlab_s_lines_read_what_is_exported(analyze_here, tmp_path):
+    page = [PROJECT / "docs" / "export_to_matlab.md"]
+    shutil.copy(TUTORIALS / "antenna.mcap", tmp_path)
+    (command,), (lines,) = blocks("sh", page), blocks("matlab", page)
+    assert analyze_here(*command.split()[1:]).returncode == 0
+    assert set(re.findall(r"s\.(\w+)", lines)) <= loadmat(tmp_path / "frf.mat").keys()
+    if octave := shutil.which("octave-cli"):
+        instead = "semilogx = @(x, y) printf('%d points', numel(x + y));"  # needs no screen
+        done = subprocess.run(
+            [octave, "--norc", "--eval", instead + lines],
+            cwd=tmp_path, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        assert done.stdout.endswith(" points"), done.stderr
+
+
+BLOCK = re.compile(r"^ *```(\S*)\n *(.*?)\n(?:.*?\n)?? *```$", re.MULTILINE | re.DOTALL)
+
+
+def all_blocks():
+    """Page, language and first line of each block of the tutorials and how-tos."""
+    contents = (PROJECT / "docs" / "how_to.md").read_text("utf-8")
+    listed = re.findall(r"^\| \[.*?\]\((\w+)\.md\)", contents, re.MULTILINE)
+    pages = [PROJECT / "docs" / f"{name}.md" for name in listed]
+    for path in [*pages, *sorted(TUTORIALS.glob("*.md"))]:
+        text = path.read_text("utf-8")
+        for block in BLOCK.finditer(text):
+            yield path.stem, block[1], block[2]
+
+
+def test_every_block_is_run_or_says_why_not():
+    """``sh`` and other code is run, ``console`` is not and has a reason, ``text`` is output."""
+    found = list(all_blocks())
+    assert len(found) > 80
+    tutorials = {path.stem for path in TUTORIALS.glob("*.md")}
+    run = tutorials | set(OTHER_PAGES) | set(RUN_ELSEWHERE) | {path.stem for path in HOW_TOS}
+    for page, language, line in found:
+        assert language in (
+            "sh", "python", "toml", "sql", "matlab", "octave", "console", "text", "{toctree}"
+        ), f"{page}: {line}"  # fmt: skip
+        if language not in ("console", "text", "{toctree}"):
+            assert page in run, f"{page}: {line}"
+    assert {line for _, language, line in found if language == "console"} == NOT_RUN.keys()
+    for page, test in RUN_ELSEWHERE.items():
+        assert page in (PROJECT / "tests" / test).read_text("utf-8")
 
 
 def test_each_tutorial_is_run():

@@ -121,6 +121,19 @@ def test_the_analyser_needs_no_extra(bare, tmp_path):
     assert "antenna_can" in here("rigd", "profiles")
 
 
+def test_the_analyser_is_small(bare):
+    """Without what Python compiles: docs/platforms.md."""
+    (metadata,) = bare.glob("lib/python3*/site-packages/rigd-*.dist-info")
+    installed = Distribution.at(metadata)
+    files = [
+        Path(each.locate_file(file))
+        for each in (installed, *required([installed]).values())
+        for file in each.files
+        if file.suffix != ".pyc"
+    ]
+    assert 100e6 < sum(file.stat().st_size for file in files if file.exists()) < 350e6
+
+
 @pytest.mark.parametrize(
     ("command", "subject", "extra"),
     [

@@ -365,7 +365,7 @@ def test_the_newest_session_of_a_folder_can_be_asked_for(record_briefly, tmp_pat
     monkeypatch.chdir(tmp_path)
     nothing = CliRunner().invoke(app, ["--latest"])
     assert nothing.exit_code == 1
-    assert nothing.stderr.startswith("Error: --latest: sessions: the folder cannot be listed")
+    assert nothing.stderr.startswith("Error: --latest: there is no folder sessions; record a")
     for name, day in (("zulu", 1), ("alpha", 3), ("mike", 2)):
         record_briefly(name, day=day)
     CliRunner().invoke(app, ["--latest", "."])
