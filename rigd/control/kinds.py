@@ -7,7 +7,7 @@ from rigd.control._added import AddedController
 from rigd.control._control_law import LinearStep
 from rigd.control._loop_model import LinearController
 from rigd.control._pid import SHIPPED_CONTROLLER, PidController, design_pid
-from rigd.control.contracts import LoopController
+from rigd.control.contracts import Controller, LoopController
 from rigd.control.declaration import ControlledRig, ControllerKind
 from rigd.plugins import (
     Plugin,
@@ -109,7 +109,7 @@ def make_controller(rig: ControlledRig) -> LoopController:
         linear = linear_controller(rig)
         assert linear is not None
         limit_nm = float("inf") if kind.shifts_reference else rig.torque_limit_nm
-        controller = LinearStep(linear, limit_nm)
+        controller: Controller = LinearStep(linear, limit_nm)
     else:
         with plugin_errors(owner):
             controller = kind.make(rig)
