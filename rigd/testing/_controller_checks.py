@@ -27,7 +27,7 @@ _MEMORY_TICKS = 4000
 """Number of ticks in which the memory of the controller must not grow."""
 _MAX_BYTES_PER_TICK = 2.0
 """Growth of the memory in bytes a tick that counts as none; a stored number takes 32."""
-_BLOCKED_S = 0.5
+_BLOCKED_S = 2.0
 """Time in seconds for which the shaft is blocked, so that the torque reaches its limit."""
 _RECOVERY_S = 1.5
 """Time in seconds after which the controller must have recovered from the limit."""

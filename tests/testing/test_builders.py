@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -111,7 +112,7 @@ def test_the_shipped_controller_is_as_the_loop_relies_on():
 
 
 _PID_STEP, _PID_RESET = PidController.step, PidController.reset
-_LEFT_BEHIND = []
+_LEFT_BEHIND, _NOISE = [], itertools.count()
 
 
 @pytest.mark.parametrize(
@@ -120,7 +121,7 @@ _LEFT_BEHIND = []
         ("step", lambda *_: float("nan"), "a torque is not finite"),
         ("step", lambda pid, *w: 2 * _PID_STEP(pid, *w), "exceeds motor.peak_torque_nm"),
         ("step", lambda pid, *w: _PID_STEP(pid, *w) + 0.1, "it gives 0.1 N·m at rest"),
-        ("step", lambda pid, *w: _PID_STEP(pid, *w) + 1e-9 * (id(pid) % 997), "equal readings"),
+        ("step", lambda pid, *w: _PID_STEP(pid, *w) + 1e-9 * next(_NOISE), "equal readings"),
         ("step", lambda *w: _LEFT_BEHIND.append([w]) or _PID_STEP(*w), "memory grows by"),
         ("reset", lambda pid, _: _PID_RESET(pid, 0.0), "after a reset at"),
     ],
