@@ -20,6 +20,24 @@ class DiscretePlant:
 
     The state z contains the state of motor and beam, the last commands (newest first), and past
     readings that are delayed. No reading depends on the command u of its own tick.
+
+    Parameters
+    ----------
+    model
+        Motor, delays and rate.
+    realisation
+        State space of the beam, or None for the motor alone.
+
+    Attributes
+    ----------
+    a, b
+        State matrix, shape (n, n), and column of the command, shape (n,).
+    angle, velocity, sensor_torque
+        Rows that give angle, velocity and the sensor's torque at a tick from the state.
+    measured_angle, measured_torque
+        Rows that give the readings of angle and torque at a tick from the state.
+    shaft_torque
+        Effect on the next state of 1 N·m on the shaft for one period.
     """
 
     def __init__(self, model: LoopModel, realisation: Realisation | None) -> None:

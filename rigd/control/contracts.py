@@ -21,6 +21,11 @@ class Controller(Protocol):
 
         The next step returns 0 if reference and angle are equal to this angle and the coupling
         torque is zero.
+
+        Parameters
+        ----------
+        angle_rad
+            Angle at which the motor is at rest.
         """
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
@@ -28,6 +33,13 @@ class Controller(Protocol):
 
         It is a finite ``float``. The call takes a few microseconds, waits for nothing, and leaves
         no memory behind.
+
+        Parameters
+        ----------
+        reference_rad, angle_rad
+            Reference and measured angle.
+        coupling_torque_nm
+            Measured coupling torque.
         """
 
 
@@ -49,10 +61,23 @@ class LoopController(Protocol):
         """
 
     def reset(self, angle_rad: float) -> None:
-        """Set the controller's state to rest at an angle, so that the torque does not jump."""
+        """Set the controller's state to rest at an angle, so that the torque does not jump.
+
+        Parameters
+        ----------
+        angle_rad
+            Angle at which the motor is at rest.
+        """
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
         """Return the torque command of a tick in N·m, within `torque_limit_nm`.
+
+        Parameters
+        ----------
+        reference_rad, angle_rad
+            Reference and measured angle.
+        coupling_torque_nm
+            Measured coupling torque.
 
         Raises
         ------

@@ -459,7 +459,7 @@ class Profile:
 
     @property
     def is_loop_modelled(self) -> bool:
-        """Whether the model of the closed loop has the controller, and not the PID in its place.
+        """Whether the model of the closed loop has the controller, and not the PID instead.
 
         Own code of a package need not state matrices.
         """
