@@ -80,7 +80,9 @@ def main() -> None:
         )
     try:
         devices = open_devices(job.profile.rig, job.moving)
-    except RigdError as error:  # of a device, or of a beam that cannot be simulated
+        # Imports a package and designs its controller before a connected drive expects SYNCs.
+        make_controller(job.profile.controlled_rig())
+    except RigdError as error:  # of a device, a controller, or a beam that cannot be simulated
         parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))

@@ -306,7 +306,7 @@ class ProbingMove:
         self.reset(0.0)
 
     def reset(self, angle_rad: float) -> None:
-        """Set the move to its begin, with the shaft at rest at an angle."""
+        """Set the move to its start, with the shaft at rest at an angle."""
         self._start_rad = angle_rad
         self._beam_follower = BeamFollower(self._rig)
         first_side = -1.0 if angle_rad > 0.0 else 1.0
