@@ -1,4 +1,4 @@
-"""A package that `rigd plugins new` makes passes its own tests, and is a device of rigd."""
+"""A package that `rigd plugins new` makes passes its own tests, and is a part of rigd."""
 
 import os
 import subprocess
@@ -13,9 +13,19 @@ from rigd.cli.app import app
 
 
 @pytest.mark.process
-def test_a_new_package_passes_its_tests_and_joins(tmp_path):
+@pytest.mark.parametrize(
+    ("options", "passed", "shown"),
+    [
+        ((), 9, '# address of the instrument\nhost = "…"\n'),
+        (("--kind", "controller"), 8, '# In [control]: controller = "mypart"\n[mypart]\n'),
+    ],
+    ids=["device", "controller"],
+)
+def test_a_new_package_passes_its_tests_and_joins(tmp_path, options, passed, shown):
     folder = tmp_path / "own"
-    code, output, errors = rigd_with(tmp_path, "plugins", "new", "mysensor", "--folder", folder)
+    code, output, errors = rigd_with(
+        tmp_path, "plugins", "new", "mypart", *options, "--folder", folder
+    )
     assert code == 0, output + errors
     # As pip would install it.
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
@@ -31,15 +41,17 @@ def test_a_new_package_passes_its_tests_and_joins(tmp_path):
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "9 passed" in done.stdout
-    code, output, _ = rigd_with(folder, "plugins", "show", "mysensor", cwd=tmp_path)
+    assert f"{passed} passed" in done.stdout
+    code, output, _ = rigd_with(folder, "plugins", "show", "mypart", cwd=tmp_path)
     assert code == 0
-    assert '# address of the instrument\nhost = "…"\n' in output
+    assert shown in output
 
 
-@pytest.mark.parametrize("name", ["Upper", "cia402", "a b", "../x"])
-def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, name):
+@pytest.mark.parametrize(
+    "arguments", [["Upper"], ["cia402"], ["a b"], ["../x"], ["pid", "--kind", "controller"]]
+)
+def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["plugins", "new", name])
+    result = CliRunner().invoke(app, ["plugins", "new", *arguments])
     assert result.exit_code == 2
     assert not list(tmp_path.iterdir())
