@@ -1,6 +1,6 @@
 """Contracts between the control loop and a controller of the motor's angle."""
 
-from typing import Protocol
+from typing import Protocol, runtime_checkable
 
 from rigd.errors import FailureError
 
@@ -43,6 +43,7 @@ class Controller(Protocol):
         """
 
 
+@runtime_checkable
 class LoopController(Protocol):
     """What the loop uses of any controller: its torque, limited, and how it came about."""
 

@@ -11,6 +11,7 @@ from rigd.control.contracts import Controller, LoopController
 from rigd.control.declaration import ControlledRig, ControllerKind
 from rigd.plugins import (
     Plugin,
+    PluginError,
     find_plugin,
     installed_plugins,
     load_declaration,
@@ -101,9 +102,13 @@ def make_controller(rig: ControlledRig) -> LoopController:
     ControlDesignError
         If the PID cannot be designed.
     """
-    owner = controller_owner(rig.loop.settings.controller)
+    owner = _owner_of(rig)
     if owner is None:
-        return _make_pid(rig)
+        shipped = SHIPPED[rig.loop.settings.controller].make
+        assert shipped is not None
+        loop_controller = shipped(rig)
+        assert isinstance(loop_controller, LoopController)
+        return loop_controller
     kind = load_controller(owner)
     if kind.make is None:
         linear = linear_controller(rig)
@@ -132,11 +137,29 @@ def linear_controller(rig: ControlledRig) -> LinearController | None:
     PluginError
         If the package that adds the kind cannot be used, or its code fails.
     """
-    owner = controller_owner(rig.loop.settings.controller)
+    owner = _owner_of(rig)
     if owner is None:
         return None
     with plugin_errors(owner):
         return _linear_controller(load_controller(owner), owner, rig)
+
+
+def _owner_of(rig: ControlledRig) -> Plugin | None:
+    """Return the package that adds the controller of a rig, or None for a shipped one.
+
+    Raises
+    ------
+    PluginError
+        If there is no such controller any more, or its package cannot be used.
+    """
+    name = rig.loop.settings.controller
+    owner = controller_owner(name)
+    if owner is None and name not in SHIPPED:
+        raise PluginError(
+            f'control.controller = "{name}": no installed package adds it; install the package, or '
+            f'set control.controller = "{SHIPPED_CONTROLLER}".'
+        )
+    return owner
 
 
 @lru_cache(maxsize=8)

@@ -233,6 +233,15 @@ def test_code_that_fails_refuses_a_session_with_the_name_of_the_package(
     sys.modules.pop("u_bad", None)
 
 
+def test_a_package_that_is_gone_is_an_error_and_not_the_pid(packages, tmp_path, monkeypatch):
+    profile = load_profile(write_rig(tmp_path, "own"))
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each != str(packages)])
+    with pytest.raises(PluginError, match='"own": no installed package adds it'):
+        make_controller(profile.controlled_rig())
+    with pytest.raises(PluginError, match="no installed package"):
+        profile.loop_model()
+
+
 def test_two_parts_of_one_section_are_named(packages, tmp_path, monkeypatch):
     load_profile(write_rig(tmp_path, "own"))
     code = (

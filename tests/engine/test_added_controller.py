@@ -8,7 +8,7 @@ import pytest
 from packages import install
 from shipped_profile import load_shipped
 
-from rigd.engine.messages import Finished
+from rigd.engine.messages import Finished, Measured, Probe
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session.layout import Status
@@ -171,4 +171,14 @@ def test_a_slow_one_counts_as_missed_ticks(make_session, law, monkeypatch):
     monkeypatch.setattr(law, "ACTION", lambda: clock.spend(5_300_000))
     session = run_hold(make_session, clock=clock).run()
     assert session.finished.counts["missed"] == 4
+    session.assert_safe()
+
+
+def test_a_probing_move_is_its_own_controller(make_session, law, monkeypatch):
+    monkeypatch.setattr(law.Law, "step", lambda *_: float("nan"))
+    session = run_hold(make_session)
+    session.obey(Probe(session.profile), session.order())
+    (measured,) = session.parent.said(Measured)
+    assert measured.values["end"] == "COMPLETE"
+    assert session.finished.outcome == "fault"  # the session after it has the profile's controller
     session.assert_safe()
