@@ -82,7 +82,7 @@ def probe(
     stated = replace(profile, rig=scaled(profile.rig, lie.profile))
     rig, plant = probed_rig(stated), SimulatedPlant(truth)
     plant.enable()
-    move = ProbingMove(rig, plan_probe(rig), 0.0, noise_nm)
+    move = ProbingMove(rig, plan_probe(rig), noise_nm)
     noise = noise_nm * np.random.default_rng(seed).standard_normal(LONGEST_TICKS)
     angle_rad = from_rad = 0.0
     speeds, angles = [0.0], [0.0]

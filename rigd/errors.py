@@ -23,6 +23,7 @@
      |    +-- WrongUseError         rigd inject with a fault that does not exist
      +-- FailureError          the same request may succeed later: exit code 1
      |    +-- DeviceError           the drive does not answer, or reports a fault
+     |    +-- ControllerError       the code of a package's controller failed in a tick
      |    +-- CheckFailedError      rigd check fails without a device: the worst travel is too long
      |    +-- ProbeFailedError      the probing move contradicts a scale of the profile
      |    +-- ChildError            the control process was killed

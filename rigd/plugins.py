@@ -11,11 +11,11 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Iterator
+from collections.abc import Container, Iterator
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Final, TypeVar
+from typing import Final, Protocol, TypeVar
 
 from rigd.errors import FailureError, UserError
 from rigd.printable import listed, printable
@@ -23,13 +23,33 @@ from rigd.printable import listed, printable
 T = TypeVar("T")
 """Type of the object that an entry point names."""
 
+
+class Declaration(Protocol):
+    """Declaration of a part, whose name is that of its entry point."""
+
+    @property
+    def name(self) -> str:
+        """Name of the part."""
+
+
+D = TypeVar("D", bound=Declaration)
+"""Type of the declaration that an entry point names."""
+
 GROUPS: Final = {
     "rigd.devices": "rigd.profile:check_device_plugin",
+    "rigd.controllers": "rigd.profile:check_controller_plugin",
     "rigd.excitations": "rigd.excitation:check_excitation_plugin",
     "analysis.formats": "analysis.exchange:check_format_plugin",
 }
 """Groups of entry points, each with the function that checks an entry point of the group."""
 
+_NOUNS: Final = {
+    "rigd.devices": "device",
+    "rigd.controllers": "controller",
+    "rigd.excitations": "excitation",
+    "analysis.formats": "file format",
+}
+"""Words for a part of each group, for messages."""
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 """Pattern of the names that a package can add; they are keys of profiles and options."""
 _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -60,6 +80,11 @@ class Plugin:
     """Version of the package."""
     problem: str = ""
     """Reason why the part cannot be used, as a sentence with a remedy; empty if none is known."""
+
+    @property
+    def noun(self) -> str:
+        """Word for a part of the group, for messages."""
+        return _NOUNS[self.group]
 
     @property
     def label(self) -> str:
@@ -145,6 +170,51 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
     return found
 
 
+def refuse_built_in(plugin: Plugin, built_in: Container[str]) -> None:
+    """Raise if a package adds a part whose name is built in.
+
+    Parameters
+    ----------
+    plugin
+        Part of an installed package.
+    built_in
+        Names of the parts that come with rigd.
+
+    Raises
+    ------
+    PluginError
+        If the name is built in.
+    """
+    if plugin.name in built_in:
+        raise plugin.error(
+            f"this {plugin.noun} is built into rigd and cannot be replaced; rename it."
+        )
+
+
+def load_declaration(plugin: Plugin, expected: type[D]) -> D:
+    """Import a package and return the declaration of its part, which has the entry point's name.
+
+    Parameters
+    ----------
+    plugin
+        Part of an installed package.
+    expected
+        Type that the declaration must have.
+
+    Raises
+    ------
+    PluginError
+        If the import fails in any way, or the declaration has another type or name.
+    """
+    declaration = load_plugin(plugin, expected)
+    if declaration.name != plugin.name:
+        raise plugin.error(
+            f'it declares the {plugin.noun} "{declaration.name}"; the two names must be '
+            "equal: rename one."
+        )
+    return declaration
+
+
 def check_plugin(plugin: Plugin) -> str:
     """Import a part that a package adds, check it, and return one line on it.
 
@@ -179,7 +249,7 @@ def plugin_errors(
         yield
     except passed_on:
         raise
-    except Exception as error:
+    except (Exception, SystemExit) as error:  # SystemExit is no Exception
         if plugin is None:
             raise
         raise plugin.error(

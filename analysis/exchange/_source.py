@@ -19,6 +19,7 @@ from rigd.plugins import (
     installed_plugins,
     load_plugin,
     plugin_errors,
+    refuse_built_in,
 )
 from rigd.printable import printable
 from rigd.session.limits import MAX_SAMPLES
@@ -233,8 +234,7 @@ def check_format_plugin(plugin: Plugin) -> str:
     PluginError
         If it cannot be used.
     """
-    if f".{plugin.name}" in _FORMATS:
-        raise plugin.error("files of this suffix are read by rigd; it cannot be replaced.")
+    refuse_built_in(plugin, {suffix.removeprefix(".") for suffix in _FORMATS})
     file_format = load_plugin(plugin, ImportFormat)
     return f"{file_format.name}, import of .{plugin.name}"
 

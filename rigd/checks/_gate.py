@@ -75,6 +75,11 @@ PAPER_CHECKS: Final = (
         needs_values=False,
     ),
     PaperCheck(
+        paper.added_controller_rows,
+        (paper.CONTROLLER_ROW,),
+        not_acceptable="the shaft could not be held",
+    ),
+    PaperCheck(
         paper.stability_rows,
         (paper.STABILITY_ROW,),
         not_acceptable="the shaft could not be held",

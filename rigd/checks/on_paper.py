@@ -39,11 +39,13 @@ from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.realisation import RealisationError
 from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.control import ControlDesignError, stable_loop
+from rigd.control.contracts import ControllerError
+from rigd.control.kinds import controller_owner, load_controller, make_controller
 from rigd.devices import MAY_BE_UNKNOWN, is_simulated_here, unknown_values
 from rigd.devices.kinds import find_owner, selected_kinds
 from rigd.devices.parameters import RigParameters
 from rigd.excitation import chirp
-from rigd.plugins import plugin_errors
+from rigd.plugins import PluginError, plugin_errors
 from rigd.profile import Profile
 from rigd.safety import ENCODER_FAILURE_S
 from rigd.safety.limits import Limits
@@ -74,8 +76,20 @@ STABILITY_ROW = "loop_stability"
 def stability_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the check result on whether the closed loop of a profile's rig is stable."""
     try:
+        if not profile.is_loop_modelled:
+            yield CheckRow(
+                "loop",
+                "stability",
+                f'not checked: controller "{profile.control.controller}" states no matrices',
+                "stable",
+                CheckResult.WARNING,
+                "Loop: neither stability nor margins are known, and sessions are predicted with "
+                "the PID of [control]. Start with a small amplitude.",
+                STABILITY_ROW,
+            )
+            return
         closed_loop, warning_text = stable_loop(profile.loop_model())
-    except (ControlDesignError, RealisationError) as error:
+    except (ControlDesignError, RealisationError, PluginError) as error:
         yield CheckRow(
             "loop", "stability", str(error), "stable", CheckResult.FAIL, name=STABILITY_ROW
         )
@@ -95,12 +109,18 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield results on the stability margins of the closed loop; skipped if it is unstable."""
     from rigd.control import loop_margins
 
+    skip_reason = ""
     try:
-        closed_loop, warning_text = stable_loop(profile.loop_model())
-    except (ControlDesignError, RealisationError) as error:
-        warning_text = str(error)
-    if warning_text is not None:
-        yield CheckRow("loop", "margins", "the loop is not stable", "", CheckResult.SKIPPED)
+        if profile.is_loop_modelled:
+            closed_loop, warning_text = stable_loop(profile.loop_model())
+            if warning_text is not None:
+                skip_reason = "the loop is not stable"
+        else:
+            skip_reason = "the controller states no matrices"
+    except (ControlDesignError, RealisationError, PluginError):
+        skip_reason = "the loop is not stable"
+    if skip_reason:
+        yield CheckRow("loop", "margins", skip_reason, "", CheckResult.SKIPPED)
         return
     period_s = 1.0 / profile.rig.rate_hz
     for cut_margins in loop_margins(closed_loop):
@@ -616,6 +636,49 @@ def added_device_rows(profile: Profile) -> Iterator[CheckRow]:
             with plugin_errors(owner):
                 for row in kind.check_rows(profile.rig):
                     yield replace(row, name=DEVICE_ROW)
+
+
+CONTROLLER_ROW = "controller"
+"""Name of the rows on the controller that an installed package adds."""
+_LARGEST_START_FRACTION = 1e-6
+"""Largest torque of a controller at rest, as a fraction of the motor's peak torque."""
+
+
+def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
+    """Yield the rows on the controller of an installed package; none for the shipped one."""
+    name = profile.control.controller
+    owner = controller_owner(name)
+    if owner is None:
+        return
+    yield CheckRow("controller", name, owner.label, "", CheckResult.OK)
+    rig = profile.controlled_rig()
+    row_label, wanted_text = "torque after a reset", "0 N·m"
+    try:
+        start_torques_nm = []
+        controller = make_controller(rig)
+        for start_rad in (0.0, profile.limits.angle_rad):
+            controller.reset(start_rad)
+            controller.step(start_rad, start_rad, 0.0)
+            start_torques_nm.append(abs(controller.unlimited_torque_nm))
+        kind = load_controller(owner)
+        with plugin_errors(owner):
+            declared_rows = () if kind.check_rows is None else tuple(kind.check_rows(rig))
+    except (ControllerError, ControlDesignError, PluginError) as error:
+        yield CheckRow(
+            "controller", row_label, str(error), wanted_text, CheckResult.FAIL, name=CONTROLLER_ROW
+        )
+        return
+    largest_nm = max(start_torques_nm)
+    yield CheckRow(
+        "controller",
+        row_label,
+        f"{largest_nm:.3g} N·m",
+        wanted_text,
+        grade(fail=not largest_nm <= _LARGEST_START_FRACTION * rig.torque_limit_nm),
+        name=CONTROLLER_ROW,
+    )
+    for row in declared_rows:
+        yield replace(row, name=CONTROLLER_ROW)
 
 
 def _identifier_row(found_text: str, check_result: CheckResult) -> CheckRow:

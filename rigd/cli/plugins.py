@@ -2,6 +2,7 @@
 
 import json
 import re
+from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
@@ -17,8 +18,9 @@ plugins_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 def plugins(context: typer.Context, as_json: AsJson = False) -> None:
     """List what installed packages add, or make a package.
 
-    A package adds a device by an entry point of the group rigd.devices. Each is imported and
-    checked; one that cannot be used is named with the reason, and the command exits with 1.
+    A package adds a device by an entry point of the group rigd.devices, a controller by one of
+    rigd.controllers. Each is imported and checked; one that cannot be used is named with the
+    reason, and the command exits with 1.
 
     Example: rigd plugins
     """
@@ -59,69 +61,105 @@ def plugins(context: typer.Context, as_json: AsJson = False) -> None:
 
 @plugins_app.command()
 def show(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the device.")],
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the device or controller.")],
 ) -> None:
-    """Print the section of a profile for a device that an installed package adds.
+    """Print the section of a profile for a device or controller that an installed package adds.
 
     Example: rigd plugins show netft
     """
+    from rigd.control.kinds import controller_owner, find_controller
     from rigd.devices.kinds import find_kind, find_owner
     from rigd.profile import section_text
 
-    kind = find_kind(name)
-    if kind is None or find_owner(name) is None:
-        fail(f"No installed package adds a device {printable(name, 40)}.", EXIT_WRONG_USE)
-    typer.echo(section_text(kind), nl=False)
+    device = find_kind(name)
+    if device is not None and find_owner(name) is not None:
+        typer.echo(section_text(device), nl=False)
+        return
+    controller = find_controller(name)
+    if controller is None or controller_owner(name) is None:
+        fail(
+            f"No installed package adds a device or a controller {printable(name, 40)}.",
+            EXIT_WRONG_USE,
+        )
+    typer.echo(f'# In [control]: controller = "{name}"')
+    typer.echo(section_text(controller), nl=False)
 
 
 _TEMPLATE = Path(__file__).with_name("plugin_template")
-"""Folder with the files of a new package, in which NAME represents the name of its device."""
-_TEMPLATE_FILES = {
-    "pyproject.toml.txt": "pyproject.toml",
-    "README.md.txt": "README.md",
-    "device.py.txt": "rigd_NAME/__init__.py",
-    "test_device.py.txt": "tests/test_NAME.py",
+"""Folder with the files of a new package, in which NAME represents the name of its part."""
+
+
+class PartKind(StrEnum):
+    """Kind of part that a new package adds."""
+
+    DEVICE = "device"
+    """Force-torque sensor."""
+    CONTROLLER = "controller"
+    """Controller of the motor's angle."""
+
+
+_TEMPLATE_WORDS = {
+    PartKind.DEVICE: {
+        "TITLE": "Force-torque sensor NAME",
+        "GROUP": "rigd.devices",
+        "DECLARATION": "DEVICE",
+    },
+    PartKind.CONTROLLER: {
+        "TITLE": "Controller NAME",
+        "GROUP": "rigd.controllers",
+        "DECLARATION": "CONTROLLER",
+    },
 }
-"""Files of the template, each with its path in the new package."""
-_DEVICE_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
-"""Pattern of the name of a device."""
+"""Words of the template's project file and README that differ between the kinds of parts."""
+_PART_NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
+"""Pattern of the name of a part."""
 
 
 @plugins_app.command()
 def new(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the new device.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the new device or controller.")
+    ],
+    kind: Annotated[
+        PartKind, typer.Option("--kind", help="What the package adds.")
+    ] = PartKind.DEVICE,
     folder: Annotated[
         Path | None,
         typer.Option("--folder", metavar="FOLDER", help="New folder (default: rigd-NAME)."),
     ] = None,
 ) -> None:
-    """Make a package with a force-torque sensor and its tests, to be changed for your device.
+    """Make a package with a force-torque sensor or a controller and its tests, to be changed.
 
     Example: rigd plugins new mysensor
     """
-    from rigd.devices.kinds import find_kind
-    from rigd.plugins import PluginError
-
-    if not _DEVICE_NAME.fullmatch(name):
+    if not _PART_NAME.fullmatch(name):
         fail(
             f"{printable(name, 40)}: choose a name of lower-case letters, digits and _, at most 32 "
             "characters, that begins with a letter.",
             EXIT_WRONG_USE,
         )
-    try:
-        is_taken = find_kind(name) is not None
-    except PluginError:
-        is_taken = True
-    if is_taken:
-        fail(f"A device {name} exists already (rigd plugins); choose another name.", EXIT_WRONG_USE)
+    if _is_taken(kind, name):
+        fail(
+            f"A {kind.value} {name} exists already (rigd plugins); choose another name.",
+            EXIT_WRONG_USE,
+        )
+    template_files = {
+        "pyproject.toml.txt": "pyproject.toml",
+        "README.md.txt": "README.md",
+        f"{kind.value}.py.txt": "rigd_NAME/__init__.py",
+        f"test_{kind.value}.py.txt": "tests/test_NAME.py",
+    }
     target = folder if folder is not None else Path(f"rigd-{name}")
     try:
         target.mkdir(parents=True)
-        for template, path in _TEMPLATE_FILES.items():
-            text = (_TEMPLATE / template).read_text(encoding="utf-8").replace("NAME", name)
+        for template, path in template_files.items():
+            text = (_TEMPLATE / template).read_text(encoding="utf-8")
+            if not template.endswith(".py.txt"):
+                for word, replacement in _TEMPLATE_WORDS[kind].items():
+                    text = text.replace(word, replacement)
             new_file = target / path.replace("NAME", name)
             new_file.parent.mkdir(exist_ok=True)
-            new_file.write_text(text, encoding="utf-8")
+            new_file.write_text(text.replace("NAME", name), encoding="utf-8")
     except FileExistsError:
         fail(f"{target} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
     except OSError as error:
@@ -132,3 +170,16 @@ def new(
         )
         + f"rigd plugins, python -m pytest {printable(str(target))}/tests."
     )
+
+
+def _is_taken(kind: PartKind, name: str) -> bool:
+    """Return whether rigd or an installed package has a part of this kind and name."""
+    from rigd.control.kinds import find_controller
+    from rigd.devices.kinds import find_kind
+    from rigd.plugins import PluginError
+
+    try:
+        found = find_kind(name) if kind is PartKind.DEVICE else find_controller(name)
+    except PluginError:
+        return True
+    return found is not None

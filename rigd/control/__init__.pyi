@@ -1,13 +1,16 @@
 from ._closed_loop import ClosedLoop as ClosedLoop
-from ._closed_loop import LoopModel as LoopModel
 from ._closed_loop import LoopResponse as LoopResponse
 from ._closed_loop import check_stability as check_stability
 from ._closed_loop import close_loop as close_loop
 from ._closed_loop import stable_loop as stable_loop
+from ._discrete_plant import DiscretePlant as DiscretePlant
 from ._friction import Disturbances as Disturbances
 from ._friction import simulate_disturbed as simulate_disturbed
+from ._loop_model import LinearController as LinearController
+from ._loop_model import LoopModel as LoopModel
 from ._margins import Margins as Margins
 from ._margins import loop_margins as loop_margins
+from ._pid import SHIPPED_CONTROLLER as SHIPPED_CONTROLLER
 from ._pid import ControlDesignError as ControlDesignError
 from ._pid import ControlSettings as ControlSettings
 from ._pid import PidController as PidController

@@ -1,4 +1,4 @@
-"""The discrete closed loop of motor, beam, delays, feed-forward and PID: linear, exact at ticks.
+"""The discrete closed loop of motor, beam, delays and controller: linear, exact at ticks.
 
 The plant is propagated exactly for a torque that is constant between two switches. A switch is at
 the instant inside a period at which a command takes effect after the actuation delay. Delayed
@@ -9,20 +9,17 @@ effect of the old torque.
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from math import exp, floor, pi
+from math import exp, pi
 
 import numpy as np
 from numpy.typing import NDArray
 
 from rigd.beam import Damping, Plant, undamped_frequencies_rad_s
-from rigd.beam.realisation import Realisation, couple, propagator, realise
-from rigd.control._pid import (
-    ControlDesignError,
-    ControlSettings,
-    derivative_coefficients,
-    design_pid,
-    lowpass_coefficients,
-)
+from rigd.beam.realisation import Realisation, realise
+from rigd.control._control_law import control_law
+from rigd.control._discrete_plant import DiscretePlant
+from rigd.control._loop_model import LoopModel
+from rigd.control._pid import ControlDesignError
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complex128]
@@ -49,38 +46,12 @@ _LIGHT_DAMPING_RATIO = 1e-4
 """Damping ratio of the beam's first mode in this check. It is not 0, because rounding may make the
 realisation of an undamped beam unstable."""
 
-MAX_DELAY_PERIODS = 50
-"""Longest delay in the model in periods: every period of delay adds one state."""
-
 _MAX_DELAY_EIGENVALUE = 1e-9
 """Magnitude of an eigenvalue below which it belongs to a delay, which decays within a few ticks."""
 _BLOCK_TICKS = 64  # ticks: fewer make the sequential part longer, more the products
 _BLOCKS_AT_ONCE = 4096
 """Number of blocks of ticks whose response is computed at once."""
 _OUTPUT_ROWS = 5  # angle, velocity, torque without friction, reference speed, sensor torque
-
-
-@dataclass(frozen=True, slots=True)
-class LoopModel:
-    """Parameters of motor, beam, delays and controller, from which a closed loop is computed."""
-
-    rate_hz: float
-    """Ticks a second."""
-    plant: Plant | None
-    """Beam on the motor, with its damping and ends and the tool inertia; None: the motor alone. The
-    delay of the torque relative to the angle follows from the ages of both readings."""
-    motor_inertia_kg_m2: float
-    """Inertia of the motor, at the output shaft."""
-    viscous_nm_s_per_rad: float
-    """Viscous friction of the motor, at the output shaft."""
-    actuation_delay_s: float
-    """Delay from a tick to the instant when its command takes effect; any fraction of a period."""
-    angle_delay_s: float
-    """Age of the angle reading at the tick that uses it."""
-    torque_delay_s: float
-    """Age of the coupling torque reading at the tick that uses it."""
-    settings: ControlSettings
-    """Settings of the controller."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -288,77 +259,48 @@ def close_loop(model: LoopModel) -> ClosedLoop:
     >>> loop.spectral_radius < 1
     True
     """
-    settings = model.settings
-    gains = design_pid(model.motor_inertia_kg_m2, model.viscous_nm_s_per_rad, settings.pole_rad_s)
+    law = control_law(model)
     realisation = None if model.plant is None else realise(model.plant)
-    discrete_plant = _DiscretePlant(model, realisation)
-    n = discrete_plant.a.shape[0]
+    discrete_plant = DiscretePlant(model, realisation)
+    n, size = discrete_plant.a.shape[0], discrete_plant.a.shape[0] + len(law.a)
 
-    # States: plant, integral, derivative, two low-pass filters of the reference.
-    integral_index, derivative_index, first_filter_index, second_filter_index = range(n, n + 4)
-    period_s = 1.0 / model.rate_hz
-    integral_gain = gains.ki_nm_per_rad_s * period_s
-    derivative_decay, derivative_gain = derivative_coefficients(gains, model.rate_hz)
-    b_p, b_d, kp = gains.setpoint_weight_p, gains.setpoint_weight_d, gains.kp_nm_per_rad
-
-    a = np.zeros((n + 4, n + 4))
-    b = np.zeros(n + 4)
-    measured_angle_row, measured_torque_row, command_column = np.zeros((3, n + 4))
+    # States: plant, then controller.
+    a, b = np.zeros((size, size)), np.zeros(size)
+    measured_angle_row, measured_torque_row, command_column = np.zeros((3, size))
     measured_angle_row[:n] = discrete_plant.measured_angle
     measured_torque_row[:n] = discrete_plant.measured_torque
     command_column[:n] = discrete_plant.b
-
-    # The integral carries Ki T/2 of the last error, the derivative its decayed last step.
-    torque_from_angle = -(kp + 0.5 * integral_gain + derivative_gain)
-    torque_from_reference = kp * b_p + 0.5 * integral_gain + derivative_gain * b_d
-    torque_row = (
-        torque_from_angle * measured_angle_row + settings.feedforward_gain * measured_torque_row
+    output_rows = np.outer(law.d[:, 1], measured_angle_row) + np.outer(
+        law.d[:, 2], measured_torque_row
     )
-    torque_row[[integral_index, derivative_index]] = 1.0
+    output_rows[:, n:] = law.c
+    torque_row = output_rows[0]
 
-    angle_action = torque_from_angle * command_column
-    angle_action[integral_index] = -integral_gain
-    angle_action[derivative_index] = -(derivative_decay - 1.0) * derivative_gain
+    angle_action = law.d[0, 1] * command_column
+    angle_action[n:] = law.b[:, 1]
+    torque_action = law.d[0, 2] * command_column
+    torque_action[n:] = law.b[:, 2]
     cut_signals = (
         CutSignal("torque command", command_column, torque_row),
         CutSignal("angle reading", angle_action, measured_angle_row),
-        CutSignal(
-            "torque reading", settings.feedforward_gain * command_column, measured_torque_row
-        ),
+        CutSignal("torque reading", torque_action, measured_torque_row),
     )
 
     a[:n, :n] = discrete_plant.a
     a[:n] += np.outer(discrete_plant.b, torque_row)
-    b[:n] = discrete_plant.b * torque_from_reference
-    a[integral_index] = -integral_gain * measured_angle_row
-    a[integral_index, integral_index] += 1.0
-    b[integral_index] = integral_gain
-    a[derivative_index] = -(derivative_decay - 1.0) * derivative_gain * measured_angle_row
-    a[derivative_index, derivative_index] += derivative_decay
-    b[derivative_index] = (derivative_decay - 1.0) * derivative_gain * b_d
+    b[:n] = discrete_plant.b * law.d[0, 0]
+    a[n:] = np.outer(law.b[:, 1], measured_angle_row) + np.outer(law.b[:, 2], measured_torque_row)
+    a[n:, n:] = law.a
+    b[n:] = law.b[:, 0]
 
-    # Low-pass filters: output = state + gain · input, next state = decay · output + gain · input.
-    lowpass_decay, lowpass_gain = lowpass_coefficients(settings, model.rate_hz)
-    a[first_filter_index, first_filter_index] = lowpass_decay
-    b[first_filter_index] = lowpass_gain * (lowpass_decay + 1.0)
-    a[second_filter_index, second_filter_index] = lowpass_decay
-    a[second_filter_index, first_filter_index] = lowpass_gain * (lowpass_decay + 1.0)
-    b[second_filter_index] = lowpass_gain * lowpass_gain * (lowpass_decay + 1.0)
-    speed_row = np.zeros(n + 4)
-    speed_row[first_filter_index], speed_row[second_filter_index] = (
-        settings.pole_rad_s * (1.0 - lowpass_gain),
-        -settings.pole_rad_s,
-    )
-    speed_from_reference = settings.pole_rad_s * (lowpass_gain - lowpass_gain * lowpass_gain)
-
-    c = np.zeros((_OUTPUT_ROWS, n + 4))
+    c = np.zeros((_OUTPUT_ROWS, size))
     c[0, :n], c[1, :n], c[4, :n] = (
         discrete_plant.angle,
         discrete_plant.velocity,
         discrete_plant.sensor_torque,
     )
-    c[2], c[3] = torque_row, speed_row
-    d = np.array([0.0, 0.0, torque_from_reference, speed_from_reference, 0.0])
+    c[2:4] = output_rows
+    d = np.array([0.0, 0.0, law.d[0, 0], law.d[1, 0], 0.0])
 
     loop_poles = continuous_poles(a, model.rate_hz)
     return ClosedLoop(
@@ -369,7 +311,7 @@ def close_loop(model: LoopModel) -> ClosedLoop:
         model,
         cut_signals,
         loop_poles[np.argsort(-loop_poles.real)],
-        np.append(discrete_plant.shaft_torque, np.zeros(4)),
+        np.append(discrete_plant.shaft_torque, np.zeros(len(law.a))),
         realisation,
     )
 
@@ -404,7 +346,7 @@ def check_stability(closed_loop: ClosedLoop) -> str | None:
         If an oscillation of the loop grows faster than `MAX_GROWTH_PER_S`, or would do so without
         the beam's own damping (`MAX_DAMPING_REDUCTION`).
     """
-    remedy_text = _stability_remedy(closed_loop.model.settings)
+    remedy_text = _stability_remedy(closed_loop.model)
     growth_rate_per_s = closed_loop.growth_per_s
     instability_text = (
         "The closed loop of motor, beam and delays is unstable (spectral radius "
@@ -466,8 +408,14 @@ def _stable_loop(model: LoopModel) -> tuple[ClosedLoop, str | None]:
     return closed_loop, check_stability(closed_loop)
 
 
-def _stability_remedy(settings: ControlSettings) -> str:
+def _stability_remedy(model: LoopModel) -> str:
     """Return the end of a message: how to change the settings of an unstable controller."""
+    settings = model.settings
+    if model.controller is not None:
+        return (
+            f"change the settings of [{settings.controller}], or choose another controller "
+            '(control.controller = "pid")'
+        )
     if settings.feedforward_gain < 0.5:
         return (
             f"control.feedforward_gain = {settings.feedforward_gain:g} leaves the beam to the "
@@ -504,112 +452,3 @@ def _describe_pole(pole_rad_s: complex) -> str:
     """Return frequency in Hz and damping ratio of a pole, as text for a message."""
     frequency_hz = abs(pole_rad_s.imag) / (2.0 * pi)
     return f"a mode at {frequency_hz:.3g} Hz with damping ratio {_damping_ratio(pole_rad_s):.2g}"
-
-
-class _DiscretePlant:
-    """State space of motor, beam and delays in discrete time: ``z[k+1] = a z[k] + b u[k]``.
-
-    The state z contains the state of motor and beam, the last commands (newest first), and past
-    readings that are delayed. No reading depends on the command u of its own tick.
-    """
-
-    def __init__(self, model: LoopModel, realisation: Realisation | None) -> None:
-        coupled_plant = couple(
-            realisation,
-            motor_inertia_kg_m2=model.motor_inertia_kg_m2,
-            viscous_nm_s_per_rad=model.viscous_nm_s_per_rad,
-            tool_inertia_kg_m2=0.0 if model.plant is None else model.plant.tool_inertia_kg_m2,
-        )
-        period_s = 1.0 / model.rate_hz
-        whole_periods, period_fraction = _split_delay(
-            model.actuation_delay_s, period_s, "actuation.delay_s"
-        )
-        angle_chain = _split_delay(model.angle_delay_s, period_s, "encoder.delay_s")
-        torque_chain = _split_delay(model.torque_delay_s, period_s, "sensor.delay_s")
-        n = coupled_plant.b.size
-        command_count = whole_periods + 1
-        chain_lengths = [w + (1 if f > 0.0 else 0) for w, f in (angle_chain, torque_chain)]
-        state_size = n + command_count + sum(chain_lengths)
-
-        # Columns of the torque before and after the switch within a period. Without a whole period
-        # of delay the command after it is the tick's own: the input column, last.
-        column_before = n + whole_periods
-        column_after = column_before - 1 if whole_periods else state_size
-        switch_s = period_fraction * period_s
-        extended_matrix = np.zeros((state_size, state_size + 1))
-
-        def state_map_after(duration_s: float) -> tuple[Real, int]:
-            """Return the linear map to the state at a time after a tick, shape (n, state_size + 1).
-
-            The second result is the column of the torque that acts at that time.
-            """
-            state_map, torque_column = np.eye(n, state_size + 1), column_before
-            for interval_s, acting_column in (
-                (min(duration_s, switch_s), column_before),
-                (duration_s - switch_s, column_after),
-            ):
-                if interval_s > 0.0:
-                    transition, torque_effect = propagator(coupled_plant, interval_s)
-                    state_map = transition @ state_map
-                    state_map[:, acting_column] += torque_effect
-                    torque_column = acting_column
-            return state_map, torque_column
-
-        def reading_row(quantity_row: Real, per_torque: float, since_tick_s: float = 0.0) -> Real:
-            """Return the row vector of a reading at a time after a tick, (state_size + 1,)."""
-            state_map, torque_column = state_map_after(since_tick_s)
-            chain_reading: Real = quantity_row @ state_map
-            chain_reading[torque_column] += per_torque
-            return chain_reading
-
-        extended_matrix[:n] = state_map_after(period_s)[0]
-        self.shaft_torque = np.append(
-            propagator(coupled_plant, period_s)[1], np.zeros(state_size - n)
-        )
-        extended_matrix[n, state_size] = 1.0
-        for command_index in range(1, command_count):
-            extended_matrix[n + command_index, n + command_index - 1] = 1.0
-
-        angle_row = (coupled_plant.angle, 0.0)
-        sensor_torque_row = (coupled_plant.sensor_torque, coupled_plant.sensor_torque_per_torque)
-        self.angle = reading_row(*angle_row)[:state_size]
-        self.velocity = reading_row(coupled_plant.velocity, 0.0)[:state_size]
-        self.sensor_torque = reading_row(*sensor_torque_row)[:state_size]
-
-        measured_rows = []
-        chain_begin = n + command_count
-        for (_, fraction), chain_length, reading_quantity, undelayed_row in (
-            (angle_chain, chain_lengths[0], angle_row, self.angle),
-            (torque_chain, chain_lengths[1], sensor_torque_row, self.sensor_torque),
-        ):
-            if chain_length == 0:
-                measured_rows.append(undelayed_row)
-                continue
-            # The chain's first link: the reading of the last tick, or one from the period since.
-            periods_since_tick = 1.0 - fraction if fraction > 0.0 else 0.0
-            extended_matrix[chain_begin] = reading_row(
-                *reading_quantity, periods_since_tick * period_s
-            )
-            for chain_link in range(chain_begin + 1, chain_begin + chain_length):
-                extended_matrix[chain_link, chain_link - 1] = 1.0
-            measured_rows.append(np.eye(state_size)[chain_begin + chain_length - 1])
-            chain_begin += chain_length
-        self.measured_angle, self.measured_torque = measured_rows
-        self.a = extended_matrix[:, :state_size]
-        self.b = extended_matrix[:, state_size]
-
-
-def _split_delay(delay_s: float, period_s: float, key: str) -> tuple[int, float]:
-    """Return the whole periods of a delay, and the remainder as a fraction of a period.
-
-    `key` is the delay's name in the message of the `ControlDesignError` for too long a delay.
-    """
-    delay_periods = delay_s / period_s
-    if delay_periods > MAX_DELAY_PERIODS:
-        raise ControlDesignError(
-            f"{key} = {delay_s:g} s is {delay_periods:.4g} periods; at most {MAX_DELAY_PERIODS} "
-            "can be controlled over."
-        )
-    whole_periods = floor(delay_periods + 1e-9)
-    period_fraction = delay_periods - whole_periods
-    return whole_periods, period_fraction if period_fraction > 1e-9 else 0.0

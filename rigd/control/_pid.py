@@ -9,13 +9,18 @@ nominal closed loop ``1/(1 + s/p)²``, so that the compensated speed is the expe
 motor, not the requested one.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import tanh
 from typing import Annotated
 
-from annotated_types import Ge, Gt, Le
+from annotated_types import Ge, Gt, Le, MinLen
 
 from rigd.errors import UserError
+
+SHIPPED_CONTROLLER = "pid"
+"""Name of the controller that comes with rigd."""
+_OPTIONAL = {"optional": True}
+"""Metadata of a field whose key a profile may omit."""
 
 
 class ControlDesignError(UserError, ValueError):
@@ -34,6 +39,8 @@ class ControlSettings:
     """Coulomb friction that the controller compensates; 0 switches the compensation off."""
     friction_velocity_rad_s: Annotated[float, Gt(0)]
     """Speed at which the compensation reaches 76 % of its largest torque (the tanh of 1)."""
+    controller: Annotated[str, MinLen(1)] = field(default=SHIPPED_CONTROLLER, metadata=_OPTIONAL)
+    """Name of the controller: "pid", or one that an installed package adds."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -213,6 +220,17 @@ class PidController:
         self._pole_rad_s = settings.pole_rad_s
         self._lowpass_decay, self._lowpass_gain = lowpass_coefficients(settings, rate_hz)
         self.reset(0.0)
+
+    @property
+    def terms_nm(self) -> tuple[float, float, float, float, float]:
+        """Terms of the last torque: proportional, integral, derivative, feed-forward, friction."""
+        return (
+            self.proportional_nm,
+            self.integral_nm,
+            self.derivative_nm,
+            self.feedforward_nm,
+            self.friction_nm,
+        )
 
     def reset(self, angle_rad: float) -> None:
         """Set the controller's state to rest at an angle, so that the torque does not jump.

@@ -9,7 +9,13 @@ from typing import Final
 from rigd.devices._shipped import SHIPPED
 from rigd.devices.declaration import DeviceKind
 from rigd.devices.parameters import DeviceSelection
-from rigd.plugins import Plugin, find_plugin, installed_plugins, load_plugin
+from rigd.plugins import (
+    Plugin,
+    find_plugin,
+    installed_plugins,
+    load_declaration,
+    refuse_built_in,
+)
 
 DEVICE_GROUP: Final = "rigd.devices"
 """Group of the entry points by which packages add kinds of devices."""
@@ -47,13 +53,8 @@ def load_kind(plugin: Plugin) -> DeviceKind:
     PluginError
         If the package cannot be imported, or its declaration is invalid or replaces a shipped kind.
     """
-    if plugin.name in SHIPPED:
-        raise plugin.error("this device is built into rigd and cannot be replaced; rename it.")
-    kind = load_plugin(plugin, DeviceKind)
-    if kind.name != plugin.name:
-        raise plugin.error(
-            f'it declares the device "{kind.name}"; the two names must be equal: rename one.'
-        )
+    refuse_built_in(plugin, SHIPPED)
+    kind = load_declaration(plugin, DeviceKind)
     if kind.open_drive is None and kind.open_sensor is None:
         raise plugin.error("it is neither drive nor sensor; add open_drive or open_sensor.")
     return kind

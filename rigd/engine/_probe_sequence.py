@@ -4,7 +4,7 @@ It uses the cycle of a session, with its interlocks, stops and watchdogs, but an
 and records nothing.
 """
 
-from typing import TYPE_CHECKING, Any, cast
+from typing import Any
 
 from rigd.engine._probed_rig import probed_rig
 from rigd.engine._publish import ReadingPublisher
@@ -19,9 +19,6 @@ from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.safety.probe_estimate import estimate_probe
 from rigd.safety.probing_move import ProbingMove, plan_probe
-
-if TYPE_CHECKING:
-    from rigd.control import PidController
 
 
 class ProbeSequence(SessionSequence):
@@ -68,12 +65,10 @@ class ProbeSequence(SessionSequence):
         self._standstill.reset()
         cycle = self._cycle
         start_rad = cycle.angle_rad
-        probing_move = ProbingMove(
-            self._rig, plan_probe(self._rig), start_rad, self._rest_spread_nm
-        )
+        probing_move = ProbingMove(self._rig, plan_probe(self._rig), self._rest_spread_nm)
         cycle.encoder_watch = None  # the move itself compares angle and torques
+        cycle.controller = probing_move
         cycle.start(self._rest_spread_nm)
-        cycle.controller = cast("PidController", probing_move)  # the cycle only steps it
         self._run_tick(start_rad, excused=True)  # enabling takes its time
         self._move, self._last_tick = probing_move, self._scheduler.tick
         while probing_move.end is None:

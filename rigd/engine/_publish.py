@@ -267,7 +267,7 @@ class SampleLog:
         ring.publish()
 
     def _write_terms(self, tick: int, t_ns: int) -> None:
-        """Write the torques of a tick's PID terms to their ring, unless the ring is full."""
+        """Write the controller's terms of a tick to their ring, unless the ring is full."""
         terms_ring, controller = self._terms_ring, self._cycle.controller
         slot_offset = terms_ring.next_slot()
         if slot_offset < 0:
@@ -277,11 +277,7 @@ class SampleLog:
             slot_offset,
             t_ns,
             tick,
-            controller.proportional_nm,
-            controller.integral_nm,
-            controller.derivative_nm,
-            controller.feedforward_nm,
-            controller.friction_nm,
+            *controller.terms_nm,
             controller.unlimited_torque_nm,
         )
         terms_ring.publish()

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from rigd.control.contracts import ControllerError
 from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
 from rigd.engine._publish import ReadingPublisher, SampleLog
@@ -532,6 +533,9 @@ class SessionSequence:
         """
         try:
             violation = self._cycle.step(self._scheduler.due_ns, reference_rad)
+        except ControllerError as error:
+            self._cycle.torque_off()
+            return SessionEnd("fault", str(error))
         except (DeviceError, OSError) as error:
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.

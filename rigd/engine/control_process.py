@@ -10,7 +10,8 @@ import time
 from collections.abc import Callable
 from dataclasses import asdict
 
-from rigd.control import PidController, design_pid
+from rigd.control.contracts import ControllerError
+from rigd.control.kinds import make_controller
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError, Devices, StatedDrive
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
@@ -46,6 +47,7 @@ from rigd.engine.reference import ReferenceReader, map_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
 from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.errors import RigdError
+from rigd.plugins import PluginError
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
 from rigd.runtime.processes import name_this_process
@@ -78,7 +80,9 @@ def main() -> None:
         )
     try:
         devices = open_devices(job.profile.rig, job.moving)
-    except RigdError as error:  # of a device, or of a beam that cannot be simulated
+        # Imports a package and designs its controller before a connected drive expects SYNCs.
+        make_controller(job.profile.controlled_rig())
+    except RigdError as error:  # of a device, a controller, or a beam that cannot be simulated
         parent.send(Ended(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
@@ -129,7 +133,7 @@ def run_control(
             )
         )
         server.serve()
-    except (DeviceError, OSError) as error:
+    except (DeviceError, OSError, PluginError) as error:
         failure_text = str(error)
     finally:
         devices.drive.disable()
@@ -334,6 +338,8 @@ class _ControlServer:
             session_sequence.check_tare()
         except SessionEnd as end:
             session_outcome, end_reason, device_failed = end.outcome, end.reason, end.device_failed
+        except ControllerError as error:  # of its reset
+            session_outcome, end_reason = "fault", str(error)
         except (DeviceError, OSError) as error:
             session_outcome, end_reason, device_failed = "fault", str(error), True
         finally:
@@ -506,7 +512,7 @@ class _ControlServer:
         cycle = Cycle(
             self._devices,
             rig.sensor.projection,
-            _make_controller(profile),
+            make_controller(profile.controlled_rig()),
             self._watch,
             make_reading_monitors(profile, self._devices),
         )
@@ -540,13 +546,6 @@ class _ControlServer:
         for check_row in session_job.accepted:
             warning_message = f"Accepted by the operator, though rigd check fails: {check_row}"
             write_event(self._channels.events, LogEvent(0, "warning", warning_message))
-
-
-def _make_controller(profile: Profile) -> PidController:
-    """Return the PID controller of the motor's angle, designed for the motor of a profile."""
-    motor = profile.control_motor
-    gains = design_pid(motor.inertia_kg_m2, motor.viscous_nm_s_per_rad, profile.control.pole_rad_s)
-    return PidController(gains, profile.control, profile.rig.rate_hz, motor.peak_torque_nm)
 
 
 if __name__ == "__main__":

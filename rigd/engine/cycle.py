@@ -18,7 +18,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.control import PidController
+from rigd.control.contracts import LoopController
 from rigd.devices.contracts import DeviceError, Devices, GaugeSensor, Wrench
 from rigd.engine.timing import TickScheduler
 from rigd.profile import Profile
@@ -187,7 +187,7 @@ class Cycle:
         self,
         devices: Devices,
         projection: Wrench,
-        controller: PidController,
+        controller: LoopController,
         limit_watch: LimitWatch,
         reading_monitors: "ReadingMonitors",
     ) -> None:
@@ -195,7 +195,7 @@ class Cycle:
         self._drive = devices.drive
         self._sensor = devices.sensor
         self._projection = projection
-        self.controller = controller
+        self.controller: LoopController = controller
         self.watch = limit_watch
         self.encoder_watch: EncoderWatch | None = reading_monitors.encoder
         self.sensor_watch = reading_monitors.sensor
@@ -247,6 +247,11 @@ class Cycle:
             Time at which the tick was due.
         reference_rad
             Reference angle of this tick, from the rig's zero.
+
+        Raises
+        ------
+        ControllerError
+            If the controller of an installed package fails; the torque is then as before.
         """
         self.observe(due_ns)
         status_flags = self.flags & ~_TORQUE_OFF

@@ -1,5 +1,4 @@
 from ._added import EXCITATION_GROUP as EXCITATION_GROUP
-from ._added import find_excitation as find_excitation
 from ._added import option_types as option_types
 from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
@@ -9,6 +8,7 @@ from ._named import KINDS as KINDS
 from ._named import RIG_ARGUMENTS as RIG_ARGUMENTS
 from ._named import Value as Value
 from ._named import check_excitation_plugin as check_excitation_plugin
+from ._named import find_excitation as find_excitation
 from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
 from ._segment_search import SHORTEST_S as SHORTEST_S

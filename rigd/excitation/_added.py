@@ -21,8 +21,9 @@ from rigd.plugins import (
     PluginError,
     find_plugin,
     installed_plugins,
-    load_plugin,
+    load_declaration,
     plugin_errors,
+    refuse_built_in,
 )
 from rigd.units import unit_of
 
@@ -71,6 +72,19 @@ class ExcitationKinds(Mapping[str, MakeExcitation]):
         """Return the number of names."""
         return sum(1 for _ in self)
 
+    def find_added(self, name: str) -> tuple[ExcitationKind, Plugin] | None:
+        """Return the excitation of a name that a package adds, with the package; else None.
+
+        Raises
+        ------
+        PluginError
+            If the package cannot be used.
+        """
+        if name in self._shipped:
+            return None
+        plugin = find_plugin(EXCITATION_GROUP, name)
+        return None if plugin is None else (load_excitation(plugin), plugin)
+
     def check_plugin(self, plugin: Plugin) -> str:
         """Import the excitation of a package, and return its summary.
 
@@ -79,8 +93,7 @@ class ExcitationKinds(Mapping[str, MakeExcitation]):
         PluginError
             If it cannot be used.
         """
-        if plugin.name in self._shipped:
-            raise plugin.error("this excitation is built into rigd and cannot be replaced.")
+        refuse_built_in(plugin, self._shipped)
         added_function(plugin)
         return load_excitation(plugin).summary
 
@@ -93,9 +106,7 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
     PluginError
         If it cannot be used.
     """
-    kind = load_plugin(plugin, ExcitationKind)
-    if kind.name != plugin.name:
-        raise plugin.error(f'it declares the excitation "{kind.name}"; rename one of the two.')
+    kind = load_declaration(plugin, ExcitationKind)
     with plugin_errors(plugin):
         options = {option.name for option in fields(kind.options)}
         missing = [name for name in _SEGMENT_OPTIONS if name not in options]
@@ -106,23 +117,6 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
         except ExcitationError as error:
             raise plugin.error(f"its default {error}") from error
     return kind
-
-
-def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
-    """Return the excitation of a name that a package adds, with the package; else None.
-
-    Parameters
-    ----------
-    name
-        Name of an excitation.
-
-    Raises
-    ------
-    PluginError
-        If the package cannot be used.
-    """
-    plugin = find_plugin(EXCITATION_GROUP, name)
-    return None if plugin is None else (load_excitation(plugin), plugin)
 
 
 def option_types(kind: ExcitationKind) -> dict[str, tuple[type, Any, str]]:

@@ -12,6 +12,7 @@ from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
 from rigd.excitation._until import ScanRig, until
+from rigd.excitation.declaration import ExcitationKind
 from rigd.plugins import Plugin
 
 Value = float | int | str | Path
@@ -76,6 +77,22 @@ def make_excitation(
     if "rig" in inspect.signature(make_kind).parameters:
         return make_kind(rate_hz=rate_hz, rig=rig, **parameters)
     return make_kind(rate_hz=rate_hz, **parameters)
+
+
+def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
+    """Return the excitation of a name that a package adds, with the package; else None.
+
+    Parameters
+    ----------
+    name
+        Name of an excitation.
+
+    Raises
+    ------
+    PluginError
+        If the package cannot be used.
+    """
+    return KINDS.find_added(name)
 
 
 def check_excitation_plugin(plugin: Plugin) -> str:

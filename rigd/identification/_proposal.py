@@ -4,7 +4,7 @@ from dataclasses import dataclass, replace
 from math import floor, inf, log10
 from typing import Any
 
-from rigd.control import ControlDesignError, check_stability, close_loop
+from rigd.control import SHIPPED_CONTROLLER, ControlDesignError, check_stability, close_loop
 from rigd.identification.estimate import MotorEstimate, MotorQuantity
 from rigd.profile import Profile
 from rigd.units import unit_of
@@ -21,11 +21,13 @@ lightest motors."""
 
 
 def with_cautious_controller(rig_profile: Profile) -> Profile:
-    """Return a profile with the slowest stable controller, which tolerates wrong motor data.
+    """Return a profile with the slowest stable PID, which tolerates wrong motor data.
 
     The check of the scales (``limits.torque_ratio``) is off, since the sessions measure them.
     """
-    rig_profile = replace(rig_profile, limits=replace(rig_profile.limits, torque_ratio=inf))
+    rig_profile = replace(
+        _with_pid(rig_profile), limits=replace(rig_profile.limits, torque_ratio=inf)
+    )
     for pole_rad_s in _CAUTIOUS_POLES_RAD_S:
         if pole_rad_s < rig_profile.control.pole_rad_s:
             slow_profile = replace(
@@ -37,7 +39,7 @@ def with_cautious_controller(rig_profile: Profile) -> Profile:
 
 
 def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
-    """Return a profile whose controller is designed for the estimated motor.
+    """Return a profile whose PID is designed for the estimated motor.
 
     The scale of the commands is unchanged: inertia, friction and feed-forward are divided by the
     torque scale instead. If the loop is not stable with the profile's pole, the controller is that
@@ -50,6 +52,7 @@ def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
     estimate
         Estimate of the rig's motor.
     """
+    profile = _with_pid(profile)
     torque_scale = estimate.torque_scale.value
     fitted_motor = replace(
         profile.rig.motor,
@@ -66,6 +69,12 @@ def with_tuned_controller(profile: Profile, estimate: MotorEstimate) -> Profile:
     return (
         fitted_profile if _is_stable(fitted_profile) else with_cautious_controller(fitted_profile)
     )
+
+
+def _with_pid(profile: Profile) -> Profile:
+    """Return a profile with rigd's PID, in place of a package's controller for a known motor."""
+    control_settings = replace(profile.control, controller=SHIPPED_CONTROLLER)
+    return replace(profile, control=control_settings, controller_settings=None)
 
 
 def _is_stable(profile: Profile) -> bool:

@@ -14,6 +14,8 @@ from pydantic_core import ErrorDetails
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
+from rigd.control.declaration import ControllerKind
+from rigd.control.kinds import controller_owner, find_controller, known_controllers
 from rigd.devices import MAY_BE_UNKNOWN
 from rigd.devices.declaration import DeviceKind
 from rigd.devices.kinds import find_owner, selected_kinds
@@ -31,9 +33,9 @@ from rigd.profile._schema import (
     SECTIONS,
     SOURCES,
     TEXT_KEYS,
-    device_sections,
     is_number,
     key_types,
+    optional_sections,
     section_fields,
 )
 from rigd.safety.limits import RECORDER_BUFFER_S
@@ -452,12 +454,24 @@ def wiring_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         if kind.contradictions is not None:
             with plugin_errors(find_owner(kind.name)):
                 yield from kind.contradictions(profile_values)
+    controller = _selected_controller(profile_values)
+    if controller is not None and controller.contradictions is not None:
+        with plugin_errors(controller_owner(controller.name)):
+            yield from controller.contradictions(profile_values)
     yield from _delay_contradictions(profile_values)
 
 
 def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
     """Yield messages for profile sections that the selected devices lack or do not use."""
     drive_name, sensor_name = profile_values["devices.drive"], profile_values["devices.sensor"]
+    controller_name = profile_values["control.controller"]
+    controller = _selected_controller(profile_values)
+    if controller is None:
+        yield (
+            f'control.controller = "{controller_name}" is not known; choose '
+            f"{_quoted_choice(tuple(known_controllers()))}."
+        )
+    controller_sections = () if controller is None else controller.required_sections
     required_sections = {
         section_name
         for kind in _selected_kinds(profile_values)
@@ -465,16 +479,23 @@ def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
     }
     used_sections = {
         section_name
-        for section_name in device_sections()
+        for section_name in optional_sections()
         if any(key in profile_values for key, _ in section_fields(section_name))
     }
+    for section_name in controller_sections:
+        if section_name not in used_sections:
+            yield (
+                f"section [{section_name}] is missing, which control.controller = "
+                f'"{controller_name}" needs.'
+            )
     for section_name in sorted(required_sections - used_sections):
         yield (
             f'section [{section_name}] is missing, which devices.drive = "{drive_name}" with '
             f'devices.sensor = "{sensor_name}" needs.'
         )
     # Any profile may have the noise and offset of a simulated rig.
-    for section_name in sorted(used_sections - required_sections - {"simulation"}):
+    not_needed = used_sections - required_sections - {"simulation", *controller_sections}
+    for section_name in sorted(not_needed):
         yield (
             f'section [{section_name}] belongs to none of devices.drive = "{drive_name}" and '
             f'devices.sensor = "{sensor_name}"; remove it.'
@@ -486,6 +507,11 @@ def _selected_kinds(profile_values: Mapping[str, Any]) -> tuple[DeviceKind, ...]
     return selected_kinds(
         DeviceSelection(profile_values["devices.drive"], profile_values["devices.sensor"])
     )
+
+
+def _selected_controller(profile_values: Mapping[str, Any]) -> ControllerKind | None:
+    """Return the kind of controller that a profile names, or None if it is not known."""
+    return find_controller(profile_values["control.controller"])
 
 
 def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:

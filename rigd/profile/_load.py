@@ -16,6 +16,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd import documents
+from rigd.control import SHIPPED_CONTROLLER
+from rigd.control.kinds import controller_owner, load_controller
 from rigd.devices import MAY_BE_UNKNOWN
 from rigd.devices.kinds import find_kind, find_owner
 from rigd.devices.parameters import RigParameters
@@ -29,11 +31,11 @@ from rigd.profile._schema import (
     SOURCES,
     UNKNOWN,
     Profile,
-    add_device_section,
-    device_sections,
+    add_section,
     is_number,
     key_defaults,
     key_types,
+    optional_sections,
     section_fields,
 )
 
@@ -97,12 +99,13 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         If the text has mistakes.
     """
     document = parse_document(profile_text, profile_path)
-    added_sections = _add_sections_of_packages(document, profile_path)
+    added_sections = _add_sections_of_devices(document, profile_path)
+    _add_section_of_controller(document, profile_path)
     problems: list[str] = []
     profile_values, sources = flatten_document(document, problems)
     absent_sections = {
         section_name
-        for section_name in device_sections()
+        for section_name in optional_sections()
         if not any(k.startswith(section_name + ".") for k in profile_values)
     }
     unknown_keys = frozenset(
@@ -155,10 +158,17 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         sources=sources,
         tip_mass_kg=sections["beam"].tip_mass_kg,
         axis_tilt_deg=sections["rig"].axis_tilt_deg,
+        controller_settings=_controller_settings(sections),
     )
 
 
-def _add_sections_of_packages(document: Mapping[str, Any], profile_path: Path) -> list[str]:
+def _controller_settings(sections: Mapping[str, Any]) -> object | None:
+    """Return the section of the controller that a package adds, or None if it has none."""
+    name = sections["control"].controller
+    return None if name == SHIPPED_CONTROLLER else sections.get(name)
+
+
+def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) -> list[str]:
     """Make the sections known that devices of installed packages require; return their names.
 
     Raises
@@ -173,12 +183,32 @@ def _add_sections_of_packages(document: Mapping[str, Any], profile_path: Path) -
         try:
             plugin, kind = find_owner(name), find_kind(name)
             if plugin is not None and kind is not None:
-                add_device_section(kind, plugin)
+                add_section(kind, plugin)
                 if kind.settings is not None:
                     added_sections.append(kind.name)
         except PluginError as error:
             raise ProfileError(f'{profile_path}: devices: "{name}": {error}') from error
     return added_sections
+
+
+def _add_section_of_controller(document: Mapping[str, Any], profile_path: Path) -> None:
+    """Make the section known that the controller of an installed package requires.
+
+    Raises
+    ------
+    ProfileError
+        If the package that adds the controller of the profile cannot be used.
+    """
+    settings = document.get("control")
+    name = settings.get("controller") if isinstance(settings, dict) else None
+    if not isinstance(name, str) or name == SHIPPED_CONTROLLER:
+        return
+    try:
+        owner = controller_owner(name)
+        if owner is not None:
+            add_section(load_controller(owner), owner)
+    except PluginError as error:
+        raise ProfileError(f'{profile_path}: control.controller = "{name}": {error}') from error
 
 
 def parse_document(text: str, path: Path) -> dict[str, Any]:

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import MISSING, dataclass, field, fields
+from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
@@ -11,7 +11,9 @@ from annotated_types import DocInfo, Ge, Gt, Le, MinLen
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rigd.beam import Beam, Damping, Plant
-from rigd.control import ControlSettings, LoopModel
+from rigd.control import SHIPPED_CONTROLLER, ControlSettings, LoopModel
+from rigd.control.declaration import ControlledRig, ControllerKind
+from rigd.control.kinds import find_controller, linear_controller, load_controller
 from rigd.devices import describe_unknown_values
 from rigd.devices.declaration import DeviceKind
 from rigd.devices.kinds import load_kind, shipped_kinds
@@ -169,44 +171,46 @@ SECTIONS: dict[str, type] = {
     "uncertainty": ScaleUncertainty,
 }
 """Map from a section's name to the dataclass of its keys."""
-_ADDED_SECTIONS: set[str] = set()
-"""Names in `SECTIONS` of the sections of devices that installed packages add."""
+_ADDED_SECTIONS: dict[str, str] = {}
+"""Names in `SECTIONS` of the sections of parts that installed packages add, with their group."""
 
 
-def device_sections() -> tuple[str, ...]:
-    """Return the names of the sections that only some devices require."""
+def optional_sections() -> tuple[str, ...]:
+    """Return the names of the sections that only some devices or controllers require."""
     shipped = [name for kind in shipped_kinds() for name in kind.required_sections]
     return tuple(dict.fromkeys([*shipped, *sorted(_ADDED_SECTIONS)]))
 
 
-def add_device_section(kind: DeviceKind, plugin: Plugin) -> None:
-    """Add the section of a device of an installed package to the sections of a profile.
+def add_section(kind: DeviceKind | ControllerKind, plugin: Plugin) -> None:
+    """Add the section of a part of an installed package to the sections of a profile.
 
     Nothing changes if it was added before.
 
     Parameters
     ----------
     kind
-        Kind of device.
+        Kind of device or controller.
     plugin
         Package that adds it.
 
     Raises
     ------
     PluginError
-        If the declaration of its settings is invalid, or the section is one of rigd's own.
+        If the declaration of its settings is invalid, or the section is one of rigd's own or of
+        another part.
     """
     settings = kind.settings
     if settings is None or SECTIONS.get(kind.name) is settings:
         return
-    if kind.name in SECTIONS and kind.name not in _ADDED_SECTIONS:
-        raise plugin.error(f"[{kind.name}] is a section of every profile; rename the device.")
+    if kind.name in SECTIONS and _ADDED_SECTIONS.get(kind.name) != plugin.group:
+        where = "another package's part" if kind.name in _ADDED_SECTIONS else "every profile"
+        raise plugin.error(f"[{kind.name}] is a section of {where}; rename the {plugin.noun}.")
     if problem := _settings_problem(settings):
         raise plugin.error(f"its settings {settings.__name__} are invalid: {problem}")
-    if unknown := set(kind.sections) - set(SECTIONS):
+    if unknown := set(kind.required_sections) - {kind.name} - set(SECTIONS):
         raise plugin.error(f"it requires the unknown section [{min(unknown)}].")
     SECTIONS[kind.name] = settings
-    _ADDED_SECTIONS.add(kind.name)
+    _ADDED_SECTIONS[kind.name] = plugin.group
     key_types.cache_clear()
     key_defaults.cache_clear()
 
@@ -239,7 +243,20 @@ def check_device_plugin(plugin: Plugin) -> str:
         If it cannot be used.
     """
     kind = load_kind(plugin)
-    add_device_section(kind, plugin)
+    add_section(kind, plugin)
+    return kind.summary
+
+
+def check_controller_plugin(plugin: Plugin) -> str:
+    """Import the controller that an installed package adds, and return its summary.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    kind = load_controller(plugin)
+    add_section(kind, plugin)
     return kind.summary
 
 
@@ -251,13 +268,13 @@ UNKNOWN = "unknown"
 """Source of a number without a value, which is NaN in the parameters (see `MAY_BE_UNKNOWN`)."""
 
 
-def section_text(kind: DeviceKind) -> str:
-    """Return a section of a profile for a kind of device, with ranges, units and help as comments.
+def section_text(kind: DeviceKind | ControllerKind) -> str:
+    """Return a section of a profile for a kind of part, with ranges, units and help as comments.
 
     Parameters
     ----------
     kind
-        Kind of device; without settings, the text is empty.
+        Kind of device or controller; without settings, the text is empty.
     """
     if kind.settings is None:
         return ""
@@ -407,6 +424,8 @@ class Profile:
     """Inclination of the resting beam in the plane of motion, or None if it was not measured.
 
     It is positive if the tip is lower than the motor's axis."""
+    controller_settings: object | None = None
+    """Values of the section of the controller that a package adds, or None if it has no section."""
     specimen: Specimen | None = None
     """Mounted specimen whose file has replaced the profile's beam, or None."""
     specimen_in_words: str = ""
@@ -438,8 +457,41 @@ class Profile:
             tip_mass_kg=self.tip_mass_kg or 0.0,
         )
 
+    @property
+    def is_loop_modelled(self) -> bool:
+        """Whether the model of the closed loop has the controller, and not the PID instead.
+
+        Own code of a package need not state matrices.
+        """
+        name = self.control.controller
+        kind = None if name == SHIPPED_CONTROLLER else find_controller(name)
+        return kind is None or kind.linear is not None
+
     def loop_model(self) -> LoopModel:
         """Return the model of this rig's closed loop, for its design and prediction.
+
+        A controller without matrices is replaced by the PID (see `is_loop_modelled`).
+
+        Raises
+        ------
+        UnknownValueError
+            If values of the profile are unknown; the message names each one and where to find it.
+        PluginError
+            If the package that adds the controller cannot be used.
+        """
+        rig = self.controlled_rig()
+        controller = linear_controller(rig)
+        if controller is None:
+            return rig.loop
+        kind = find_controller(self.control.controller)
+        return replace(
+            rig.loop,
+            controller=controller,
+            shifts_reference=kind is not None and kind.shifts_reference,
+        )
+
+    def controlled_rig(self) -> ControlledRig:
+        """Return the rig for which the controller is made.
 
         Raises
         ------
@@ -453,7 +505,7 @@ class Profile:
                     f"{self.path}: {message_line}" for message_line in unknown_keys.splitlines()
                 )
             )
-        return LoopModel(
+        loop = LoopModel(
             rate_hz=rig.rate_hz,
             plant=self.plant,
             motor_inertia_kg_m2=self.control_motor.inertia_kg_m2,
@@ -463,3 +515,4 @@ class Profile:
             torque_delay_s=rig.sensor.delay_s,
             settings=self.control,
         )
+        return ControlledRig(loop, self.control_motor.peak_torque_nm, self.controller_settings)

@@ -321,6 +321,11 @@ def predict_session(
             for violation_text in torque_violations
         ]
     warnings = [*paper_check.warnings, *([instability_warning] if instability_warning else [])]
+    if not profile.is_loop_modelled:
+        warnings.append(
+            f'The peaks are predicted with the PID of [control]: controller "'
+            f'{profile.control.controller}" states no matrices.'
+        )
     if not refusals:
         warnings += [
             f"{violation_text}: it will be clipped and flagged."
@@ -333,7 +338,9 @@ def predict_session(
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
         refused="\n".join(refusals),
-        ending=_motion_after_record(closed_loop, stays=excitation.stays),
+        ending=_motion_after_record(
+            closed_loop, stays=excitation.stays, damped=profile.is_loop_modelled
+        ),
         clearance=paper_check,
     )
 
@@ -346,11 +353,15 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) 
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
-def _motion_after_record(loop: ClosedLoop, *, stays: bool) -> Ending:
-    """Return the motion after the record: a vibration-free return to the start, with damping."""
+def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> Ending:
+    """Return the motion after the record: a vibration-free return to the start, with damping.
+
+    Active damping is designed for the loop, and left out where its controller is not known.
+    """
     if loop.model.plant is None:
         return Ending(stays=stays)
-    return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), design_damper(loop))
+    damper = design_damper(loop) if damped else None
+    return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
 
 
 def largest_amplitude(

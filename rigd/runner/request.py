@@ -18,6 +18,7 @@ from pathlib import Path
 
 from rigd import __version__
 from rigd.checks import FailedCheck
+from rigd.control.kinds import controller_owner
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
@@ -442,7 +443,12 @@ def _session_metadata(
     if rig.acquisition is not None:
         metadata["acquisition_mode"] = rig.acquisition.mode
         metadata["acquisition_deadline_s"] = repr(rig.acquisition.deadline_us * 1e-6)
-    metadata = _device_metadata(rig) | _excitation_metadata(order.excitation.kind) | metadata
+    metadata = (
+        _device_metadata(rig)
+        | _controller_metadata(order.profile)
+        | _excitation_metadata(order.excitation.kind)
+        | metadata
+    )
     if order.profile.tip_mass_kg is not None:
         metadata["tip_mass_kg"] = repr(order.profile.tip_mass_kg)
     if order.profile.axis_tilt_deg is not None:
@@ -467,6 +473,12 @@ def _excitation_metadata(kind: str) -> dict[str, str]:
     if declaration.welch_exclusion:
         metadata["welch_exclusion"] = declaration.welch_exclusion
     return metadata
+
+
+def _controller_metadata(profile: Profile) -> dict[str, str]:
+    """Return the controller that a package adds and the package; empty for the shipped one."""
+    owner = controller_owner(profile.control.controller)
+    return {} if owner is None else {"controller": owner.name, "controller_package": owner.label}
 
 
 def _device_metadata(rig: RigParameters) -> dict[str, str]:

@@ -271,8 +271,6 @@ class ProbingMove:
         Values of the profile.
     plan
         Plan of the move, as returned by `plan_probe`.
-    start_rad
-        Angle at which the shaft is at rest.
     torque_noise_nm
         Standard deviation of the coupling torque at rest.
 
@@ -289,15 +287,14 @@ class ProbingMove:
 
     saturated = False
     unlimited_torque_nm = 0.0
+    terms_nm = (0.0, 0.0, 0.0, 0.0, 0.0)
 
-    def __init__(
-        self, rig: ProbedRig, plan: ProbePlan, start_rad: float, torque_noise_nm: float
-    ) -> None:
+    def __init__(self, rig: ProbedRig, plan: ProbePlan, torque_noise_nm: float) -> None:
         rate_hz = rig.rate_hz
+        self._rig = rig
         self._plan = plan
-        self._start_rad = start_rad
+        self.torque_limit_nm = plan.torque_limit_nm
         self._period_s = 1.0 / rate_hz
-        self._beam_follower = BeamFollower(rig)
         inertia_kg_m2 = rig.inertia_kg_m2 + rig.beam.inertia_kg_m2 + rig.tool_inertia_kg_m2
         bandwidth_rad_s = min(_BANDWIDTH_RAD_S, 0.05 * rate_hz)
         self._gain = inertia_kg_m2 * bandwidth_rad_s
@@ -306,10 +303,16 @@ class ProbingMove:
         self._filter_gain = 1.0 / (1.0 + _COMPARISON_TIME_CONSTANT_S * rate_hz)
         self._min_difference_nm = max(_MIN_DIFFERENCE_NM, _MIN_DIFFERENCE_STDS * torque_noise_nm)
         self._min_movement_rad = max(_MIN_MOVEMENT_STEPS * rig.resolution_rad, _MIN_MOVEMENT_RAD)
-        first_side = -1.0 if start_rad > 0.0 else 1.0
+        self.reset(0.0)
+
+    def reset(self, angle_rad: float) -> None:
+        """Set the move to its start, with the shaft at rest at an angle."""
+        self._start_rad = angle_rad
+        self._beam_follower = BeamFollower(self._rig)
+        first_side = -1.0 if angle_rad > 0.0 else 1.0
         self._strokes = [
             (stroke_side * first_side, speed_rad_s)
-            for speed_rad_s in (plan.speed_rad_s, plan.fast_rad_s)
+            for speed_rad_s in (self._plan.speed_rad_s, self._plan.fast_rad_s)
             for stroke_side in (1.0, -1.0)
         ]
         self._stroke_index = 0

@@ -1,3 +1,4 @@
+from ._controller_checks import CONTROLLER_CHECKS as CONTROLLER_CHECKS
 from ._device_checks import DEVICE_CHECKS as DEVICE_CHECKS
 from ._profiles import write_profile as write_profile
 from ._sessions import PAPER_BEAM as PAPER_BEAM

@@ -1,4 +1,4 @@
-"""A package that `rigd plugins new` makes passes its own tests, and is a device of rigd."""
+"""A package that `rigd plugins new` makes passes its own tests, and is a part of rigd."""
 
 import os
 import re
@@ -16,12 +16,10 @@ from rigd.cli.app import app
 PROJECT = Path(__file__).parents[2]
 
 
-@pytest.fixture(scope="module")
-def package(tmp_path_factory):
-    """Folder of a new package, as pip would install it."""
-    folder = tmp_path_factory.mktemp("package") / "own"
+def made(folder, name, *options):
+    """Make a new package in a folder, as pip would install it."""
     code, output, errors = rigd_with(
-        folder.parent, "plugins", "new", "mysensor", "--folder", folder
+        folder.parent, "plugins", "new", name, *options, "--folder", folder
     )
     assert code == 0, output + errors
     project = tomllib.loads((folder / "pyproject.toml").read_text())["project"]
@@ -34,23 +32,33 @@ def package(tmp_path_factory):
 
 
 @pytest.mark.process
-def test_a_new_package_passes_its_tests_and_joins(package, tmp_path):
+@pytest.mark.parametrize(
+    ("options", "passed", "shown"),
+    [
+        ((), 9, '# address of the instrument\nhost = "…"\n'),
+        (("--kind", "controller"), 8, '# In [control]: controller = "mypart"\n[mypart]\n'),
+    ],
+    ids=["device", "controller"],
+)
+def test_a_new_package_passes_its_tests_and_joins(tmp_path, options, passed, shown):
+    folder = made(tmp_path / "own", "mypart", *options)
     done = subprocess.run(
         [sys.executable, "-P", "-m", "pytest", "-q", "-p", "no:cacheprovider", "-W", "error",
-         package / "tests"],
-        cwd=package, env=os.environ | {"PYTHONPATH": str(package)},
+         folder / "tests"],
+        cwd=folder, env=os.environ | {"PYTHONPATH": str(folder)},
         capture_output=True, text=True, check=False,
     )  # fmt: skip
     assert done.returncode == 0, done.stdout + done.stderr
-    assert "9 passed" in done.stdout
-    code, output, _ = rigd_with(package, "plugins", "show", "mysensor", cwd=tmp_path)
+    assert f"{passed} passed" in done.stdout
+    code, output, _ = rigd_with(folder, "plugins", "show", "mypart", cwd=tmp_path)
     assert code == 0
-    assert '# address of the instrument\nhost = "…"\n' in output
+    assert shown in output
 
 
 @pytest.mark.process
 @pytest.mark.further
-def test_it_runs_as_its_page_says(package, runtime_folder, tmp_path, monkeypatch):
+def test_it_runs_as_its_page_says(runtime_folder, tmp_path, monkeypatch):
+    package = made(tmp_path / "own", "mysensor")
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
     (section,) = blocks("toml")
     lines = "".join(blocks("sh")).splitlines()
@@ -72,9 +80,11 @@ def blocks(language):
     return re.findall(rf"^```{language}\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
 
 
-@pytest.mark.parametrize("name", ["Upper", "cia402", "a b", "../x"])
-def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, name):
+@pytest.mark.parametrize(
+    "arguments", [["Upper"], ["cia402"], ["a b"], ["../x"], ["pid", "--kind", "controller"]]
+)
+def test_a_name_that_cannot_be_is_refused(tmp_path, monkeypatch, arguments):
     monkeypatch.chdir(tmp_path)
-    result = CliRunner().invoke(app, ["plugins", "new", name])
+    result = CliRunner().invoke(app, ["plugins", "new", *arguments])
     assert result.exit_code == 2
     assert not list(tmp_path.iterdir())

@@ -2,6 +2,7 @@
 
 import doctest
 import inspect
+import itertools
 import re
 import subprocess
 import sys
@@ -14,6 +15,7 @@ import pytest
 from analysis.record import load_record
 from rigd import testing
 from rigd.beam import Beam, Damping
+from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
 from rigd.profile import load_profile
 
@@ -102,6 +104,47 @@ class Wrong:
 
     def __getattr__(self, name):
         return getattr(self._drive, name)
+
+
+def test_the_shipped_controller_is_as_the_loop_relies_on():
+    for check in testing.CONTROLLER_CHECKS:
+        check(load_profile("sim"))
+
+
+_PID_STEP, _PID_RESET = PidController.step, PidController.reset
+_LEFT_BEHIND, _NOISE = [], itertools.count()
+
+
+@pytest.mark.parametrize(
+    ("method", "wrong", "complaint"),
+    [
+        ("step", lambda *_: float("nan"), "a torque is not finite"),
+        ("step", lambda pid, *w: 2 * _PID_STEP(pid, *w), "exceeds motor.peak_torque_nm"),
+        ("step", lambda pid, *w: _PID_STEP(pid, *w) + 0.1, "it gives 0.1 N·m at rest"),
+        ("step", lambda pid, *w: _PID_STEP(pid, *w) + 1e-9 * next(_NOISE), "equal readings"),
+        ("step", lambda *w: _LEFT_BEHIND.append([w]) or _PID_STEP(*w), "memory grows by"),
+        ("reset", lambda pid, _: _PID_RESET(pid, 0.0), "after a reset at"),
+    ],
+)
+def test_a_controller_that_is_wrong_is_refused(monkeypatch, method, wrong, complaint):
+    monkeypatch.setattr(PidController, method, wrong)
+    assert any(complaint in each for each in controller_complaints())
+    _LEFT_BEHIND.clear()
+
+
+def test_a_controller_that_winds_up_is_refused(monkeypatch):
+    gains = design_pid(motor_inertia_kg_m2=2e-3, viscous_nm_s_per_rad=1e-2, pole_rad_s=80)
+    monkeypatch.setattr(type(gains), "tracking_s", float("inf"))
+    assert any("winding up" in each for each in controller_complaints())
+
+
+def controller_complaints():
+    """What the checks of controllers say of the PID."""
+    for check in testing.CONTROLLER_CHECKS:
+        try:
+            check(load_profile("sim"))
+        except AssertionError as error:
+            yield str(error)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,110 @@
+"""Controller of an installed package in the loop: its output is checked, its torque is limited."""
+
+from math import isfinite
+
+from rigd.control._pid import PidController
+from rigd.control.contracts import Controller, ControllerError
+from rigd.plugins import Plugin
+
+
+class AddedController:
+    """Controller of an installed package, as the loop uses it (`LoopController`).
+
+    Parameters
+    ----------
+    controller
+        Controller of the package.
+    torque_limit_nm
+        Largest magnitude of the returned torque.
+    owner
+        Package, for messages.
+    pid
+        PID to whose reference the output is added; None: the output is the torque.
+    """
+
+    __slots__ = (
+        "_controller",
+        "_owner",
+        "_pid",
+        "_step",
+        "saturated",
+        "torque_limit_nm",
+        "unlimited_torque_nm",
+    )
+
+    def __init__(
+        self,
+        controller: Controller,
+        torque_limit_nm: float,
+        owner: Plugin,
+        pid: PidController | None,
+    ) -> None:
+        self._controller = controller
+        self._step = controller.step
+        self._owner = owner
+        self._pid = pid
+        self.torque_limit_nm = torque_limit_nm
+        self.unlimited_torque_nm = 0.0
+        self.saturated = False
+
+    @property
+    def terms_nm(self) -> tuple[float, float, float, float, float]:
+        """Terms of the PID whose reference is shifted; zero if there is no PID."""
+        return (0.0, 0.0, 0.0, 0.0, 0.0) if self._pid is None else self._pid.terms_nm
+
+    def reset(self, angle_rad: float) -> None:
+        """Set the state to rest at an angle.
+
+        Raises
+        ------
+        ControllerError
+            If the package's code fails.
+        """
+        self.unlimited_torque_nm, self.saturated = 0.0, False
+        if self._pid is not None:
+            self._pid.reset(angle_rad)
+        try:
+            self._controller.reset(angle_rad)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # SystemExit is no Exception
+            raise self._failure("reset", error) from error
+
+    def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
+        """Return the torque command of a tick in N·m, within the limit.
+
+        Raises
+        ------
+        ControllerError
+            If the package's code fails, or its output is no finite number.
+        """
+        try:
+            output = self._step(reference_rad, angle_rad, coupling_torque_nm)
+            is_usable = isinstance(output, (float, int)) and isfinite(output)
+        except KeyboardInterrupt:
+            raise
+        except BaseException as error:  # SystemExit is no Exception
+            raise self._failure("step", error) from error
+        if not is_usable:
+            raise self._failure("step", None, f"it returned {output!r}")
+        pid = self._pid
+        if pid is not None:
+            torque_nm = pid.step(reference_rad + output, angle_rad, coupling_torque_nm)
+            self.unlimited_torque_nm, self.saturated = pid.unlimited_torque_nm, pid.saturated
+            return torque_nm
+        limit_nm = self.torque_limit_nm
+        self.unlimited_torque_nm = float(output)
+        self.saturated = not -limit_nm <= output <= limit_nm
+        return min(max(float(output), -limit_nm), limit_nm)
+
+    def _failure(self, method: str, error: BaseException | None, what: str = "") -> ControllerError:
+        """Return the error that names the package, its method and what went wrong."""
+        found = what or f"{type(error).__name__}: {error}".removesuffix(": ")
+        return ControllerError(
+            str(
+                self._owner.error(
+                    f"the controller's {method} failed ({found}), and the torque was switched off; "
+                    'report that to the package\'s author, or set control.controller = "pid".'
+                )
+            )
+        )

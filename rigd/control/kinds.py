@@ -1,0 +1,175 @@
+"""Kinds of controllers that a profile can name: that of rigd, and those of installed packages."""
+
+from functools import lru_cache
+from typing import Final
+
+from rigd.control._added import AddedController
+from rigd.control._control_law import LinearStep
+from rigd.control._loop_model import LinearController
+from rigd.control._pid import SHIPPED_CONTROLLER, PidController, design_pid
+from rigd.control.contracts import Controller, LoopController
+from rigd.control.declaration import ControlledRig, ControllerKind
+from rigd.plugins import (
+    Plugin,
+    PluginError,
+    find_plugin,
+    installed_plugins,
+    load_declaration,
+    plugin_errors,
+    refuse_built_in,
+)
+
+CONTROLLER_GROUP: Final = "rigd.controllers"
+"""Group of the entry points by which packages add controllers."""
+
+
+def _make_pid(rig: ControlledRig) -> PidController:
+    """Return the PID controller, designed for the motor of a rig."""
+    loop = rig.loop
+    gains = design_pid(
+        loop.motor_inertia_kg_m2, loop.viscous_nm_s_per_rad, loop.settings.pole_rad_s
+    )
+    return PidController(gains, loop.settings, loop.rate_hz, rig.torque_limit_nm)
+
+
+SHIPPED: Final = {
+    kind.name: kind
+    for kind in (
+        ControllerKind(
+            SHIPPED_CONTROLLER,
+            "PID with two degrees of freedom, feed-forward and friction compensation",
+            make=_make_pid,
+        ),
+    )
+}
+"""Controllers that come with rigd, by their names in a profile."""
+
+
+def find_controller(name: str) -> ControllerKind | None:
+    """Return the kind of controller of a name, shipped or of an installed package, or None.
+
+    Parameters
+    ----------
+    name
+        Value of ``control.controller`` in a profile.
+
+    Raises
+    ------
+    PluginError
+        If the package that adds the kind cannot be used.
+    """
+    owner = controller_owner(name)
+    return SHIPPED.get(name) if owner is None else load_controller(owner)
+
+
+def load_controller(plugin: Plugin) -> ControllerKind:
+    """Import the kind of controller that a package adds.
+
+    Raises
+    ------
+    PluginError
+        If the package cannot be imported, or its declaration is invalid or replaces a shipped kind.
+    """
+    refuse_built_in(plugin, SHIPPED)
+    kind = load_declaration(plugin, ControllerKind)
+    if not (callable(kind.linear) or callable(kind.make)):
+        raise plugin.error("it has neither matrices nor code; add linear or make.")
+    return kind
+
+
+def controller_owner(name: str) -> Plugin | None:
+    """Return the package that adds a controller, or None for a shipped or unknown one."""
+    return None if name in SHIPPED else find_plugin(CONTROLLER_GROUP, name)
+
+
+def known_controllers() -> list[str]:
+    """Return the names of the controllers that come with rigd, and of those of packages."""
+    return [*SHIPPED, *(plugin.name for plugin in installed_plugins(CONTROLLER_GROUP))]
+
+
+def make_controller(rig: ControlledRig) -> LoopController:
+    """Return a new controller of the kind that a rig's settings name.
+
+    Parameters
+    ----------
+    rig
+        Rig, from :meth:`rigd.profile.Profile.controlled_rig`.
+
+    Raises
+    ------
+    PluginError
+        If the package that adds the kind cannot be used, or its code fails.
+    ControlDesignError
+        If the PID cannot be designed.
+    """
+    owner = _owner_of(rig)
+    if owner is None:
+        shipped = SHIPPED[rig.loop.settings.controller].make
+        assert shipped is not None
+        loop_controller = shipped(rig)
+        assert isinstance(loop_controller, LoopController)
+        return loop_controller
+    kind = load_controller(owner)
+    if kind.make is None:
+        linear = linear_controller(rig)
+        assert linear is not None
+        limit_nm = float("inf") if kind.shifts_reference else rig.torque_limit_nm
+        controller: Controller = LinearStep(linear, limit_nm)
+    else:
+        with plugin_errors(owner):
+            controller = kind.make(rig)
+        if not all(callable(getattr(controller, name, None)) for name in ("reset", "step")):
+            raise owner.error(f"{type(controller).__name__} has no reset and step; add them.")
+    pid = _make_pid(rig) if kind.shifts_reference else None
+    return AddedController(controller, rig.torque_limit_nm, owner, pid)
+
+
+def linear_controller(rig: ControlledRig) -> LinearController | None:
+    """Return the matrices of the controller of a package, or None if there are none.
+
+    Parameters
+    ----------
+    rig
+        Rig, from :meth:`rigd.profile.Profile.controlled_rig`.
+
+    Raises
+    ------
+    PluginError
+        If the package that adds the kind cannot be used, or its code fails.
+    """
+    owner = _owner_of(rig)
+    if owner is None:
+        return None
+    with plugin_errors(owner):
+        return _linear_controller(load_controller(owner), owner, rig)
+
+
+def _owner_of(rig: ControlledRig) -> Plugin | None:
+    """Return the package that adds the controller of a rig, or None for a shipped one.
+
+    Raises
+    ------
+    PluginError
+        If there is no such controller any more, or its package cannot be used.
+    """
+    name = rig.loop.settings.controller
+    owner = controller_owner(name)
+    if owner is None and name not in SHIPPED:
+        raise PluginError(
+            f'control.controller = "{name}": no installed package adds it; install the package, or '
+            f'set control.controller = "{SHIPPED_CONTROLLER}".'
+        )
+    return owner
+
+
+@lru_cache(maxsize=8)
+def _linear_controller(
+    kind: ControllerKind, owner: Plugin, rig: ControlledRig
+) -> LinearController | None:
+    """Return the matrices of a kind of controller for a rig; a design may take seconds."""
+    if kind.linear is None:
+        return None
+    linear = kind.linear(rig)
+    if not isinstance(linear, LinearController):
+        raise owner.error(f"its linear returns a {type(linear).__name__}, no LinearController.")
+    return linear
