@@ -50,12 +50,8 @@ happens by chance in one record of a hundred."""
 MAX_DRAG_COMPUTATIONS: Final = 8
 """Maximum number of computations of the drag torque for one record."""
 
-_SMALL_CHANGE: Final = 0.1
-"""Relative change of the damping ratios by insignificant drag up to which the first order
-suffices."""
-
-_INSIGNIFICANT_STDS: Final = 1.5
-"""Drag in standard deviations up to which it is insignificant."""
+_LEAST_DRAG_M: Final = 1e-6
+"""C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
 _TOLERANCE_STDS: Final = 0.2
 """Change of the drag, in standard deviations, below which its computation has converged."""
@@ -146,6 +142,7 @@ def fit_modes_with_drag(
     current = ModesWithDrag(
         modal_fit, DragLaw(0.0), 0.0, candidate_set.comparison, drag_spectrum[None]
     )
+    last_estimate_m = math.inf
     for remaining in reversed(range(max_computations)):
         fit_with_drag = fit_modes(
             current.comparison,
@@ -157,26 +154,33 @@ def fit_modes_with_drag(
             return None
         [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
         law = DragLaw(current.law.constant_m + change_m)
-        current = replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m)
-        is_first_order = current.comparison is candidate_set.comparison
-        suffices = is_first_order and (
-            law.constant_m < _INSIGNIFICANT_STDS * std_m
-            and _largest_change(modal_fit, fit_with_drag) < _SMALL_CHANGE
+        is_converged = abs(law.constant_m - last_estimate_m) < _TOLERANCE_STDS * std_m
+        current, last_estimate_m = (
+            replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m),
+            law.constant_m,
         )
-        # Negative drag is an error of the estimate. No torque is computed for it.
-        is_negative = law.constant_m <= 0
-        is_converged = abs(change_m) < _TOLERANCE_STDS * std_m
-        if suffices or is_negative or is_converged or not remaining:
+        if is_converged or not remaining:
             break
+        # Negative drag is an error of the estimate. Its torque is that of hardly any drag, whose
+        # derivatives belong to these poles; those of a small drag may be too far off.
+        assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
         try:
-            comparison = candidate_set.comparison.remove_drag_torque(
-                candidate_set.likeliest.plant, law, fit_with_drag.poles_rad_s
+            comparison = candidate_set.comparison.renewed_with_drag(
+                candidate_set.likeliest.plant,
+                assumed_law,
+                fit_with_drag.model,
+                fit_with_drag.poles_rad_s,
+                candidate_set.noise,
             )
         except DragError:
             break  # the last fit has the uncertainty of the drag, if not its exact torque
         assert comparison.drag is not None
-        spectra = comparison.drag.by_law[:1]
-        current = replace(current, comparison=comparison, drag_spectra=spectra)
+        current = replace(
+            current,
+            law=assumed_law,
+            comparison=comparison,
+            drag_spectra=comparison.drag.by_law[:1],
+        )
     return current
 
 
@@ -186,17 +190,6 @@ def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
         (mode_number, pole.imag / (2 * math.pi), -pole.real / abs(pole))
         for mode_number, pole in modal_fit.poles_rad_s.items()
     ]
-
-
-def _largest_change(without_drag: ModalFit, with_drag: ModalFit) -> float:
-    """Return the largest change of the logarithm of a damping ratio by the drag."""
-    changes = [
-        math.log(
-            with_drag.mode(mode_number).damping_ratio / without_drag.mode(mode_number).damping_ratio
-        )
-        for mode_number in set(with_drag.visible) & set(without_drag.visible)
-    ]
-    return max(map(abs, changes), default=0.0)
 
 
 def _drag_matters(modal_fit: ModalFit, drag_spectrum: NDArray[np.complex128]) -> bool:
