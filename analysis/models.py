@@ -1,8 +1,4 @@
-"""Damping structures, their parametrization, and the settings with which they are fitted.
-
-A structure defines which damping parameters are fitted and which are fixed. Types I to VI have the
-fixed values of Table 2 of the reference paper. Type VII follows from its conclusions: internal
-damping of integer order (alpha = 1) with external damping of fractional order.
+"""Parametrization of the damping structures, and the settings with which they are fitted.
 
 A coefficient and its order have almost the same effect near the frequencies where they act: a fit
 of ``zeta`` and ``alpha`` themselves would follow a curved flat direction (their correlation is
@@ -23,15 +19,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
 
+from analysis.structures import STRUCTURES as STRUCTURES  # noqa: PLC0414 - imported from here
+from analysis.structures import Structure as Structure  # noqa: PLC0414 - imported from here
 from rigd.beam import (
     COEFFICIENT_OF,
-    DAMPING_PARAMETERS,
     Beam,
     Damping,
     DampingParameter,
@@ -46,100 +42,6 @@ from rigd.spectral import (
 
 if TYPE_CHECKING:
     from rigd.spectral import Estimator
-
-
-# Structures
-
-
-@dataclass(frozen=True, slots=True)
-class Structure:
-    """Damping structure: a choice of free and fixed damping parameters.
-
-    Attributes
-    ----------
-    name : str
-        "I" to "VII".
-    free : tuple of str
-        Parameters to be fitted, in the order of `rigd.beam.DAMPING_PARAMETERS`.
-    fixed : mapping of str to float
-        Values of the other parameters. A damping that the structure lacks has coefficient and order
-        0.
-
-    Examples
-    --------
-    >>> from analysis.models import STRUCTURES
-    >>> STRUCTURES["VII"].free
-    ('zeta', 'gamma', 'lambda')
-    >>> STRUCTURES["VII"].damping({"zeta": 7e-5, "gamma": 0.05, "lambda": 0.6})
-    Damping(zeta=7e-05, alpha=1.0, gamma=0.05, lambda_=0.6)
-    """
-
-    name: str
-    free: tuple[DampingParameter, ...]
-    fixed: Mapping[DampingParameter, float]
-
-    @property
-    def internal(self) -> bool:
-        """Whether the structure has internal damping (of the material)."""
-        return "zeta" in self.free
-
-    @property
-    def external(self) -> bool:
-        """Whether the structure has external damping (of the environment)."""
-        return "gamma" in self.free
-
-    def has(self, parameter_name: str) -> bool:
-        """Return whether the structure has the kind of damping to which a parameter belongs.
-
-        The kinds are internal and external damping. The result is True for a parameter of beam or
-        rig.
-
-        Parameters
-        ----------
-        parameter_name : str
-            Name of a parameter of damping, beam or rig.
-        """
-        if parameter_name in ("zeta", "alpha"):
-            return self.internal
-        if parameter_name in ("gamma", "lambda"):
-            return self.external
-        return True
-
-    def damping(self, free_values: Mapping[DampingParameter, float]) -> Damping:
-        """Return the damping with given free parameters, and the structure's fixed ones."""
-        values_by_name = {
-            **self.fixed,
-            **{parameter_name: free_values[parameter_name] for parameter_name in self.free},
-        }
-        return Damping(
-            zeta=values_by_name["zeta"],
-            alpha=values_by_name["alpha"],
-            gamma=values_by_name["gamma"],
-            lambda_=values_by_name["lambda"],
-        )
-
-
-def _structure(name: str, fixed_values: dict[DampingParameter, float]) -> Structure:
-    """Return a damping structure with given fixed parameters; the other ones are free."""
-    free_names = tuple(p for p in DAMPING_PARAMETERS if p not in fixed_values)
-    return Structure(name, free_names, MappingProxyType(fixed_values))
-
-
-STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
-    {
-        structure.name: structure
-        for structure in (
-            _structure("I", {"alpha": 1.0, "gamma": 0.0, "lambda": 0.0}),
-            _structure("II", {"zeta": 0.0, "alpha": 0.0, "lambda": 1.0}),
-            _structure("III", {"alpha": 1.0, "lambda": 1.0}),
-            _structure("IV", {"gamma": 0.0, "lambda": 0.0}),
-            _structure("V", {"zeta": 0.0, "alpha": 0.0}),
-            _structure("VI", {}),
-            _structure("VII", {"alpha": 1.0}),
-        )
-    }
-)
-"""Damping structures by name, I to VII."""
 
 
 # Response of a structure

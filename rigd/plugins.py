@@ -27,6 +27,7 @@ GROUPS: Final = {
     "rigd.devices": "rigd.profile:check_device_plugin",
     "rigd.excitations": "rigd.excitation:check_excitation_plugin",
     "analysis.formats": "analysis.exchange:check_format_plugin",
+    "analysis.structures": "analysis.structures:check_structure_plugin",
 }
 """Groups of entry points, each with the function that checks an entry point of the group."""
 
