@@ -30,7 +30,6 @@ from rigd.beam import (
     COEFFICIENT_OF,
     Beam,
     Damping,
-    DampingParameter,
     TransferGrid,
     undamped_frequencies_rad_s,
 )
@@ -377,11 +376,9 @@ class DampingUnknowns:
             [upper_bound for _, upper_bound in unknown_ranges]
         )
 
-    def parameters(self, x: NDArray[np.float64]) -> dict[DampingParameter, float]:
+    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return the four damping parameters for unknowns `x`, shape (k,)."""
-        free_unknowns: dict[DampingParameter, float] = dict(
-            zip(self.structure.free, map(float, x), strict=True)
-        )
+        free_unknowns: dict[str, float] = dict(zip(self.structure.free, map(float, x), strict=True))
         parameters = {**self.structure.fixed, **free_unknowns}
         if self.structure.internal:
             parameters["zeta"] = math.exp(

@@ -1,14 +1,14 @@
 """Damping structures: those of the analyser by name, and those that installed packages add.
 
-A structure is declared in one place: its parameters, its damping as a function of s, and the words
-for it in reports. Types I to VI have the fixed values of Table 2 of the reference paper. Type VII
-follows from its conclusions: internal damping of integer order (alpha = 1) with external damping of
-fractional order.
+One declaration states all of a structure: its parameters, its damping as a function of s, and the
+words for it in reports. Types I to VI have the fixed values of Table 2 of the reference paper. Type
+VII follows from its conclusions: internal damping of integer order (alpha = 1) with external
+damping of fractional order.
 
 A package adds a structure by an entry point of the group ``analysis.structures``. It is fitted to
-the whole record beside types I to VII and compared with them, but is none of the candidates of the
-verdict: the reported numbers, campaigns and exported models are of types I to VII, and how often
-the selection errs is known for these only.
+the whole record and compared with types I to VII, but is none of the candidates of the verdict: the
+reported numbers, campaigns and exported models are of types I to VII, and how often the selection
+errs is known for these only.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from rigd.beam import DAMPING_PARAMETERS, PARAMETERS, Damping, DampingParameter, Parameter
+from rigd.beam import DAMPING_PARAMETERS, PARAMETERS, Damping, Parameter
 from rigd.plugins import Plugin, find_plugin, installed_plugins, load_plugin, plugin_errors
 from rigd.printable import listed, printable
 from rigd.units import unit_of
@@ -116,7 +116,7 @@ class Structure:
             return self.external
         return True
 
-    def damping(self, free_values: Mapping[DampingParameter, float]) -> Damping:
+    def damping(self, free_values: Mapping[str, float]) -> Damping:
         """Return the damping of types I to VII with given free parameters."""
         return Damping(
             *(
@@ -182,9 +182,9 @@ class Structure:
 
     def _check_damping(self, values: Mapping[str, float]) -> None:
         """Raise ValueError if the damping at some values is not finite, lossy and real in time."""
-        s = 1j * _CHECKED_OMEGA_RAD_S
+        s = (1j * _CHECKED_OMEGA_RAD_S).astype(np.complex128)
         factors = self.finite_factors(s, values)
-        self.finite_factors(s + 1.0, values)  # causal responses are computed there
+        self.finite_factors(1.0 + s, values)  # causal responses are computed there
         for factor, name in zip(factors, ("stiffness", "external damping"), strict=True):
             gains = np.flatnonzero(factor.imag < -_LOSS_TOLERANCE * np.abs(factor))
             if gains.size:

@@ -461,7 +461,7 @@ class CandidateSet:
             for parameter_name, fixed_value in structure.fixed.items()
             if structure.has(parameter_name)
         }
-        fixed_values[order] = 1.0  # type: ignore[index]
+        fixed_values[order] = 1.0
         free_names = tuple(
             parameter_name
             for parameter_name in DAMPING_PARAMETERS

@@ -1,4 +1,4 @@
-"""Fit of a damping structure of an installed package to a whole record, beside types I to VII.
+"""Fit of a damping structure of an installed package to a whole record.
 
 Data and noise spectrum are those of the structures of the analyser, so that the costs are
 comparable. The poles of the free decay at the start of the record are those of the closest of these
@@ -7,7 +7,7 @@ structures: nearly all records begin at rest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -18,6 +18,7 @@ from analysis.identify._settings import free_settings
 from analysis.identify._structure_plant import StructureUnknowns
 from analysis.identify._uncertainty import covariance_of_unknowns
 from analysis.identify.parametrization import Unknowns
+from analysis.identify.verdict import BIC_DECISIVE
 from analysis.optimizer import Box
 from analysis.structures import UNDAMPED
 from rigd.beam import LOGARITHMIC_PARAMETERS
@@ -86,11 +87,31 @@ class StructureFit:
     compared_with: str
     residual: NDArray[np.complex128]
 
+    @property
+    def sentence(self) -> str:
+        """Return the sentence of the verdict on this structure, which is none of its candidates."""
+        above = self.delta_bic > 0
+        difference = (
+            f"its BIC is {abs(self.delta_bic):.3g} {'above' if above else 'below'} that of type "
+            f"{self.compared_with}"
+        )
+        meaning = "the record supports it less" if above else "the record supports it more"
+        if abs(self.delta_bic) < BIC_DECISIVE:
+            meaning = "the record does not distinguish the two"
+        return (
+            f"Structure {self.structure.name} of {self.package} "
+            f"({self.structure.description[:1].lower()}{self.structure.description[1:]}): "
+            f"{difference}, so {meaning}. The reported numbers are those of types I to VII."
+        )
+
 
 def fit_structure(
     added: AddedStructure, selection: Selection, fixed: tuple[Setting, ...] = ()
-) -> StructureFit:
+) -> StructureFit | None:
     """Fit the damping structure of a package to the record of a selection.
+
+    Return None if drag, a change along the record or another effect is part of the selected model:
+    the costs would not be comparable.
 
     Parameters
     ----------
@@ -108,8 +129,10 @@ def fit_structure(
     """
     structure, plugin = added.structure, added.plugin
     best = selection.candidates[0]
+    if best.effect_count or selection.analysis.comparison.drag is not None:
+        return None
     noise = selection.analysis.noise
-    comparison = replace(selection.analysis.comparison, drag=None)  # the torque of drag is removed
+    comparison = selection.analysis.comparison
     settings = Unknowns.of(UNDAMPED, comparison.measurement.nominal, free_settings(fixed))
     unknowns = StructureUnknowns(
         structure,

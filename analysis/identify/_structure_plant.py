@@ -11,7 +11,7 @@ import numpy as np
 from analysis.identify._settings import SETTINGS
 from analysis.identify.parametrization import Unknowns
 from analysis.structures import UNDAMPED
-from rigd.beam import Plant
+from rigd.beam import BEAM_PARAMETERS, Plant
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
@@ -167,14 +167,16 @@ class StructureUnknowns(Unknowns):
         density_over_stiffness = plant.beam.density_over_stiffness
         stiffening = abs(elastic[1])
         inertia_change = abs(1 + external[0] / (density_over_stiffness * s[0] ** 2))
-        effective = {
+        effective: dict[str, float] = {
             "density_over_stiffness": density_over_stiffness * stiffening / inertia_change,
             "bending_stiffness_n_m2": plant.beam.bending_stiffness_n_m2 / stiffening,
         }
-        changes = {name: value for name, value in effective.items() if name in self.free}
+        changes: dict[str, float] = {
+            name: effective[name] for name in BEAM_PARAMETERS if name in self.free
+        }
         plant = plant.with_parameters(changes)
         return StructurePlant(
-            *(getattr(plant, name) for name in _PLANT_FIELDS),
+            **{name: getattr(plant, name) for name in _PLANT_FIELDS},
             structure=self.structure,
             values=values,
             decay_poles=self.decay_poles,
@@ -183,7 +185,7 @@ class StructureUnknowns(Unknowns):
     def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return the values of structure and settings by name, for a vector of unknowns."""
         plant = self.plant(x)
-        return {**plant.values, **{name: plant.parameters[name] for name in SETTINGS}}
+        return {**plant.values, **{name: float(plant.parameters[name]) for name in SETTINGS}}
 
     def plant_and_gradient(
         self, x: NDArray[np.float64]

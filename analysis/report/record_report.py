@@ -327,6 +327,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
         tables.correlations_table(whole_record),
         *tables.amplitude_tables(whole_record),
         fit_tables.structures_table(whole_record),
+        *fit_tables.added_structures_tables(whole_record),
     )
     paper_tables = (
         ()

@@ -35,3 +35,6 @@ EXCITATION = Path(__file__).with_name("outside_excitation.txt").read_text()
 
 FORMAT = Path(__file__).with_name("outside_format.txt").read_text()
 """Code of a package with the import format ``.npz``."""
+
+STRUCTURE = Path(__file__).with_name("outside_structure.txt").read_text()
+"""Code of a package with the damping structure ``zener``."""
