@@ -36,6 +36,7 @@ from rigd.beam import (
 from rigd.spectral import (
     PAPER_OVERLAP_FRACTION,
     PAPER_RATE_HZ,
+    WINDOW,
     Segmentation,
 )
 
@@ -252,7 +253,7 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
     if estimator == "fft":
         return ESTIMATOR_NAMES[estimator]
     return (
-        f"{ESTIMATOR_NAMES[estimator]}, {segments} Hamming segments of "
+        f"{ESTIMATOR_NAMES[estimator]}, {segments} {WINDOW.name} segments of "
         f"{segmentation.segment_length}, overlap {segmentation.overlap}, nfft {segmentation.nfft}"
     )
 
