@@ -383,6 +383,8 @@ def _with_structures(
     warn: Callable[[str], None],
 ) -> WholeRecord:
     """Return the fits with those of packages' structures; warn of each that cannot be fitted."""
+    if not structures:
+        return whole_fits
     from analysis.identify import fit_structure
     from rigd.plugins import PluginError
 

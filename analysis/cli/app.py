@@ -496,10 +496,12 @@ def _fixed_parameters(option_text: str) -> tuple[Setting, ...]:
 
 def _added_structures(option_text: str) -> tuple[AddedStructure, ...]:
     """Return the structures named in --structure; raise a usage error if one cannot be used."""
+    names = [name.strip() for name in option_text.split(",") if name.strip()]
+    if not names:
+        return ()
     from analysis.structures import added_structures
     from rigd.plugins import PluginError
 
-    names = [name.strip() for name in option_text.split(",") if name.strip()]
     try:
         return added_structures(list(dict.fromkeys(names)))
     except (LookupError, PluginError) as error:

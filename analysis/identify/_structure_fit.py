@@ -19,8 +19,8 @@ from analysis.identify._structure_plant import StructureUnknowns
 from analysis.identify._uncertainty import covariance_of_unknowns
 from analysis.identify.parametrization import Unknowns
 from analysis.identify.verdict import BIC_DECISIVE
+from analysis.models import UNDAMPED
 from analysis.optimizer import Box
-from analysis.structures import UNDAMPED
 from rigd.beam import LOGARITHMIC_PARAMETERS
 from rigd.plugins import plugin_errors
 
@@ -31,7 +31,8 @@ if TYPE_CHECKING:
 
     from analysis.identify._select import Selection
     from analysis.identify._settings import Setting
-    from analysis.structures import AddedStructure, Structure
+    from analysis.models import Structure
+    from analysis.structures import AddedStructure
 
 _ROUGH_TOLERANCE: Final = 1e-3
 """Relative tolerance of the cost in the descents from several starts."""

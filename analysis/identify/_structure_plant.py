@@ -10,7 +10,7 @@ import numpy as np
 
 from analysis.identify._settings import SETTINGS
 from analysis.identify.parametrization import Unknowns
-from analysis.structures import UNDAMPED
+from analysis.models import UNDAMPED
 from rigd.beam import BEAM_PARAMETERS, Plant
 
 if TYPE_CHECKING:
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.structures import Structure
+    from analysis.models import Structure
     from rigd.beam import Parameter, Pole
 
 _PARAMETER_STEP: Final = 1e-5

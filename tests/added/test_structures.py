@@ -7,8 +7,9 @@ import pytest
 from packages import STRUCTURE, install, rigd_with
 
 from analysis.identify import Measurement, fit_structure, select
+from analysis.models import Structure
 from analysis.record import load_record
-from analysis.structures import AddedStructure, Structure, added_structures
+from analysis.structures import AddedStructure, added_structures, check_structure
 from rigd.beam import Parameter
 from rigd.plugins import Plugin, PluginError, check_plugin, find_plugin, installed_plugins
 
@@ -71,7 +72,7 @@ def test_its_fit_is_that_of_the_same_law_in_the_analyser(selection):
         coefficient("outside", 1e-2), order("order_outside"),
     )  # fmt: skip
     structure = Structure("fractional", "Fractional damping", parameters, fractional)
-    structure.check()
+    check_structure(structure)
     added = fit_structure(AddedStructure(structure, PLUGIN), selection)
     (fit,) = [each.fit for each in selection.candidates if each.name == "VI"]
     assert added.cost == pytest.approx(fit.cost, rel=1e-4)
@@ -90,7 +91,7 @@ def test_a_law_that_fails_in_its_range_is_named_with_its_values(selection):
         return 1 + values["inside"] * s, float("nan") * s if values["inside"] > 1.2e-5 else 0 * s
 
     structure = Structure("breaks", "Breaks", (coefficient("inside", 1e-5),), breaks)
-    structure.check()
+    check_structure(structure)
     with pytest.raises(PluginError, match=r"lab-x 1, .*not finite at inside = "):
         fit_structure(AddedStructure(structure, PLUGIN), selection)
 
