@@ -152,10 +152,13 @@ def test_two_packages_that_add_the_same_name_are_named(packages, tmp_path, monke
 @pytest.mark.fit
 def test_analyze_offers_fits_and_reports_it(packages, session, tmp_path):
     analyze = ("-P", "-m", "analysis")
+    entry_points = f"[{GROUP}]\nbroken = lab_broken:BROKEN\n"
+    install(packages, "lab-broken", "1", "raise SystemExit(3)", entry_points)
     code, output, errors = rigd_with(packages, "--help", program=analyze)
     assert code == 0, errors
     assert "--structure" in output
     assert "of lab-zener 0.1" in output
+    assert "of lab-broken 1" in output  # none is imported
     report, results = tmp_path / "report", tmp_path / "a.json"
     code, output, errors = rigd_with(
         packages, session, "--method", "record", "--structure", "zener", "--figures", "png",
@@ -177,7 +180,8 @@ def test_analyze_offers_fits_and_reports_it(packages, session, tmp_path):
     assert "Relaxation of the material" not in table
     assert "Structures of installed packages" in (report / "report.html").read_text()
     for arguments, reason in (
-        (("--structure", "maxwell"), "there are zener"),
+        (("--structure", "maxwell"), "there are broken and zener"),
+        (("--structure", "broken"), "Package lab-broken 1"),
         (("--structure", "zener", "--method", "welch"), "for whole-record fits"),
     ):
         code, _, errors = rigd_with(packages, session, *arguments, program=analyze)
