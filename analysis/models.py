@@ -1,8 +1,9 @@
 """Damping structures, their parametrization, and the settings with which they are fitted.
 
-A structure defines which damping parameters are fitted and which are fixed. Types I to VI have the
-fixed values of Table 2 of the reference paper. Type VII follows from its conclusions: internal
-damping of integer order (alpha = 1) with external damping of fractional order.
+A structure states its parameters, its damping as a function of s, and the words for it in reports.
+Types I to VI have the fixed values of Table 2 of the reference paper. Type VII follows from its
+conclusions: internal damping of integer order (alpha = 1) with external damping of fractional
+order. Installed packages add others (`analysis.structures`).
 
 A coefficient and its order have almost the same effect near the frequencies where they act: a fit
 of ``zeta`` and ``alpha`` themselves would follow a curved flat direction (their correlation is
@@ -22,7 +23,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from itertools import product
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final
 
@@ -32,15 +34,17 @@ from numpy.typing import NDArray
 from rigd.beam import (
     COEFFICIENT_OF,
     DAMPING_PARAMETERS,
+    PARAMETERS,
     Beam,
     Damping,
-    DampingParameter,
+    Parameter,
     TransferGrid,
     undamped_frequencies_rad_s,
 )
 from rigd.spectral import (
     PAPER_OVERLAP_FRACTION,
     PAPER_RATE_HZ,
+    WINDOW,
     Segmentation,
 )
 
@@ -50,20 +54,36 @@ if TYPE_CHECKING:
 
 # Structures
 
+Factors = tuple[NDArray[np.complex128], NDArray[np.complex128]]
+"""Factor of the bending stiffness, and external damping in 1/m⁴, each of the shape of s."""
+DampingFactors = Callable[[NDArray[np.complex128], Mapping[str, float]], Factors]
+"""Function of s in rad/s and of the parameters by name that returns the `Factors`."""
+
 
 @dataclass(frozen=True, slots=True)
 class Structure:
-    """Damping structure: a choice of free and fixed damping parameters.
+    """Damping structure: its parameters, which of them are free, and its damping.
+
+    The stiffness of the beam is ``EI c(s)``, and its equation of motion has ``rho/EI s² + e(s)``.
 
     Attributes
     ----------
     name : str
-        "I" to "VII".
-    free : tuple of str
-        Parameters to be fitted, in the order of `rigd.beam.DAMPING_PARAMETERS`.
+        "I" to "VII", or the name that a package gives its structure.
+    description : str
+        Words for the damping, as a sentence without its full stop.
+    parameters : tuple of Parameter
+        Parameters with symbol, meaning, unit and range. Those of a package state ``starts``; a
+        ``logarithmic`` one is fitted by its logarithm.
+    factors : callable
+        Function of s (complex, rad/s) and of the parameters by name. It returns c and e: the
+        stiffness relative to EI, and the external damping in 1/m⁴. Derivatives by the parameters
+        are finite differences, so it must be smooth in them.
     fixed : mapping of str to float
-        Values of the other parameters. A damping that the structure lacks has coefficient and order
-        0.
+        Values of the parameters that are not fitted. A damping that types I to VII lack has
+        coefficient and order 0.
+    free : tuple of str
+        Names of the fitted parameters, in the order of `parameters`.
 
     Examples
     --------
@@ -75,8 +95,15 @@ class Structure:
     """
 
     name: str
-    free: tuple[DampingParameter, ...]
-    fixed: Mapping[DampingParameter, float]
+    description: str
+    parameters: tuple[Parameter, ...]
+    factors: DampingFactors
+    fixed: Mapping[str, float] = field(default_factory=dict)
+    free: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        names = (parameter.name for parameter in self.parameters)
+        object.__setattr__(self, "free", tuple(name for name in names if name not in self.fixed))
 
     @property
     def internal(self) -> bool:
@@ -105,41 +132,90 @@ class Structure:
             return self.external
         return True
 
-    def damping(self, free_values: Mapping[DampingParameter, float]) -> Damping:
-        """Return the damping with given free parameters, and the structure's fixed ones."""
-        values_by_name = {
-            **self.fixed,
-            **{parameter_name: free_values[parameter_name] for parameter_name in self.free},
-        }
+    def damping(self, free_values: Mapping[str, float]) -> Damping:
+        """Return the damping of types I to VII with given free parameters."""
         return Damping(
-            zeta=values_by_name["zeta"],
-            alpha=values_by_name["alpha"],
-            gamma=values_by_name["gamma"],
-            lambda_=values_by_name["lambda"],
+            *(
+                self.fixed[name] if name in self.fixed else free_values[name]
+                for name in DAMPING_PARAMETERS
+            )
         )
 
+    def start_values(self) -> list[dict[str, float]]:
+        """Return all combinations of the parameters' start values, each with the fixed values."""
+        free_starts = [each.starts for each in self.parameters if each.name not in self.fixed]
+        return [
+            {**self.fixed, **dict(zip(self.free, combination, strict=True))}
+            for combination in product(*free_starts)
+        ]
 
-def _structure(name: str, fixed_values: dict[DampingParameter, float]) -> Structure:
-    """Return a damping structure with given fixed parameters; the other ones are free."""
-    free_names = tuple(p for p in DAMPING_PARAMETERS if p not in fixed_values)
-    return Structure(name, free_names, MappingProxyType(fixed_values))
+    def finite_factors(self, s: NDArray[np.complex128], values: Mapping[str, float]) -> Factors:
+        """Return the factors c and e at `s`; raise ValueError unless they are finite numbers.
 
+        Parameters
+        ----------
+        s : ndarray of complex, shape (n,)
+            Laplace variable in rad/s, not 0.
+        values : mapping of str to float
+            Values of all parameters.
+        """
+        with np.errstate(all="ignore"):
+            elastic, external = (
+                np.broadcast_to(np.asarray(factor, dtype=np.complex128), s.shape)
+                for factor in self.factors(s, values)
+            )
+        if not (np.isfinite(elastic).all() and np.isfinite(external).all()):
+            raise ValueError(f"its damping is not finite at {described(values)}.")
+        return elastic, external
+
+
+def described(values: Mapping[str, float]) -> str:
+    """Return names and values of parameters as a text."""
+    return ", ".join(f"{name} = {value:.4g}" for name, value in values.items())
+
+
+def _fractional_factors(s: NDArray[np.complex128], values: Mapping[str, float]) -> Factors:
+    """Return the factors of fractional internal and external damping, as in the reference paper."""
+    return (
+        1 + values["zeta"] * s ** values["alpha"],
+        (values["gamma"] * s ** values["lambda"]).astype(np.complex128),
+    )
+
+
+def _fractional(name: str, description: str, fixed_values: dict[str, float]) -> Structure:
+    """Return a structure of fractional damping with given fixed parameters."""
+    return Structure(
+        name,
+        description,
+        tuple(PARAMETERS[parameter] for parameter in DAMPING_PARAMETERS),
+        _fractional_factors,
+        MappingProxyType(fixed_values),
+    )
+
+
+_NO_INTERNAL: Final = {"zeta": 0.0, "alpha": 0.0}
+"""Values of the parameters of absent internal damping."""
+_NO_EXTERNAL: Final = {"gamma": 0.0, "lambda": 0.0}
+"""Values of the parameters of absent external damping."""
+
+UNDAMPED: Final = _fractional("undamped", "No damping", _NO_INTERNAL | _NO_EXTERNAL)
+"""Structure without damping, which leaves the parameters of beam and rig."""
 
 STRUCTURES: Final[Mapping[str, Structure]] = MappingProxyType(
     {
         structure.name: structure
         for structure in (
-            _structure("I", {"alpha": 1.0, "gamma": 0.0, "lambda": 0.0}),
-            _structure("II", {"zeta": 0.0, "alpha": 0.0, "lambda": 1.0}),
-            _structure("III", {"alpha": 1.0, "lambda": 1.0}),
-            _structure("IV", {"gamma": 0.0, "lambda": 0.0}),
-            _structure("V", {"zeta": 0.0, "alpha": 0.0}),
-            _structure("VI", {}),
-            _structure("VII", {"alpha": 1.0}),
+            _fractional("I", "Internal damping only", {"alpha": 1.0, **_NO_EXTERNAL}),
+            _fractional("II", "External damping only", {**_NO_INTERNAL, "lambda": 1.0}),
+            _fractional("III", "Internal and external damping", {"alpha": 1.0, "lambda": 1.0}),
+            _fractional("IV", "Internal damping only", _NO_EXTERNAL),
+            _fractional("V", "External damping only", _NO_INTERNAL),
+            _fractional("VI", "Internal and external damping", {}),
+            _fractional("VII", "Internal and external damping", {"alpha": 1.0}),
         )
     }
 )
-"""Damping structures by name, I to VII."""
+"""Damping structures of the analyser by name, I to VII."""
 
 
 # Response of a structure
@@ -351,7 +427,7 @@ def estimate_text(estimator: Estimator, segmentation: Segmentation, segments: in
     if estimator == "fft":
         return ESTIMATOR_NAMES[estimator]
     return (
-        f"{ESTIMATOR_NAMES[estimator]}, {segments} Hamming segments of "
+        f"{ESTIMATOR_NAMES[estimator]}, {segments} {WINDOW.name} segments of "
         f"{segmentation.segment_length}, overlap {segmentation.overlap}, nfft {segmentation.nfft}"
     )
 
@@ -475,11 +551,9 @@ class DampingUnknowns:
             [upper_bound for _, upper_bound in unknown_ranges]
         )
 
-    def parameters(self, x: NDArray[np.float64]) -> dict[DampingParameter, float]:
+    def parameters(self, x: NDArray[np.float64]) -> dict[str, float]:
         """Return the four damping parameters for unknowns `x`, shape (k,)."""
-        free_unknowns: dict[DampingParameter, float] = dict(
-            zip(self.structure.free, map(float, x), strict=True)
-        )
+        free_unknowns: dict[str, float] = dict(zip(self.structure.free, map(float, x), strict=True))
         parameters = {**self.structure.fixed, **free_unknowns}
         if self.structure.internal:
             parameters["zeta"] = math.exp(

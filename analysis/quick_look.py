@@ -29,6 +29,7 @@ from rigd.session.quick_look import (
     quick_look_path,
     read_quick_look,
 )
+from rigd.spectral import WINDOW
 from rigd.units import decimals
 
 if TYPE_CHECKING:
@@ -52,9 +53,6 @@ structures take 15 ms, the freest structure alone 4 ms."""
 _JOIN_DISTANCE: Final = 0.1
 """Distance of two bands of low coherence, relative to their frequency, up to which they are joined
 to one band."""
-
-_HAMMING_WIDTH_BINS: Final = 1.30
-"""Width of a Hamming window's main lobe at half power, in bins of a segment's transform."""
 
 
 class QuickLookError(ValueError):
@@ -230,7 +228,7 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
 
     last_hz = min(LAST_HZ, LARGEST_FRACTION_OF_RATE * record.rate_hz)
     segments = segmentation_of(record.first_sweep_samples, record.rate_hz)
-    resolution_hz = _HAMMING_WIDTH_BINS * record.rate_hz / segments.segment_length
+    resolution_hz = WINDOW.half_power_bins * record.rate_hz / segments.segment_length
     try:
         estimate = _estimate_response(record, segments, last_hz)
         # For steps, multisines and narrow sweeps, the coherence would depend on the segments.

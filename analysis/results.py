@@ -15,12 +15,13 @@ if TYPE_CHECKING:
     from collections.abc import Callable, Mapping
     from pathlib import Path
 
-    from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting
+    from analysis.identify import RecordAnalysis, RecordFit, Selection, Setting, StructureFit
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
+    from analysis.structures import AddedStructure
     from rigd.beam import Plant
     from rigd.estimates import Estimate
     from rigd.session import Validity
@@ -56,6 +57,8 @@ class Routes:
     uniformity : float or None
         Relative standard deviation of mode frequencies from those of a uniform beam; None uses the
         value in the file.
+    structures : tuple of AddedStructure
+        Damping structures of installed packages that are fitted to the whole record as well.
     """
 
     settings: WelchSettings
@@ -65,6 +68,7 @@ class Routes:
     band_hz: tuple[float, float] | None = None
     figures: tuple[FigureFormat, ...] = DEFAULT_FORMATS
     uniformity: float | None = None
+    structures: tuple[AddedStructure, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +85,8 @@ class WholeRecord:
         Frequency band of the fits.
     fixed : tuple of str
         Parameters that stayed at the file's values.
+    added : tuple of StructureFit
+        Fits of damping structures of installed packages, in addition to the selection.
     validity : Validity
         Validity of the linear model for the record.
     """
@@ -89,6 +95,7 @@ class WholeRecord:
     selection: Selection
     band_hz: tuple[float, float]
     fixed: tuple[Setting, ...] = ()
+    added: tuple[StructureFit, ...] = ()
     validity: Validity = field(init=False)
 
     def __post_init__(self) -> None:
@@ -130,9 +137,13 @@ class WholeRecord:
         """
         verdict = self.selection.verdict
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
+        added_sentences = (structure_fit.sentence for structure_fit in self.added)
         return replace(
-            verdict, sentences=(*first_sentence, self.validity.sentence, *other_sentences)
-        )
+            verdict,
+            sentences=(
+                *first_sentence, self.validity.sentence, *other_sentences, *added_sentences,
+            ),
+        )  # fmt: skip
 
     @property
     def orders(self) -> tuple[OrderVerdict, OrderVerdict]:
@@ -362,7 +373,37 @@ def record_result(
             if welch_results is None:
                 raise
             warn(f"{error} Only the Welch fits were run.")
+        else:
+            whole_fits = _with_structures(whole_fits, routes.structures, warn)
     return RecordResult(record, whole_fits, welch_results)
+
+
+def _with_structures(
+    whole_fits: WholeRecord,
+    structures: tuple[AddedStructure, ...],
+    warn: Callable[[str], None],
+) -> WholeRecord:
+    """Return the fits with those of packages' structures; warn of each that cannot be fitted."""
+    if not structures:
+        return whole_fits
+    from analysis.identify import fit_structure
+    from rigd.plugins import PluginError
+
+    fits = []
+    for added in structures:
+        try:
+            structure_fit = fit_structure(added, whole_fits.selection, whole_fits.fixed)
+        except PluginError as error:
+            warn(f"{whole_fits.record.path}: {error}")
+            continue
+        if structure_fit is None:
+            warn(
+                f"{whole_fits.record.path}: the record shows an effect beyond the damping of a "
+                f"beam, with which the structure {added.structure.name} is not fitted."
+            )
+        else:
+            fits.append(structure_fit)
+    return replace(whole_fits, added=tuple(fits))
 
 
 def with_uniformity(record: Record, uniformity: float | None) -> Record:

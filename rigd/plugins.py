@@ -40,6 +40,7 @@ GROUPS: Final = {
     "rigd.controllers": "rigd.profile:check_controller_plugin",
     "rigd.excitations": "rigd.excitation:check_excitation_plugin",
     "analysis.formats": "analysis.exchange:check_format_plugin",
+    "analysis.structures": "analysis.structures:check_structure_plugin",
 }
 """Groups of entry points, each with the function that checks an entry point of the group."""
 

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
     from analysis.paper import Indices, Peak
-    from rigd.beam import Beam, Damping, DampingParameter
+    from rigd.beam import Beam, Damping
 
 
 # Parameters
@@ -143,7 +143,7 @@ class NominalModel:
     structure: str
     weighting: str
     damping: Damping
-    parameters: Mapping[DampingParameter, float]
+    parameters: Mapping[str, float]
     response: NDArray[np.complex128]
     peaks: tuple[Peak | None, ...]
     indices: tuple[Indices, ...]
@@ -253,7 +253,7 @@ def _nominal_model(
     )
 
 
-def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[DampingParameter, float]:
+def _mean_parameters(welch_fits: Sequence[WelchFit]) -> dict[str, float]:
     """Return the mean of each damping parameter over the sessions' fits."""
     return {
         parameter_name: float(np.mean([fit.parameters[parameter_name] for fit in welch_fits]))

@@ -45,6 +45,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import SingleSessionError
     from analysis.identify import Setting
     from analysis.results import FigureFormat
+    from analysis.structures import AddedStructure
 
 DEFAULT_COMMAND: Final = "default"
 """Name of the command that runs if the first argument is not the name of a command."""
@@ -86,8 +87,22 @@ class CommandWithOthers(TyperCommand):
     def format_options(self, ctx: Any, formatter: Any) -> None:  # noqa: ANN401
         """Write arguments and options, followed by the list of the other commands."""
         super().format_options(ctx, formatter)
+        structures = _names_of_added_structures()
+        if structures:
+            with formatter.section("Structures of installed packages"):
+                formatter.write_dl(structures)
         with formatter.section("Commands"):
             formatter.write_dl([*_OTHER_COMMANDS.items()])
+
+
+def _names_of_added_structures() -> list[tuple[str, str]]:
+    """Return name and package of each damping structure that a package adds; none is imported."""
+    from rigd.plugins import installed_plugins
+
+    return [
+        (plugin.name, plugin.problem or f"of {plugin.label}")
+        for plugin in installed_plugins("analysis.structures")
+    ]
 
 
 def _print_version(requested: bool) -> None:
@@ -223,6 +238,14 @@ def analyze(
             help="Weightings of the Welch fits: const, omega (1/omega), omega^K.",
         ),
     ] = "const,omega",
+    structure: Annotated[
+        str,
+        typer.Option(
+            metavar="LIST",
+            help="Also fit these damping structures of installed packages to the whole record "
+            "(rigd plugins lists them).",
+        ),
+    ] = "",
     band: Band = None,
     frf: Estimator = "h1",
     segment: Segment = None,
@@ -336,6 +359,12 @@ def analyze(
         )
     if method == "record":
         _check_record_method(context, is_campaign=is_campaign)
+    if structure and (method == "welch" or is_campaign):
+        raise typer.BadParameter(
+            "it is for whole-record fits of single sessions; "
+            f"{'add --each' if is_campaign else 'take --method all'}, or leave it out.",
+            param_hint="--structure",
+        )
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     run_routes = Routes(
         settings,
@@ -345,6 +374,7 @@ def analyze(
         band_hz=band_hz(band),
         figures=_figure_formats(figures),
         uniformity=None if uniformity is None else _relative_uniformity(uniformity),
+        structures=_added_structures(structure),
     )
     output_options = Outputs(report, json, overwrite, verbose)
     try:
@@ -462,6 +492,20 @@ def _fixed_parameters(option_text: str) -> tuple[Setting, ...]:
             param_hint="--fix",
         )
     return tuple(parameter_name for parameter_name in SETTINGS if parameter_name in parameter_names)
+
+
+def _added_structures(option_text: str) -> tuple[AddedStructure, ...]:
+    """Return the structures named in --structure; raise a usage error if one cannot be used."""
+    names = [name.strip() for name in option_text.split(",") if name.strip()]
+    if not names:
+        return ()
+    from analysis.structures import added_structures
+    from rigd.plugins import PluginError
+
+    try:
+        return added_structures(list(dict.fromkeys(names)))
+    except (LookupError, PluginError) as error:
+        raise typer.BadParameter(str(error), param_hint="--structure") from error
 
 
 def _relative_uniformity(uniformity_percent: float) -> float:

@@ -179,7 +179,7 @@ def read_source(
     suffix = path.suffix.lower()
     try:
         owner = None if suffix in _FORMATS else find_plugin(FORMAT_GROUP, suffix.removeprefix("."))
-        file_format = _FORMATS.get(suffix) if owner is None else load_plugin(owner, ImportFormat)
+        file_format = _FORMATS.get(suffix) if owner is None else _load_format(owner)
     except PluginError as error:
         raise ExchangeError(f"{path}: {error}") from error
     if file_format is None:
@@ -218,12 +218,22 @@ def _read_checked(
     try:
         with plugin_errors(owner, (ExchangeError, MemoryError)):
             channels = file_format.read(path, channel_names)
-            return {
-                name: replace(channels[name], values=np.asarray(channels[name].values, float))
-                for name in channel_names
-            }
+            return {name: _checked_channel(path, name, channels[name]) for name in channel_names}
     except PluginError as error:
         raise ExchangeError(f"{path}: {error}") from error
+    except SystemExit as error:
+        raise ExchangeError(f"{path}: {owner.error('its code ended the program.')}") from error
+
+
+def _checked_channel(path: Path, name: str, channel: SourceChannel) -> SourceChannel:
+    """Return a channel that a package has read, with real values; raise unless it is valid."""
+    values = real_vector(path, name, np.asarray(channel.values))
+    if values.ndim != 1:
+        raise ExchangeError(f"{path}: the channel '{name}' has {values.ndim} dimensions, not one.")
+    rate_hz = channel.rate_hz
+    if rate_hz is not None and not (rate_hz > 0 and np.isfinite(rate_hz)):
+        raise ExchangeError(f"{path}: the channel '{name}' has a rate of {rate_hz} Hz.")
+    return replace(channel, values=values)
 
 
 def check_format_plugin(plugin: Plugin) -> str:
@@ -235,8 +245,22 @@ def check_format_plugin(plugin: Plugin) -> str:
         If it cannot be used.
     """
     refuse_built_in(plugin, {suffix.removeprefix(".") for suffix in _FORMATS})
+    return f"{_load_format(plugin).name}, import of .{plugin.name}"
+
+
+def _load_format(plugin: Plugin) -> ImportFormat:
+    """Import the file format of a package, and check its declaration."""
     file_format = load_plugin(plugin, ImportFormat)
-    return f"{file_format.name}, import of .{plugin.name}"
+    if not (isinstance(file_format.name, str) and file_format.name.strip()):
+        raise plugin.error("its format has no name.")
+    if not callable(file_format.read):
+        raise plugin.error("its function that reads channels is no function.")
+    if not (isinstance(file_format.max_bytes, int) and file_format.max_bytes > 0):
+        raise plugin.error(
+            f"its largest file, max_bytes = {file_format.max_bytes}, is not a number of bytes "
+            "above 0."
+        )
+    return file_format
 
 
 def _check_file(path: Path, file_format: ImportFormat) -> None:

@@ -44,4 +44,6 @@ from ._select import fit_freest_alone as fit_freest_alone
 from ._select import select as select
 from ._settings import SETTINGS as SETTINGS
 from ._settings import Setting as Setting
+from ._structure_fit import StructureFit as StructureFit
+from ._structure_fit import fit_structure as fit_structure
 from ._uncertainty import damping_size as damping_size

@@ -17,6 +17,34 @@ FAR_BEHIND_BIC_DIFFERENCE: Final = 1000.0
 become the best one, however exactly its minimum is found."""
 
 
+def deviance(cost: float, value_count: int) -> float:
+    """Return ``-2 ln`` of the likelihood, up to a constant, for a noise of unknown level.
+
+    Parameters
+    ----------
+    cost : float
+        Sum of squares of the whitened residual.
+    value_count : int
+        Number of real values of the record.
+    """
+    return value_count * math.log(cost / value_count)
+
+
+def bic(cost: float, value_count: int, parameter_count: int) -> float:
+    """Return the Bayesian information criterion of a fit.
+
+    Parameters
+    ----------
+    cost : float
+        Sum of squares of the whitened residual.
+    value_count : int
+        Number of real values of the record.
+    parameter_count : int
+        Number of fitted parameters.
+    """
+    return deviance(cost, value_count) + parameter_count * math.log(value_count)
+
+
 @dataclass(frozen=True, slots=True)
 class Candidate:
     """Fit of one damping structure (a choice of free damping parameters) to one record.
@@ -60,7 +88,7 @@ class Candidate:
 
         The noise spectrum is known up to its level, which is estimated.
         """
-        return self.values * math.log(self.fit.cost / self.values)
+        return deviance(self.fit.cost, self.values)
 
     @property
     def bic(self) -> float:
@@ -68,7 +96,7 @@ class Candidate:
 
         G. Schwarz, Annals of Statistics 6 (1978) 461-464.
         """
-        return self.deviance + self.parameters * math.log(self.values)
+        return bic(self.fit.cost, self.values, self.parameters)
 
     @property
     def aic(self) -> float:

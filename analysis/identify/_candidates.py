@@ -24,7 +24,7 @@ from analysis.identify._settings import free_settings
 from analysis.identify.parametrization import Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
-from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
+from rigd.beam import COEFFICIENT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Iterable, Sequence
@@ -461,13 +461,8 @@ class CandidateSet:
             for parameter_name, fixed_value in structure.fixed.items()
             if structure.has(parameter_name)
         }
-        fixed_values[order] = 1.0  # type: ignore[index]
-        free_names = tuple(
-            parameter_name
-            for parameter_name in DAMPING_PARAMETERS
-            if parameter_name not in fixed_values
-        )
-        both_dampings = replace(structure, free=free_names, fixed=fixed_values)
+        fixed_values[order] = 1.0
+        both_dampings = replace(structure, fixed=fixed_values)
         unknowns = self.unknowns(both_dampings)
         coefficient_index = unknowns.names.index(coefficient)
         start_point = self.descent(unknowns, unknowns.vector(own_fit.plant), 1)

@@ -291,7 +291,7 @@ def _structure_status(
         for order_name, coefficient_name in COEFFICIENT_OF.items():
             if not structure.has(coefficient_name):
                 deviance_rise = estimate.deviance_without_damping[coefficient_name]
-            elif structure.fixed.get(order_name) == 1.0:  # type: ignore[call-overload]
+            elif structure.fixed.get(order_name) == 1.0:
                 deviance_rise = estimate.deviance_of_order_one[order_name]
             else:
                 continue

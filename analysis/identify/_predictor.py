@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from analysis.identify._modal_model import ModalModel
+from analysis.identify._structure_plant import StructurePlant
 from rigd.beam import (
     CausalTransform,
     Plant,
@@ -111,6 +112,8 @@ class TorquePredictor:
         """Return the transforms of the predicted torque and its k derivatives, shape (1 + k, n)."""
         if isinstance(plant, ModalModel):
             return (plant.response(self.s) * self._spectrum)[None]
+        if isinstance(plant, StructurePlant):
+            return plant.torque_spectra(self.s, wrt, self._spectrum)
         return self._response.evaluate(plant, wrt, self._spectrum)
 
     def torque_at_fine_samples(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 
@@ -17,10 +17,17 @@ if TYPE_CHECKING:
 
     from analysis.identify._comparison import Comparison
     from analysis.identify._estimates import DampingSize, ModeEstimate, Ringing
-    from analysis.identify._modal_fit import ModalFit
     from analysis.identify.noise import NoiseLine
     from analysis.models import Structure
     from rigd.beam import Plant
+
+
+class FitWithResidual(Protocol):
+    """Fit of a model to a record, of which only the residual is used."""
+
+    @property
+    def residual(self) -> NDArray[np.complex128]:
+        """Whitened spectrum of the residual, shape (K,)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -154,7 +161,7 @@ class RecordAnalysis:
         density_factor = self.comparison.samples * self.comparison.decimation.rate_hz / 2
         return NoiseSpectrum(self.noise_nm2_per_hz * density_factor, self.compared, self.lines)
 
-    def fit_percent(self, fit: RecordFit | ModalFit) -> float:
+    def fit_percent(self, fit: FitWithResidual) -> float:
         """Return how well a model fits the measured torque in the band, in per cent (NRMSE).
 
         Narrow-band disturbances are removed, and bins at their lines are not compared. A decay that
@@ -162,7 +169,7 @@ class RecordAnalysis:
 
         Parameters
         ----------
-        fit : RecordFit or ModalFit
+        fit : FitWithResidual
             One of `fits`, or one under the same noise.
         """
         comparison, noise = self.comparison, self.noise

@@ -533,7 +533,7 @@ def _unidentifiable_orders(
         )
         # A narrow interval without 1, although order 1 fits as well, is that of a local minimum.
         has_other_minimum = not low <= 1 <= upper_end and any(
-            other_candidate.structure.fixed.get(order_name) == 1.0  # type: ignore[call-overload]
+            other_candidate.structure.fixed.get(order_name) == 1.0
             and other_candidate.deviance - freest_candidate.deviance < NORMAL_95**2
             for other_candidate in other_candidates
         )

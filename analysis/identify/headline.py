@@ -446,10 +446,7 @@ def _structure_status(
         )
         has_worse_bic = candidate.bic > candidate_set.best.bic + BIC_DECISIVE
         return "excluded" if has_less_likelihood and has_worse_bic else "compatible"
-    if any(
-        candidate.structure.fixed.get(order_name) == 1.0  # type: ignore[call-overload]
-        for order_name in fractional_orders
-    ):
+    if any(candidate.structure.fixed.get(order_name) == 1.0 for order_name in fractional_orders):
         return "excluded"
     missing_parameters = freest_candidate.parameters - candidate.parameters
     deviance_limit = EXCLUSION_DEVIANCES[min(missing_parameters, len(EXCLUSION_DEVIANCES)) - 1]
@@ -478,7 +475,7 @@ def _conditional_estimate(
         return None
     simplest_candidate = min(compatible_candidates, key=lambda candidate: candidate.bic)
     fixed_orders = {
-        order_name: simplest_candidate.structure.fixed[order_name]  # type: ignore[index]
+        order_name: simplest_candidate.structure.fixed[order_name]
         for order_name, coefficient_name in COEFFICIENT_OF.items()
         if order_name in simplest_candidate.structure.fixed
         and coefficient_name in simplest_candidate.structure.free

@@ -8,7 +8,7 @@ coarse grid of orders finds other local minima.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from types import MappingProxyType
 from typing import TYPE_CHECKING, Final, Literal
@@ -17,8 +17,8 @@ import numpy as np
 
 from analysis.identify._candidate import FAR_BEHIND_BIC_DIFFERENCE
 from analysis.identify._refit import MISSED_COST_FRACTION, Refit
-from analysis.models import ORDER_RANGE, Structure
-from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS
+from analysis.models import ORDER_RANGE
+from rigd.beam import COEFFICIENT_OF
 
 if TYPE_CHECKING:
     from collections.abc import Collection
@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
+    from analysis.models import Structure
     from rigd.beam import Plant
 
 
@@ -330,12 +331,7 @@ def with_free_order(structure: Structure, order: Order) -> Structure:
         for parameter_name, at in structure.fixed.items()
         if parameter_name not in (damping_coefficient, order)
     }
-    free_names = tuple(
-        parameter_name
-        for parameter_name in DAMPING_PARAMETERS
-        if parameter_name not in fixed_values
-    )
-    return Structure(structure.name, free_names, MappingProxyType(fixed_values))
+    return replace(structure, fixed=MappingProxyType(fixed_values))
 
 
 class OrderProfiler:

@@ -27,17 +27,6 @@ if TYPE_CHECKING:
 
 # Sentences
 
-_DAMPING_PHRASES: Final = {
-    "I": "Internal damping only",
-    "II": "External damping only",
-    "III": "Internal and external damping",
-    "IV": "Internal damping only",
-    "V": "External damping only",
-    "VI": "Internal and external damping",
-    "VII": "Internal and external damping",
-}
-"""Beginning of the sentence on the dampings, by the name of the structure."""
-
 _MIN_MODES_TO_SEPARATE_DAMPINGS: Final = 2
 """Number of visible modes from which internal and external damping are separable."""
 
@@ -123,7 +112,7 @@ def _damping_sentences(
             else []
         )
     reported_structure = headline.fit.structure
-    damping_phrase = _DAMPING_PHRASES[reported_structure.name]
+    damping_phrase = reported_structure.description
     if any(each.reason == SECOND_DAMPING_REASON for each in order_verdicts):
         damping_phrase = damping_phrase.replace("only", "alone would do")
     sentences = [f"{damping_phrase}. Numbers are those of type {headline.name}, all orders free."]

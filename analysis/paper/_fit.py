@@ -45,7 +45,7 @@ from analysis.models import (
     weights,
 )
 from analysis.optimizer import Box, Minimum, NormalEquations, RecentValues, descend
-from rigd.beam import DAMPING_PARAMETERS, Beam, Damping, DampingParameter
+from rigd.beam import DAMPING_PARAMETERS, Beam, Damping
 
 # Fits
 
@@ -408,7 +408,7 @@ def thinned(
 
 # Starts
 
-_START_GRID: Final[dict[DampingParameter, tuple[float, ...]]] = {
+_START_GRID: Final[dict[str, tuple[float, ...]]] = {
     "zeta": tuple(math.log(size) for size in (1e-4, 1e-3, 1e-2, 1e-1)),
     "alpha": (0.3, 0.8, 1.3, 1.8),
     "gamma": tuple(math.log(size) for size in (1e-3, 1e-2, 1e-1, 1.0)),

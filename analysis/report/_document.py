@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
-    from analysis.identify import DampingSize, RecordFit
+    from analysis.identify import DampingSize, RecordFit, StructureFit
     from analysis.paper import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report.bands import LossFactor
@@ -228,8 +228,35 @@ def record_entries(
                 "fixed": list(whole_record.fixed),
                 "hum": [asdict(spectral_line) for spectral_line in whole_record.analysis.lines],
                 "curves": _curves_json(whole_record),
+                "added_structures": [
+                    _added_structure_json(structure_fit, whole_record)
+                    for structure_fit in whole_record.added
+                ],
             }
         ],
+    }
+
+
+def _added_structure_json(structure_fit: StructureFit, whole_record: WholeRecord) -> dict[str, Any]:
+    """Return the JSON object of the fit of a package's damping structure."""
+    return {
+        "structure": structure_fit.structure.name,
+        "description": structure_fit.structure.description,
+        "package": structure_fit.package,
+        "free": list(structure_fit.std),
+        "parameters": dict(structure_fit.parameters),
+        "units": {each.name: each.unit for each in structure_fit.structure.parameters},
+        "std": dict(structure_fit.std),
+        "at_bounds": list(structure_fit.at_bounds),
+        "loss_factors": [
+            {"frequency_hz": frequency_hz, "loss_factor": loss_factor}
+            for frequency_hz, loss_factor in structure_fit.loss_factors
+        ],
+        "cost": structure_fit.cost,
+        "degrees_of_freedom": structure_fit.degrees_of_freedom,
+        "nrmse_percent": whole_record.analysis.fit_percent(structure_fit),
+        "delta_bic": structure_fit.delta_bic,
+        "compared_with": structure_fit.compared_with,
     }
 
 

@@ -101,6 +101,54 @@ def structures_table(whole_record: WholeRecord) -> Table:
     )
 
 
+def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
+    """Return the table of the fits of packages' structures; nothing without such fits."""
+    if not whole_record.added:
+        return ()
+    rows: list[tuple[Entry, ...]] = [
+        (
+            fit.structure.name,
+            parameter.symbol,
+            fit.parameters[parameter.name],
+            fit.std.get(parameter.name),
+            parameter.unit or "1",
+            parameter.meaning + (" *" if parameter.name in fit.at_bounds else ""),
+            fit.delta_bic,
+            whole_record.analysis.fit_percent(fit),
+            parameter.name,
+            fit.package,
+            fit.compared_with,
+        )
+        for fit in whole_record.added
+        for parameter in fit.structure.parameters
+    ]
+    table = Table.of(
+        "added_structures",
+        "Structures of installed packages on the whole record",
+        (
+            Column("Structure", "structure", TEXT_FORMAT),
+            Column("", "symbol", TEXT_FORMAT),
+            Column("Value", "value"),
+            Column("std", "std", std_of_previous=True),
+            Column("Unit", "unit", TEXT_FORMAT),
+            Column("Meaning", "meaning", TEXT_FORMAT),
+            Column("ΔBIC", "delta_bic"),
+            Column("Fit (%)", "nrmse_percent", ".2f"),
+            Column("", "parameter", TEXT_FORMAT),
+            Column("", "package", TEXT_FORMAT),
+            Column("", "compared_with", TEXT_FORMAT),
+        ),
+        rows,
+        (
+            "ΔBIC: Bayesian information criterion above the lowest of types I to VII. These "
+            "structures are compared with the types, but are no candidates of the verdict. * rests "
+            "on the edge of the range searched.",
+        ),
+        grouped=True,
+    )
+    return (table,)
+
+
 def _marked_row(whole_record: WholeRecord) -> str:
     """Return what the highlighted row of the table of fits contains, as part of a note."""
     return (

@@ -193,6 +193,7 @@ def record_tables(whole_record: WholeRecord) -> RenderableType:
                     if (table := make_table(whole_record)) is not None
                 ),
                 *tables.amplitude_tables(whole_record),
+                *fit_tables.added_structures_tables(whole_record),
             )
         )
     )

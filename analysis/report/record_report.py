@@ -16,6 +16,7 @@ from analysis.report._uniformity import UNIFORMITY, uniformity_table
 from analysis.report.folder import write_new
 from analysis.report.table import Table, csv_text, latex_table, with_validity
 from analysis.results import DEFAULT_FORMATS
+from rigd.spectral import WINDOW
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Mapping, Sequence
@@ -242,8 +243,8 @@ def _welch_facts(analysis: WelchAnalysis) -> list[tuple[str, str]]:
         welch_facts.append(
             (
                 "segments",
-                f"{response.segments} of {segmentation.segment_length} samples (Hamming), overlap "
-                f"{segmentation.overlap}, nfft {segmentation.nfft}",
+                f"{response.segments} of {segmentation.segment_length} samples ({WINDOW.name}), "
+                f"overlap {segmentation.overlap}, nfft {segmentation.nfft}",
             )
         )
     return welch_facts
@@ -327,6 +328,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
         tables.correlations_table(whole_record),
         *tables.amplitude_tables(whole_record),
         fit_tables.structures_table(whole_record),
+        *fit_tables.added_structures_tables(whole_record),
     )
     paper_tables = (
         ()

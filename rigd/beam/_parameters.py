@@ -36,6 +36,8 @@ class Parameter:
     """Whether 0 is not valid either."""
     gradient_name: str = ""
     """Name of the logarithm by which the response is differentiated; "" for the parameter."""
+    starts: tuple[float, ...] = ()
+    """Values from which a fit starts, in the SI unit; () if a fit derives them from the beam."""
 
     def is_valid(self, parameter_value: float) -> bool:
         """Return whether a value is in the range of the parameter.

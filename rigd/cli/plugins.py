@@ -18,9 +18,9 @@ plugins_app = typer.Typer(invoke_without_command=True, rich_markup_mode=None)
 def plugins(context: typer.Context, as_json: AsJson = False) -> None:
     """List what installed packages add, or make a package.
 
-    A package adds a device by an entry point of the group rigd.devices, a controller by one of
-    rigd.controllers. Each is imported and checked; one that cannot be used is named with the
-    reason, and the command exits with 1.
+    A package adds a device, a controller, an excitation, a file format or a damping structure by an
+    entry point. Each is imported and checked; one that cannot be used is named with the reason, and
+    the command exits with 1.
 
     Example: rigd plugins
     """

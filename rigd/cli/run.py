@@ -40,10 +40,9 @@ from rigd.cli.options import (
 )
 from rigd.cli.start import SessionCommands, start_processes, start_sessions
 from rigd.extras import require_extra
-from rigd.units import unit_of
 
 if TYPE_CHECKING:
-    from rigd.excitation import Value
+    from rigd.excitation import ExcitationOption, Value
     from rigd.runner.session import RunResult
 
 
@@ -161,7 +160,7 @@ def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: 
 
 def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's click varies
     """Return the subcommand of an excitation that an installed package adds, or None."""
-    from rigd.excitation import find_excitation, option_types
+    from rigd.excitation import excitation_options, find_excitation
 
     added = find_excitation(name)
     if added is None:
@@ -176,15 +175,15 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
     parameters.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [
             inspect.Parameter(
-                option,
+                option.name,
                 inspect.Parameter.KEYWORD_ONLY,
-                default=default,
+                default=option.default,
                 annotation=Annotated[
-                    value_type,
-                    typer.Option(_option_flag(option), help=f"{text or option}{_in_unit(option)}."),
+                    option.value_type,
+                    typer.Option(_option_flag(option.name), help=_option_help(option)),
                 ],
             )
-            for option, (value_type, default, text) in option_types(kind).items()
+            for option in excitation_options(name)
         ]
     )
     app = typer.Typer(name=app_name, rich_markup_mode=None)
@@ -197,9 +196,10 @@ def _option_flag(option: str) -> str:
     return "--" + option.removesuffix("_s").removesuffix("_rad").replace("_", "-")
 
 
-def _in_unit(option: str) -> str:
-    """Return the unit of an option in parentheses after a space, or "" if it has none."""
-    return f" ({unit_of(option)})" if unit_of(option) else ""
+def _option_help(option: "ExcitationOption") -> str:
+    """Return the help of an option, with its unit in parentheses."""
+    unit = f" ({option.unit})" if option.unit else ""
+    return f"{option.help or option.name}{unit}."
 
 
 def run_sessions(

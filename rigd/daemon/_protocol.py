@@ -4,7 +4,6 @@ An invalid line raises an error whose text states the reason. docs/control_socke
 rules.
 """
 
-import inspect
 import json
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
@@ -12,7 +11,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar
 from pydantic import BaseModel, ConfigDict, Field, TypeAdapter, ValidationError
 
 from rigd.errors import RigdError
-from rigd.excitation import KINDS, RIG_ARGUMENTS, Value
+from rigd.excitation import KINDS, Value, excitation_options
 from rigd.session.user_metadata import NOTES, MetadataError, metadata_keys
 from rigd.units import finite_number
 
@@ -276,30 +275,20 @@ def _checked_session_request(request: AnySessionRequest) -> AnySessionRequest:
         if slope_rad <= 0.0:
             raise RequestError(f"tip_slope_rad = {slope_rad:g} rad must be more than 0 rad.")
         checked_fields["tip_slope_rad"] = slope_rad
-    excitation_function = KINDS[request.excitation]
-    function_parameters = {
-        parameter_name: function_parameter
-        for parameter_name, function_parameter in inspect.signature(
-            excitation_function
-        ).parameters.items()
-        if parameter_name not in RIG_ARGUMENTS
-    }
+    options = {option.name: option for option in excitation_options(request.excitation)}
     checked_values: dict[str, Value] = {}
     for parameter_name, given_value in given_parameters.items():
-        if parameter_name not in function_parameters:
+        if parameter_name not in options:
             raise RequestError(
                 f"parameters: {_shown_value(parameter_name)} is not a parameter of "
-                f"{request.excitation}; there are {', '.join(function_parameters)}."
+                f"{request.excitation}; there are {', '.join(options)}."
             )
         checked_values[parameter_name] = _converted_parameter(
-            parameter_name, given_value, function_parameters[parameter_name].annotation
+            parameter_name, given_value, options[parameter_name].value_type
         )
-    for parameter_name, function_parameter in function_parameters.items():
-        if (
-            function_parameter.default is inspect.Parameter.empty
-            and parameter_name not in checked_values
-        ):
-            raise RequestError(f"parameters.{parameter_name} is missing.")
+    for option in options.values():
+        if option.required and option.name not in checked_values:
+            raise RequestError(f"parameters.{option.name} is missing.")
     return request.model_copy(update={**checked_fields, "parameters": checked_values})
 
 

@@ -4,11 +4,11 @@ import inspect
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import asdict, fields
 from functools import lru_cache
-from typing import Annotated, Any, Final, get_args, get_origin, get_type_hints
+from typing import Any, Final, get_type_hints
 
 import numpy as np
-from annotated_types import DocInfo
 
+from rigd.excitation._options import documented
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -119,18 +119,6 @@ def load_excitation(plugin: Plugin) -> ExcitationKind:
     return kind
 
 
-def option_types(kind: ExcitationKind) -> dict[str, tuple[type, Any, str]]:
-    """Return type, default and help of each option of an excitation, by its name."""
-    found = {}
-    hints = get_type_hints(kind.options, include_extras=True)
-    for option in fields(kind.options):
-        hint = hints[option.name]
-        extras = get_args(hint)[1:] if get_origin(hint) is Annotated else ()
-        help_text = next((each.documentation for each in extras if isinstance(each, DocInfo)), "")
-        found[option.name] = (get_args(hint)[0] if extras else hint, option.default, help_text)
-    return found
-
-
 @lru_cache(maxsize=64)
 def added_function(plugin: Plugin) -> MakeExcitation:
     """Return a function with the options of a package's excitation as its arguments."""
@@ -150,19 +138,20 @@ def added_function(plugin: Plugin) -> MakeExcitation:
             )
         return assemble_excitation(kind.name, asdict(options), rate_hz, segments, sweep_rad)
 
-    described = option_types(kind)
+    hints = get_type_hints(kind.options, include_extras=True)
     keyword = inspect.Parameter.KEYWORD_ONLY
     rate = inspect.Parameter("rate_hz", keyword, annotation=float)
     make.__signature__ = inspect.Signature(  # type: ignore[attr-defined]
         [rate]
         + [
-            inspect.Parameter(name, keyword, default=default, annotation=value_type)
-            for name, (value_type, default, _) in described.items()
+            inspect.Parameter(
+                option.name, keyword, default=option.default, annotation=hints[option.name]
+            )
+            for option in fields(kind.options)
         ]
     )
-    entries = "".join(f"{name}\n    {text or name}\n" for name, (_, _, text) in described.items())
-    make.__doc__ = f"{kind.summary}\n\nParameters\n----------\n{entries}"
-    return make
+    make.__doc__ = kind.summary
+    return documented(make)
 
 
 def _checked_options(kind: ExcitationKind, given: Mapping[str, Any]) -> Any:  # noqa: ANN401

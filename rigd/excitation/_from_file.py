@@ -1,11 +1,13 @@
 """Reference signals from text files."""
 
 from pathlib import Path
-from typing import BinaryIO, Final
+from typing import Annotated, BinaryIO, Final
 
 import numpy as np
 import numpy.typing as npt
+from annotated_types import doc
 
+from rigd.excitation._options import documented
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -29,25 +31,26 @@ _RADIAN_NAMES: Final = ("rad", "radian", "radians")
 """Names of the unit that a column of angles may state."""
 
 
+@documented
 def from_csv(
-    path: str | Path, *, rate_hz: float, rest_s: float = 1.0, ring_down_s: float = 15.0
+    path: Annotated[
+        str | Path,
+        doc(
+            "Text file. Either it has the columns ``time_s`` and ``angle_rad`` (more columns "
+            "are ignored, angles are interpolated linearly to the ticks, and times are counted "
+            "from the first row). Or it has a single column of angles in rad, one per tick, "
+            "with or without the heading ``angle_rad``."
+        ),
+    ],
+    *,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    rest_s: Annotated[float, doc("Time in s before the trajectory.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s after the trajectory.")] = 15.0,
 ) -> Excitation:
     """Return an excitation whose reference angles are read from a text file.
 
     `rigd.text_table.read_table` detects separator, decimal sign, heading and encoding; an
     invalid line is an error.
-
-    Parameters
-    ----------
-    path
-        Text file. Either it has the columns ``time_s`` and ``angle_rad`` (more columns are ignored,
-        angles are interpolated linearly to the ticks, and times are counted from the first row). Or
-        it has a single column of angles in rad, one per tick, with or without the heading
-        ``angle_rad``.
-    rate_hz
-        Ticks a second.
-    rest_s, ring_down_s
-        Time in s before and after the trajectory.
 
     Raises
     ------

@@ -8,6 +8,7 @@ from typing import Protocol
 from rigd.excitation._added import ExcitationKinds
 from rigd.excitation._from_file import from_csv
 from rigd.excitation._narrow_sweeps import SweepRig, modes
+from rigd.excitation._options import ExcitationOption, declared_options
 from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
@@ -40,9 +41,23 @@ KINDS = ExcitationKinds(
 
 They include those of installed packages."""
 
-RIG_ARGUMENTS = frozenset({"rate_hz", "rig", "tip_slope_rad"})
-"""Names of arguments of these functions that are data or limits of the rig, not options of the
-excitation."""
+
+def excitation_options(name: str) -> tuple[ExcitationOption, ...]:
+    """Return the declared options of an excitation, in their order.
+
+    Parameters
+    ----------
+    name
+        Name of an excitation, a key of `KINDS`.
+
+    Raises
+    ------
+    KeyError
+        If there is no such excitation.
+    PluginError
+        If the package of the excitation cannot be used.
+    """
+    return declared_options(KINDS[name])
 
 
 def make_excitation(

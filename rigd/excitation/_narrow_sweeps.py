@@ -17,6 +17,7 @@ from statistics import median
 from typing import Annotated, Any, Final, Protocol
 
 import numpy as np
+from annotated_types import doc
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, FailFast, Field, ValidationError
 from pydantic_core import ErrorDetails
@@ -30,6 +31,7 @@ from rigd.beam import (
 )
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
+from rigd.excitation._options import documented
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
     Excitation,
@@ -436,47 +438,52 @@ def _beam_with_mode(beam: Beam, frequency_hz: float) -> Beam:
 # Sweeps
 
 
+@documented
 def modes(
     *,
-    rate_hz: float,
-    path: str | Path,
-    amplitude_rad: float = 0.025,
-    stop_hz: float = 50.0,
-    widths: float = 1.0,
-    duration_s: float = 120.0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 15.0,
-    taper_s: float = 1.0,
-    tip_slope_rad: float = SMALL_SLOPE_RAD,
-    rig: SweepRig | None = None,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    path: Annotated[
+        str | Path,
+        doc("JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`."),
+    ],
+    amplitude_rad: Annotated[
+        float,
+        doc(
+            "Amplitude in each band. It is lower if the rig's limits or the slope of the tip "
+            "require it."
+        ),
+    ] = 0.025,
+    stop_hz: Annotated[float, doc("Highest frequency of a mode that is swept.")] = 50.0,
+    widths: Annotated[
+        float,
+        doc(
+            "Number of half-power widths swept on either side of a mode, in addition to the "
+            "uncertainty of its frequency."
+        ),
+    ] = 1.0,
+    duration_s: Annotated[float, doc("Total duration of all sweeps in s.")] = 120.0,
+    rest_s: Annotated[float, doc("Time in s before the sweeps.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s after the sweeps.")] = 15.0,
+    taper_s: Annotated[
+        float,
+        doc(
+            "Duration in s of the raised-cosine fade at both ends of every sweep, so that angle "
+            "and speed are zero where two sweeps meet."
+        ),
+    ] = 1.0,
+    tip_slope_rad: Annotated[
+        float,
+        doc("Largest slope of the beam's free end, of which the sweeps use 90 %."),
+    ] = SMALL_SLOPE_RAD,
+    rig: Annotated[
+        SweepRig | None,
+        doc(
+            "Rig whose limits determine the amplitudes, and whose beam determines the times by "
+            "the information on the damping; None: equal amplitudes and times."
+        ),
+    ] = None,
 ) -> Excitation:
     """Return an excitation with a linear sweep through a narrow band around each mode.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    path
-        JSON with the modes: see `rigd.excitation._narrow_sweeps.read_modes`.
-    amplitude_rad
-        Amplitude in each band. It is lower if the rig's limits or the slope of the tip require it.
-    stop_hz
-        Highest frequency of a mode that is swept.
-    widths
-        Number of half-power widths swept on either side of a mode, in addition to the uncertainty
-        of its frequency.
-    duration_s
-        Total duration of all sweeps in s.
-    rest_s, ring_down_s
-        Time in s before and after the sweeps.
-    taper_s
-        Duration in s of the raised-cosine fade at both ends of every sweep, so that angle and speed
-        are zero where two sweeps meet.
-    tip_slope_rad
-        Largest slope of the beam's free end, of which the sweeps use 90 %.
-    rig
-        Rig whose limits determine the amplitudes, and whose beam determines the times by the
-        information on the damping; None: equal amplitudes and times.
 
     Raises
     ------

@@ -10,11 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from math import ceil, inf
 from pathlib import Path
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 import numpy as np
+from annotated_types import doc
 from numpy.typing import NDArray
 
+from rigd.excitation._options import documented
 from rigd.excitation._residual_vibration import predict_move_end
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
@@ -600,37 +602,34 @@ class MoveRig(Protocol):
         """
 
 
+@documented
 def move(
     *,
-    rate_hz: float,
-    angle_rad: float | None = None,
-    by_rad: float | None = None,
-    path: str | Path = "",
-    robust: int = 0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 5.0,
-    rig: MoveRig | None = None,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    angle_rad: Annotated[float | None, doc("Final angle from the rig's zero.")] = None,
+    by_rad: Annotated[
+        float | None,
+        doc("Distance from the present angle, of either sign, instead of `angle_rad`."),
+    ] = None,
+    path: Annotated[
+        str | Path,
+        doc(
+            "JSON written by ``analyze --json`` with the beam for which the move is planned; "
+            "empty: the beam of the profile."
+        ),
+    ] = "",
+    robust: Annotated[
+        int,
+        doc(
+            "1: the move tolerates a 1 % frequency error and does not turn back, but takes "
+            "longer. 0: the move is the shortest."
+        ),
+    ] = 0,
+    rest_s: Annotated[float, doc("Time in s before the move.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s after the move.")] = 5.0,
+    rig: Annotated[MoveRig | None, doc("Rig that is moved.")] = None,
 ) -> Excitation:
     """Return the shortest move to another angle that leaves no vibration; the motor stays there.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    angle_rad
-        Final angle from the rig's zero.
-    by_rad
-        Distance from the present angle, of either sign, instead of `angle_rad`.
-    path
-        JSON written by ``analyze --json`` with the beam for which the move is planned; empty: the
-        beam of the profile.
-    robust
-        1: the move tolerates a 1 % frequency error and does not turn back, but takes longer.
-        0: the move is the shortest.
-    rest_s, ring_down_s
-        Time in s before and after the move.
-    rig
-        Rig that is moved.
 
     Raises
     ------

@@ -3,12 +3,14 @@
 from collections.abc import Mapping
 from dataclasses import dataclass
 from math import isfinite, pi
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from annotated_types import doc
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
+from rigd.excitation._options import documented
 from rigd.session import sweep_frequency_hz
 from rigd.session.limits import MAX_SAMPLES
 from rigd.units import is_usable_size
@@ -249,42 +251,41 @@ def assemble_excitation(
 # Signals
 
 
+@documented
 def chirp(
     *,
-    rate_hz: float,
-    amplitude_rad: float = 0.025,
-    start_hz: float = 0.05,
-    stop_hz: float = 50.0,
-    duration_s: float = 120.0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 15.0,
-    taper_s: float = 0.0,
-    there_and_back: int = 0,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    amplitude_rad: Annotated[float, doc("Amplitude A.")] = 0.025,
+    start_hz: Annotated[float, doc("Frequency f0 at the sweep's first tick.")] = 0.05,
+    stop_hz: Annotated[
+        float, doc("Frequency f1 at the sweep's end; f1 < f0 sweeps downwards.")
+    ] = 50.0,
+    duration_s: Annotated[
+        float,
+        doc("Duration T of a sweep in s; with ``there_and_back``, of each of the two sweeps."),
+    ] = 120.0,
+    rest_s: Annotated[float, doc("Time in s before the sweep.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s after the sweep.")] = 15.0,
+    taper_s: Annotated[
+        float,
+        doc(
+            "Duration in s of the raised-cosine fade at both ends of the sweep; 0, as in the "
+            "paper: no fade."
+        ),
+    ] = 0.0,
+    there_and_back: Annotated[
+        int,
+        doc(
+            "1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a "
+            "change over time is visible; 0: one sweep."
+        ),
+    ] = 0,
 ) -> Excitation:
     """Return a chirp: a sine whose frequency changes linearly with time.
 
     The sweep is ``A sin 2π(f0 t + (f1 - f0) t²/(2 T))``, with t from its first tick. The defaults
     are the paper's experiment (Section 5). With ``there_and_back`` the frequency returns to f0 in
     the same time, with continuous angle and speed at the turn.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    amplitude_rad
-        Amplitude A.
-    start_hz, stop_hz
-        Frequencies f0 at the sweep's first tick and f1 at its end; f1 < f0 sweeps downwards.
-    duration_s
-        Duration T of a sweep in s; with ``there_and_back``, of each of the two sweeps.
-    rest_s, ring_down_s
-        Time in s before and after the sweep.
-    taper_s
-        Duration in s of the raised-cosine fade at both ends of the sweep; 0, as in the paper: no
-        fade.
-    there_and_back
-        1: two sweeps, the second from f1 to f0, so that each mode is passed twice and a change
-        over time is visible; 0: one sweep.
 
     Raises
     ------
@@ -339,19 +340,15 @@ def chirp(
     return assemble_excitation("chirp", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
+@documented
 def hold(
-    *, rate_hz: float, duration_s: float = 10.0, rest_s: float = 1.0, ring_down_s: float = 0.0
+    *,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 10.0,
+    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 0.0,
 ) -> Excitation:
     """Return an excitation that holds the start angle, to record noise and drift of the sensor.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    duration_s
-        Duration of the segment ``sweep`` in s.
-    rest_s, ring_down_s
-        Time in s before and after this segment.
 
     Raises
     ------
@@ -370,26 +367,16 @@ def hold(
     return assemble_excitation("hold", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
+@documented
 def step(
     *,
-    rate_hz: float,
-    amplitude_rad: float = 0.025,
-    duration_s: float = 10.0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 15.0,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    amplitude_rad: Annotated[float, doc("Angle of the step, of either sign and not 0.")] = 0.025,
+    duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 10.0,
+    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 15.0,
 ) -> Excitation:
     """Return an excitation with a step of the reference angle at the sweep's first tick.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    amplitude_rad
-        Angle of the step, of either sign and not 0.
-    duration_s
-        Duration of the segment ``sweep`` in s.
-    rest_s, ring_down_s
-        Time in s before and after this segment.
 
     Raises
     ------
@@ -419,44 +406,34 @@ def step(
     return assemble_excitation("step", parameters, rate_hz, segment_ticks, sweep_rad)
 
 
+@documented
 def multisine(
     *,
-    rate_hz: float,
-    amplitude_rad: float = 0.025,
-    start_hz: float = 0.05,
-    stop_hz: float = 50.0,
-    period_s: float = 20.0,
-    duration_s: float = 120.0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 15.0,
-    taper_s: float = 0.0,
-    seed: int = 0,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    amplitude_rad: Annotated[float, doc("Largest magnitude of the reference.")] = 0.025,
+    start_hz: Annotated[float, doc("Lowest frequency of the band.")] = 0.05,
+    stop_hz: Annotated[float, doc("Highest frequency of the band.")] = 50.0,
+    period_s: Annotated[
+        float,
+        doc("Period in s, a whole number of ticks. ``duration_s`` is a whole number of periods."),
+    ] = 20.0,
+    duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 120.0,
+    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 15.0,
+    taper_s: Annotated[
+        float,
+        doc(
+            "Duration in s of the raised-cosine fade at both ends of the whole sweep. The "
+            "periods with a fade differ from the others."
+        ),
+    ] = 0.0,
+    seed: Annotated[int, doc("Seed of the phases: equal seeds give equal references.")] = 0,
 ) -> Excitation:
     """Return a random-phase multisine: equal amplitudes on every harmonic of 1/period in a band.
 
     The period is shifted so that it begins at its smallest magnitude (the spectrum's magnitude
     stays flat), and scaled to the peak ``amplitude_rad``. ``parameters["crest_factor"]`` is its
     crest factor, peak over rms.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    amplitude_rad
-        Largest magnitude of the reference.
-    start_hz, stop_hz
-        Lowest and highest frequency of the band.
-    period_s
-        Period in s, a whole number of ticks. ``duration_s`` is a whole number of periods.
-    duration_s
-        Duration of the segment ``sweep`` in s.
-    rest_s, ring_down_s
-        Time in s before and after this segment.
-    taper_s
-        Duration in s of the raised-cosine fade at both ends of the whole sweep. The periods with a
-        fade differ from the others.
-    seed
-        Seed of the phases: equal seeds give equal references.
 
     Raises
     ------

@@ -9,10 +9,13 @@ number of ticks with and without a touch. Neither way excites a vibration.
 from dataclasses import dataclass, replace
 from math import ceil
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
+from annotated_types import doc
 from numpy.typing import NDArray
 
+from rigd.excitation._options import documented
 from rigd.excitation._shortest_move import MoveRig, shortest_braking
 from rigd.excitation._signals import (
     Excitation,
@@ -63,49 +66,41 @@ class Approach:
     """Contact force in N above which the torque is switched off."""
 
 
+@documented
 def touch(
     *,
-    rate_hz: float,
-    angle_rad: float,
-    speed_rad_s: float = 1.0,
-    acceleration_rad_s2: float = 20.0,
-    passes: int = 1,
-    hold_s: float = 0.5,
-    settle_s: float = 1.0,
-    force_limit_n: float = 10.0,
-    rest_s: float = 1.0,
-    ring_down_s: float = 1.0,
-    path: str | Path = "",
-    rig: MoveRig | None = None,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    angle_rad: Annotated[float, doc("Farthest angle from the rig's zero.")],
+    speed_rad_s: Annotated[float, doc("Speed on the way out.")] = 1.0,
+    acceleration_rad_s2: Annotated[
+        float,
+        doc("Largest acceleration of the reference at the beginning and end of the way out."),
+    ] = 20.0,
+    passes: Annotated[int, doc("Number of passes.")] = 1,
+    hold_s: Annotated[
+        float,
+        doc("Time in s from a touch to the way back; without a touch, time at the farthest angle."),
+    ] = 0.5,
+    settle_s: Annotated[float, doc("Time in s at rest before each pass.")] = 1.0,
+    force_limit_n: Annotated[
+        float,
+        doc(
+            "Contact force above which the torque is switched off and the session ends as a "
+            "fault. It is checked if the rig measures the base shear."
+        ),
+    ] = 10.0,
+    rest_s: Annotated[float, doc("Time in s before and after all passes.")] = 1.0,
+    ring_down_s: Annotated[float, doc("Time in s before and after all passes.")] = 1.0,
+    path: Annotated[
+        str | Path,
+        doc(
+            "JSON written by ``analyze --json`` with the beam whose predicted torque is "
+            "compared with the measured torque; empty: the beam of the profile."
+        ),
+    ] = "",
+    rig: Annotated[MoveRig | None, doc("Rig that is moved.")] = None,
 ) -> Excitation:
     """Return an excitation that moves the beam until it touches an obstacle, and then back.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    angle_rad
-        Farthest angle from the rig's zero.
-    speed_rad_s
-        Speed on the way out.
-    acceleration_rad_s2
-        Largest acceleration of the reference at the beginning and end of the way out.
-    passes
-        Number of passes.
-    hold_s
-        Time in s from a touch to the way back; without a touch, time at the farthest angle.
-    settle_s
-        Time in s at rest before each pass.
-    force_limit_n
-        Contact force above which the torque is switched off and the session ends as a fault. It is
-        checked if the rig measures the base shear.
-    rest_s, ring_down_s
-        Time in s before and after all passes.
-    path
-        JSON written by ``analyze --json`` with the beam whose predicted torque is compared with the
-        measured torque; empty: the beam of the profile.
-    rig
-        Rig that is moved.
 
     Raises
     ------

@@ -6,14 +6,16 @@ segments after it are planned during the session, from the record so far (`exper
 
 from dataclasses import dataclass
 from math import pi
-from typing import Final, Protocol
+from typing import Annotated, Final, Protocol
 
 import numpy as np
+from annotated_types import doc
 from numpy.typing import NDArray
 
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
+from rigd.excitation._options import documented
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -103,51 +105,56 @@ class PrecisionSearch:
     uniformity_percent: float | None = None
 
 
+@documented
 def until(
     *,
-    rate_hz: float,
-    targets: str,
-    at_most_s: float = 120.0,
-    tip_slope_rad: float = SMALL_SLOPE_RAD,
-    amplitude_rad: float = 0.05,
-    start_hz: float = 0.5,
-    stop_hz: float = 52.0,
-    scan_s: float = 5.0,
-    rest_s: float = 1.0,
-    uniformity_percent: float | None = None,
-    rig: ScanRig | None = None,
+    rate_hz: Annotated[float, doc("Ticks a second.")],
+    targets: Annotated[
+        str,
+        doc(
+            "Standard deviations to be reached: one or several of ``QUANTITY STD``, such as "
+            "``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.targets.parse_target`."
+        ),
+    ],
+    at_most_s: Annotated[float, doc("Longest duration of the record in s.")] = 120.0,
+    tip_slope_rad: Annotated[
+        float,
+        doc(
+            "Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 "
+            "%. Beyond the default, the linear model is not exact."
+        ),
+    ] = SMALL_SLOPE_RAD,
+    amplitude_rad: Annotated[
+        float,
+        doc(
+            "Largest amplitude of the scan, at its end. The amplitude is a sixth of it at mode "
+            "2 and two fifths at mode 1. It is lower if the rig's limits or the slope require "
+            "it."
+        ),
+    ] = 0.05,
+    start_hz: Annotated[float, doc("Lowest frequency of the scan.")] = 0.5,
+    stop_hz: Annotated[float, doc("Highest frequency of the scan.")] = 52.0,
+    scan_s: Annotated[float, doc("Duration of the scan in s.")] = 5.0,
+    rest_s: Annotated[float, doc("Time in s before the scan.")] = 1.0,
+    uniformity_percent: Annotated[
+        float | None,
+        doc(
+            "Relative standard deviation of each mode's frequency from that of a uniform beam, "
+            "for the fits; None: the value of the profile."
+        ),
+    ] = None,
+    rig: Annotated[
+        ScanRig | None,
+        doc(
+            "Rig whose limits and modes determine the amplitude; None: one amplitude for all "
+            "frequencies."
+        ),
+    ] = None,
 ) -> Excitation:
     """Return the excitation of a session until target standard deviations are reached.
 
     It begins with a quick scan of all modes. The segments after it are planned during the session:
     each is the most informative excitation.
-
-    Parameters
-    ----------
-    rate_hz
-        Ticks a second.
-    targets
-        Standard deviations to be reached: one or several of ``QUANTITY STD``, such as
-        ``damping 1%; frequency 1:0.002Hz``; see `rigd.excitation.targets.parse_target`.
-    at_most_s
-        Longest duration of the record in s.
-    tip_slope_rad
-        Largest slope of the beam's free end, of which the scan uses 80 % and segments 90 %. Beyond
-        the default, the linear model is not exact.
-    amplitude_rad
-        Largest amplitude of the scan, at its end. The amplitude is a sixth of it at mode 2 and two
-        fifths at mode 1. It is lower if the rig's limits or the slope require it.
-    start_hz, stop_hz
-        Lowest and highest frequency of the scan.
-    scan_s
-        Duration of the scan in s.
-    rest_s
-        Time in s before the scan.
-    uniformity_percent
-        Relative standard deviation of each mode's frequency from that of a uniform beam, for the
-        fits; None: the value of the profile.
-    rig
-        Rig whose limits and modes determine the amplitude; None: one amplitude for all frequencies.
 
     Raises
     ------

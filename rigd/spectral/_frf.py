@@ -30,6 +30,8 @@ from typing import Final, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from rigd.spectral._window import WINDOW
+
 Estimator = Literal["h1", "h2", "hv", "iv", "fft"]
 """Names of the estimators of a frequency response."""
 
@@ -408,7 +410,7 @@ def welch_response(
 ) -> FrequencyResponse:
     """Return the frequency response from averaged spectra of windowed segments (Welch's method).
 
-    The window is the symmetric Hamming window, as in MATLAB. No trend is removed from the segments.
+    The window is `WINDOW`. No trend is removed from the segments.
 
     Parameters
     ----------
@@ -459,7 +461,7 @@ def welch_response(
     check_segmentation(segment_length, overlap, nfft)
     if estimator not in ("h1", "h2", "hv"):
         raise SpectralError(f"There is no estimator {estimator!r}; choose one of h1, h2, hv.")
-    hamming_window = np.hamming(segment_length)
+    segment_weights = WINDOW.weights(segment_length)
     segment_number = segment_count(x.size, segment_length, overlap)
     if segment_number == 0:
         raise SpectralError(
@@ -476,8 +478,8 @@ def welch_response(
         segment = slice(
             segment_start := k * (segment_length - overlap), segment_start + segment_length
         )
-        np.fft.rfft(x[segment] * hamming_window, nfft, out=fx)
-        np.fft.rfft(y[segment] * hamming_window, nfft, out=fy)
+        np.fft.rfft(x[segment] * segment_weights, nfft, out=fx)
+        np.fft.rfft(y[segment] * segment_weights, nfft, out=fy)
         summed_spectra.add(fx, fy)
     return summed_spectra.response(np.arange(bin_count) * rate_hz / nfft, estimator)
 

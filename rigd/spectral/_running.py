@@ -27,6 +27,7 @@ from rigd.spectral._frf import (
     power,
     segmentation_of,
 )
+from rigd.spectral._window import WINDOW
 
 Real = NDArray[np.float64]
 """Array of real numbers."""
@@ -61,7 +62,7 @@ class RunningEstimate:
 class RunningResponse:
     """H1 estimate of the frequency response of a growing record.
 
-    Whole segments are averaged as in Welch's method, each with a Hamming window. Until the record
+    Whole segments are averaged as in Welch's method, each with `WINDOW`. Until the record
     ends, its newest samples, at most a segment of them, count as an additional segment with a
     window of their length, so that the response includes the newest part of the record. At the end
     of the record the estimate is equal to that of `welch_response`, except for rounding.
@@ -166,14 +167,12 @@ class RunningResponse:
         reference_power: NDArray[np.float64],
     ) -> None:
         """Add a segment (3, n) of reference, input and output to the sums."""
-        hamming_window = np.hamming(segment.shape[1])
+        weights = WINDOW.weights(segment.shape[1])
         reference, input_, output = segment
         # The mean angle excites nothing, but its power would exceed that of the motion.
-        reference_deviation = reference - np.average(reference, weights=hamming_window)
-        reference_power += power(self._transform(reference_deviation * hamming_window))
-        summed_spectra.add(
-            self._transform(input_ * hamming_window), self._transform(output * hamming_window)
-        )
+        reference_deviation = reference - np.average(reference, weights=weights)
+        reference_power += power(self._transform(reference_deviation * weights))
+        summed_spectra.add(self._transform(input_ * weights), self._transform(output * weights))
 
 
 # Segments of a growing record
@@ -345,13 +344,6 @@ def _interpolate_to_ticks(known_ticks: NDArray[np.int64], known_values: Real) ->
 
 # Excited bins
 
-LEAST_RELATIVE_POWER: Final = 2e-3
-"""Least power of the reference in an excited bin, relative to the largest power.
-
-It is above the leakage of a Hamming window (−43 dB in its side lobes, and its pedestal of 0.08
-where the record ends in mid-chirp). It is below the power of a chirp where two of the reference
-paper's segments join (−15 dB)."""
-
 
 def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> NDArray[np.bool_]:
     """Return True for bins in which the reference angle has power of its own.
@@ -375,7 +367,7 @@ def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> 
     if not largest_power > 0.0:
         return np.zeros(reference_power.shape, dtype=np.bool_)
     without_dips = _is_near_marked(
-        reference_power > LEAST_RELATIVE_POWER * largest_power, resolution_bins
+        reference_power > WINDOW.least_relative_power * largest_power, resolution_bins
     )
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 

@@ -8,7 +8,6 @@ from collections.abc import Awaitable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
 from importlib.resources import files
-from inspect import Parameter, cleandoc, signature
 from pathlib import Path
 from typing import Any, Final
 
@@ -18,12 +17,12 @@ from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.engine.messages import Failed, PageAddress
 from rigd.engine.processes import Parent
-from rigd.excitation import KINDS, RIG_ARGUMENTS
+from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
 from rigd.runtime import ignore
 from rigd.sweep_response import sweep_ticks
-from rigd.units import UNITS, unit_of
+from rigd.units import UNITS
 from rigd.web._access import ICON, LIVE, Connections, WebAccess, read_json_object, refusal_response
 from rigd.web._jobs import Jobs
 from rigd.web._library import Library
@@ -317,41 +316,20 @@ class OperatorPageServer:
 
 def _excitations() -> Iterator[tuple[str, list[Document]]]:
     """Yield the name and the options of each excitation, for the page's form."""
-    for excitation_name, function in KINDS.items():
-        descriptions = _parameter_descriptions(cleandoc(function.__doc__ or ""))
+    for excitation_name in KINDS:
         yield (
             excitation_name,
             [
                 {
-                    "name": command_option.name,
-                    "unit": unit_of(command_option.name),
-                    "default": None
-                    if command_option.default is Parameter.empty
-                    else command_option.default,
-                    "help": descriptions.get(command_option.name, ""),
+                    "name": option.name,
+                    "unit": option.unit,
+                    "default": option.default,
+                    "help": option.help,
                 }
-                | ({"text": True} if command_option.annotation is str else {})
-                for command_option in signature(function).parameters.values()
-                if command_option.name not in RIG_ARGUMENTS
+                | ({"text": True} if option.value_type is str else {})
+                for option in excitation_options(excitation_name)
             ],
         )
-
-
-def _parameter_descriptions(docstring: str) -> dict[str, str]:
-    """Return the descriptions of the parameters in a numpydoc docstring, by name."""
-    section_match = re.search(
-        r"^Parameters\n-+\n(.*?)(?=^\w+\n-+\n|\Z)", docstring, re.DOTALL | re.MULTILINE
-    )
-    section_entries = (
-        re.findall(r"^(\S.*)\n((?: +.*\n?)+)", section_match[1], re.MULTILINE)
-        if section_match
-        else []
-    )
-    return {
-        parameter_name.strip(): " ".join(description.split())
-        for parameter_names, description in section_entries
-        for parameter_name in parameter_names.split(",")
-    }
 
 
 # Program

@@ -1,14 +1,18 @@
 """An excitation in one file outside: command line, socket, page, file and analysis take it."""
 
+import asyncio
+import json
 import sys
 
+import aiohttp
 import numpy as np
 import pytest
+from operated_daemons import RequestError, parse_request
 from packages import EXCITATION, install, rigd_with
 
 from analysis.record import load_record
 from analysis.suited import welch_exclusion_reason
-from rigd.excitation import KINDS, ExcitationError, make_excitation
+from rigd.excitation import KINDS, ExcitationError, excitation_options, make_excitation
 from rigd.plugins import PluginError, check_plugin, find_plugin, installed_plugins
 from rigd.session import read_session
 
@@ -35,6 +39,47 @@ def test_it_is_made_by_name_like_those_of_rigd(packages):
     assert np.ptp(excitation.reference_rad) == pytest.approx(0.02)
     assert excitation.segments["sweep"] == (500, 4500)
     assert excitation.parameters["period_s"] == 1.0
+
+
+def test_its_options_are_declared_for_the_form_and_the_command(packages):
+    options = {option.name: option for option in excitation_options("triangle")}
+    assert list(options) == ["amplitude_rad", "period_s", "duration_s", "rest_s", "ring_down_s"]
+    assert options["amplitude_rad"].help == "peak of the triangle"
+    assert (options["amplitude_rad"].unit, options["amplitude_rad"].default) == ("rad", 0.01)
+    assert options["rest_s"].value_type is float
+
+
+def test_the_page_s_form_offers_it(packages, request):
+    served = request.getfixturevalue("served")  # started with the package installed
+
+    async def hello():
+        async with (
+            aiohttp.ClientSession(f"http://127.0.0.1:{served.port}/") as session,
+            session.ws_connect("/api/live") as socket,
+        ):
+            for _ in range(9):
+                for line in (await socket.receive(30.0)).data.split("\n"):
+                    message = json.loads(line)
+                    if message["type"] == "hello":
+                        return message
+        raise AssertionError("no hello")
+
+    triangle = asyncio.run(hello())["excitations"]["triangle"]
+    assert triangle[0] == {
+        "name": "amplitude_rad", "unit": "rad", "default": 0.01, "help": "peak of the triangle",
+    }  # fmt: skip
+
+
+def test_the_socket_takes_it_with_its_parameters(packages):
+    request = {"command": "start", "excitation": "triangle", "parameters": {"period_s": 2}}
+    assert parse_request(json.dumps(request).encode()).parameters == {"period_s": 2.0}
+    for parameters, message in (
+        ({"period": 2}, "is not a parameter of triangle; there are amplitude_rad, period_s"),
+        ({"period_s": "2"}, "period_s"),
+    ):
+        wrong = json.dumps(request | {"parameters": parameters}).encode()
+        with pytest.raises(RequestError, match=message):
+            parse_request(wrong)
 
 
 @pytest.mark.parametrize(

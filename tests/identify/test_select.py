@@ -1,6 +1,7 @@
 """Verdicts on sessions of known plants: the structure, its orders, and whatever else is there."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ import pytest
 from analysis.identify import fit_record, headline_json, select
 from analysis.identify.profile_likelihood import CHI_SQUARE_95
 from analysis.identify.verdict import SECOND_DAMPING_REASON
-from analysis.models import STRUCTURES, Structure
+from analysis.models import STRUCTURES
 from analysis.statistics import BIC_TIE
 from rigd.beam import Beam, Plant, clamped_free_eigenvalues
 from rigd.session import Validity
@@ -305,7 +306,7 @@ def test_a_refit_at_the_minimum_stays_there(field):
 def test_the_profile_crosses_where_a_fit_with_the_order_held_says(type_iii, sessions):
     profile = type_iii.verdict.alpha.profile
     held = [
-        Structure("VI", ("zeta", "gamma", "lambda"), {"alpha": value})
+        replace(STRUCTURES["VI"], fixed={"alpha": value})
         for value in (profile.estimate, *profile.interval)
     ]
     analysis = fit_record(sessions("III").measured(noise_nm=NOISE_NM, seed=41), held)

@@ -38,3 +38,6 @@ FORMAT = Path(__file__).with_name("outside_format.txt").read_text()
 
 CONTROLLERS = Path(__file__).with_name("outside_controllers.txt").read_text()
 """Code of a package with three controllers: matrices, a shift of the reference, own code."""
+
+STRUCTURE = Path(__file__).with_name("outside_structure.txt").read_text()
+"""Code of a package with the damping structure ``zener``."""

@@ -27,6 +27,8 @@ _TAGS: Final = {
     "comrdtbsiz": "1", "mfgdigver": "2.2.59",
 }  # fmt: skip
 """Settings of the box on its page, as it is delivered."""
+_LONGEST_PAUSE_S = 0.1
+"""Longest time between two ticks for which records are sent."""
 _MAX_FORMS = 3
 """Number of forms that the box takes; it ignores more."""
 FAULTS: Final = (
@@ -210,8 +212,15 @@ class _SimulatedNetFt(NetFtSensor):
     """Driver with a simulated box, whose page is served while it connects."""
 
     def __init__(self, rig: RigParameters, settings: NetFtSettings, box: SimulatedBox) -> None:
-        super().__init__(rig, settings, on_request=lambda: box.tick(1 / rig.rate_hz))
+        super().__init__(rig, settings, on_request=lambda: box.tick(self._elapsed_s))
         self._simulated_box = box
+        self._elapsed_s = self._period_s = 1 / rig.rate_hz
+
+    def request(self, due_ns: int) -> None:
+        """Advance the box by the time since the last tick, as a real one streams on meanwhile."""
+        since_last_s = (due_ns - self._due_ns) / 1e9 if self._due_ns > 0 else 0.0
+        self._elapsed_s = min(max(since_last_s, self._period_s), _LONGEST_PAUSE_S)
+        super().request(due_ns)
 
     def connect(self) -> None:
         """Connect to the simulated box."""

@@ -78,6 +78,16 @@ def test_it_passes_the_checks_of_devices(rig, check):
     devices.sensor.close()
 
 
+def test_records_are_not_stale_after_missed_ticks(rig):
+    sensor = open_devices(rig).sensor
+    sensor.connect()
+    for tick in (*range(500), *range(504, 900)):
+        sensor.request(tick * PERIOD_NS)
+        sensor.read_wrench()
+        assert not sensor.wrench_stale, tick
+    sensor.close()
+
+
 def test_a_record_has_the_age_of_the_box_s_counter(connect):
     sensor, _ = connect()
     assert run(sensor, 3000) == (0, 0)

@@ -1,0 +1,197 @@
+"""Damping structures that installed packages add, found by entry points.
+
+A package adds a structure by an entry point of the group ``analysis.structures``, which names a
+`Structure`. It is fitted to the whole record and compared with types I to VII, but is none of the
+candidates of the verdict: the reported numbers, campaigns and exported models are of types I to
+VII, and how often the selection errs is known for these only.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+
+from analysis.models import STRUCTURES, Structure, described
+from rigd.beam import PARAMETERS, Parameter
+from rigd.plugins import Plugin, find_plugin, installed_plugins, load_plugin, plugin_errors
+from rigd.printable import listed, printable
+from rigd.units import unit_of
+
+STRUCTURE_GROUP: Final = "analysis.structures"
+"""Group of the entry points by which packages add damping structures."""
+
+_MAX_STARTS: Final = 64
+"""Largest number of combinations of start values; each costs an evaluation of the whole record."""
+_CHECKED_OMEGA_RAD_S: Final = np.geomspace(0.1, 1e4, 60)
+"""Angular frequencies at which the damping of a package's structure is checked."""
+_LOSS_TOLERANCE: Final = 1e-9
+"""Largest gain of energy, relative to the factor, that rounding can cause."""
+
+
+def check_structure(structure: Structure) -> None:
+    """Raise ValueError if the declaration of a package's structure is not valid.
+
+    Checked are the words, the parameters with their units, ranges and starts, and the damping
+    at each start: finite, a loss at all frequencies, and real in time, as a causal force is.
+
+    Parameters
+    ----------
+    structure : Structure
+        Declaration to be checked.
+    """
+    if not structure.description.strip() or "\n" in structure.description:
+        raise ValueError("its description is not one line of text.")
+    if not structure.free:
+        raise ValueError("it has no free parameter.")
+    names = [parameter.name for parameter in structure.parameters]
+    for parameter in structure.parameters:
+        if names.count(parameter.name) > 1 or parameter.name in PARAMETERS:
+            raise ValueError(
+                f"the name of its parameter {parameter.name} is taken; choose another one."
+            )
+        _check_parameter(parameter)
+    unknown_names = sorted(set(structure.fixed) - set(names))
+    if unknown_names:
+        raise ValueError(f"it fixes {listed(unknown_names)}, which it does not have.")
+    starts = structure.start_values()
+    if len(starts) > _MAX_STARTS:
+        raise ValueError(
+            f"it has {len(starts)} combinations of start values; state at most {_MAX_STARTS}."
+        )
+    for values in starts:
+        _check_damping(structure, values)
+
+
+def _check_damping(structure: Structure, values: Mapping[str, float]) -> None:
+    """Raise ValueError if the damping at some values is not finite, lossy and real in time."""
+    s = (1j * _CHECKED_OMEGA_RAD_S).astype(np.complex128)
+    factors = structure.finite_factors(s, values)
+    structure.finite_factors(1.0 + s, values)  # causal responses are computed there
+    for factor, name in zip(factors, ("stiffness", "external damping"), strict=True):
+        gains = np.flatnonzero(factor.imag < -_LOSS_TOLERANCE * np.abs(factor))
+        if gains.size:
+            raise ValueError(
+                f"its {name} gains energy at {_CHECKED_OMEGA_RAD_S[gains[0]]:.3g} rad/s with "
+                f"{described(values)}: the imaginary part is negative."
+            )
+    mirrored = structure.finite_factors(s.conj(), values)
+    for factor, at_conjugate in zip(factors, mirrored, strict=True):
+        if not np.allclose(at_conjugate, factor.conj(), rtol=1e-9, atol=0.0):
+            raise ValueError(
+                f"its damping is not real in time with {described(values)}: at the conjugate "
+                "of s it must be the conjugate, which no causal force violates."
+            )
+
+
+def _check_parameter(parameter: Parameter) -> None:
+    """Raise ValueError if the name, unit, range or starts of a parameter are not valid."""
+    name, range_text = parameter.name, f"{parameter.lower:g} to {parameter.upper:g}"
+    if not name.isidentifier():
+        raise ValueError(f"the name of its parameter {printable(name, 40)} is no identifier.")
+    if unit_of(name) not in ("", parameter.unit):
+        raise ValueError(
+            f'its parameter {name} has the unit "{parameter.unit}", but its name says '
+            f"{unit_of(name)}."
+        )
+    if not (math.isfinite(parameter.lower) and math.isfinite(parameter.upper)):
+        raise ValueError(f"the range of its parameter {name}, {range_text}, is not finite.")
+    if not parameter.lower < parameter.upper or (parameter.logarithmic and parameter.lower <= 0):
+        raise ValueError(
+            f"the range of its parameter {name}, {range_text}, is not valid"
+            f"{': a logarithmic one begins above 0' if parameter.logarithmic else ''}."
+        )
+    if not parameter.starts:
+        raise ValueError(f"its parameter {name} states no start value.")
+    for start in parameter.starts:
+        if not parameter.lower <= start <= parameter.upper:
+            raise ValueError(f"the start {start:g} of its parameter {name} is not in {range_text}.")
+
+
+@dataclass(frozen=True, slots=True)
+class AddedStructure:
+    """Damping structure that an installed package adds.
+
+    Attributes
+    ----------
+    structure : Structure
+        Checked declaration.
+    plugin : Plugin
+        Package that adds it.
+    """
+
+    structure: Structure
+    plugin: Plugin
+
+
+def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
+    """Return the structures of given names that installed packages add.
+
+    Parameters
+    ----------
+    names : sequence of str
+        Names of structures.
+
+    Raises
+    ------
+    LookupError
+        If no package adds a structure of such a name; the message names those there are.
+    PluginError
+        If a package cannot be used.
+    """
+    structures = []
+    for name in names:
+        plugin = find_plugin(STRUCTURE_GROUP, name)
+        if plugin is None:
+            there = [each.name for each in installed_plugins(STRUCTURE_GROUP) if not each.problem]
+            raise LookupError(
+                f"no installed package adds a structure '{printable(name, 40)}'; "
+                f"{'there are ' + listed(there) if there else 'none adds any'}."
+            )
+        structures.append(AddedStructure(load_structure(plugin), plugin))
+    return tuple(structures)
+
+
+def load_structure(plugin: Plugin) -> Structure:
+    """Import the damping structure of a package, and check its declaration.
+
+    Parameters
+    ----------
+    plugin : Plugin
+        Part of an installed package.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    structure = load_plugin(plugin, Structure)
+    if plugin.name.upper() in STRUCTURES:
+        raise plugin.error("this structure is built into the analyser and cannot be replaced.")
+    if structure.name != plugin.name:
+        raise plugin.error(f'it declares the structure "{structure.name}"; rename one of the two.')
+    with plugin_errors(plugin):
+        try:
+            check_structure(structure)
+        except ValueError as error:
+            raise plugin.error(str(error)) from error
+    return structure
+
+
+def check_structure_plugin(plugin: Plugin) -> str:
+    """Import the damping structure of a package, and return its description.
+
+    Parameters
+    ----------
+    plugin : Plugin
+        Part of an installed package.
+
+    Raises
+    ------
+    PluginError
+        If it cannot be used.
+    """
+    return load_structure(plugin).description
