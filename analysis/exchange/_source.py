@@ -221,8 +221,6 @@ def _read_checked(
             return {name: _checked_channel(path, name, channels[name]) for name in channel_names}
     except PluginError as error:
         raise ExchangeError(f"{path}: {error}") from error
-    except SystemExit as error:
-        raise ExchangeError(f"{path}: {owner.error('its code ended the program.')}") from error
 
 
 def _checked_channel(path: Path, name: str, channel: SourceChannel) -> SourceChannel:

@@ -88,7 +88,7 @@ WRONG_READERS = {  # what a reader returns for the channel "angle", and the mess
     "matrix": ("{'angle': SourceChannel(np.ones((9, 2)))}", "2 dimensions"),
     "rate": ("{'angle': SourceChannel(np.ones(9), rate_hz=-1.0)}", "rate of -1.0 Hz"),
     "fails": ("1 / 0", "ZeroDivisionError"),
-    "exits": ("exit()", "ended the program"),
+    "exits": ("exit()", "SystemExit"),
 }
 
 

@@ -57,11 +57,26 @@ def test_a_new_package_passes_its_tests_and_joins(tmp_path, options, passed, sho
 
 @pytest.mark.process
 @pytest.mark.further
-def test_it_runs_as_its_page_says(runtime_folder, tmp_path, monkeypatch):
-    package = made(tmp_path / "own", "mysensor")
+@pytest.mark.parametrize(
+    ("name", "options", "page", "line_of_profile", "with_part"),
+    [
+        ("mysensor", (), "your_own_device", r'sensor = ".*"', 'sensor = "mysensor"'),
+        (
+            "mylaw",
+            ("--kind", "controller"),
+            "your_own_controller",
+            r"\[control\]",
+            '[control]\ncontroller = "mylaw"',
+        ),
+    ],
+)
+def test_it_runs_as_its_page_says(
+    runtime_folder, tmp_path, monkeypatch, name, options, page, line_of_profile, with_part
+):
+    package = made(tmp_path / "own", name, *options)
     monkeypatch.setenv("XDG_CONFIG_HOME", str(tmp_path))
-    (section,) = blocks("toml")
-    lines = "".join(blocks("sh")).splitlines()
+    (section,) = blocks(page, "toml")
+    lines = "".join(blocks(page, "sh")).splitlines()
     assert [line.partition(" ")[0] for line in lines] == ["rigd"] * 4
     for line in lines:
         arguments = line.replace("--duration 20", "--duration 2 --no-look").split()[1:]
@@ -69,15 +84,17 @@ def test_it_runs_as_its_page_says(runtime_folder, tmp_path, monkeypatch):
         assert code == 0, output + errors
         if arguments[:2] == ["profiles", "copy"]:
             (profile,) = tmp_path.rglob("lab.toml")
-            text, chosen = re.subn(r'\nsensor = ".*"', '\nsensor = "mysensor"', profile.read_text())
+            text, chosen = re.subn(
+                rf"^{line_of_profile}", with_part, profile.read_text(), flags=re.MULTILINE
+            )
             assert chosen == 1
             profile.write_text(text + section)
     assert list(tmp_path.glob("sessions/*-chirp.mcap"))
 
 
-def blocks(language):
-    page = (PROJECT / "docs" / "your_own_device.md").read_text("utf-8")
-    return re.findall(rf"^```{language}\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+def blocks(page, language):
+    text = (PROJECT / "docs" / f"{page}.md").read_text("utf-8")
+    return re.findall(rf"^```{language}\n(.*?)^```$", text, re.MULTILINE | re.DOTALL)
 
 
 @pytest.mark.parametrize(

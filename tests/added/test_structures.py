@@ -130,11 +130,11 @@ def test_a_package_that_cannot_be_used_is_named_and_hurts_no_other(
     code, reason = WRONG[name]
     if name not in ("other", "vi"):
         code = code.replace('"zener"', f'"{name}"')
-    entry_points = f"[{GROUP}]\n{name} = y_{name}:ZENER\n"
-    install(tmp_path / "wrong", f"y-{name}", "0.3", code, entry_points)
+    entry_points = f"[{GROUP}]\n{name} = law_{name}:ZENER\n"
+    install(tmp_path / "wrong", f"law-{name}", "0.3", code, entry_points)
     monkeypatch.syspath_prepend(tmp_path / "wrong")
     (plugin,) = [each for each in installed_plugins(GROUP) if each.name == name]
-    with pytest.raises(PluginError, match=f"y-{name} 0.3, .*{reason}"):
+    with pytest.raises(PluginError, match=f"law-{name} 0.3, .*{reason}"):
         check_plugin(plugin)
     with pytest.raises(PluginError, match=reason):
         added_structures([name])

@@ -84,6 +84,7 @@ RUN_ELSEWHERE = {
     "opening_sessions": "docs/test_layouts.py",
     "library": "library/test_library_document.py",
     "your_own_device": "added/test_new_package.py",
+    "your_own_controller": "added/test_new_package.py",
 }
 """How-tos with a test of their own."""
 
@@ -91,6 +92,8 @@ NOT_RUN = {
     "python3 -m venv env": "installs from the package index; .ci/release installs what is built",
     "rigd plugins new mysensor": "installs a package; added/test_new_package.py does the same",
     "python -m pytest rigd-mysensor/tests": "added/test_new_package.py",
+    "rigd plugins new mylaw --kind controller":
+        "installs a package; added/test_new_package.py does the same",
     "rigd check --profile lab": "on the bench",
     "rigd bench": "three minutes; bench",
     "rigd bench --seconds 10": "three minutes; bench",

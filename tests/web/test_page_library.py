@@ -77,6 +77,7 @@ def test_files_looks_reports_and_responses_are_served(served, two):
     assert get(served, "/api/sessions/second/look")[0] == 404
     (served.folder / "folder.mcap").mkdir()
     assert get(served, "/api/sessions/folder/file.mcap")[0] == 404
+    (served.folder / "folder.mcap").rmdir()
     status, head, body = get(served, "/api/sessions/first/report/")
     assert (status, body[-8:]) == (200, b"A report")
     assert "sandbox" in head
