@@ -107,6 +107,7 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         section_name
         for section_name in optional_sections()
         if not any(k.startswith(section_name + ".") for k in profile_values)
+        and not (section_name in document and _has_defaults_only(section_name))
     }
     unknown_keys = frozenset(
         key for key, number_source in sources.items() if number_source == UNKNOWN
@@ -160,6 +161,11 @@ def profile_from_text(profile_text: str, profile_path: Path) -> Profile:
         axis_tilt_deg=sections["rig"].axis_tilt_deg,
         controller_settings=_controller_settings(sections),
     )
+
+
+def _has_defaults_only(section_name: str) -> bool:
+    """Return whether every key of a section may be omitted."""
+    return all(key in key_defaults() for key, _ in section_fields(section_name))
 
 
 def _controller_settings(sections: Mapping[str, Any]) -> object | None:
