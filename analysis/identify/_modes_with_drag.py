@@ -150,8 +150,9 @@ def fit_modes_with_drag(
             _mode_starts(current.modal_fit),
             current.drag_spectra,
         )
-        if fit_with_drag is None:
-            return None
+        if fit_with_drag is None or fit_with_drag.visible != modal_fit.visible:
+            # Drag of any size imitates a mode that hardly shows.
+            return None if math.isinf(last_estimate_m) else current
         [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
         law = DragLaw(current.law.constant_m + change_m)
         is_converged = abs(law.constant_m - last_estimate_m) < _TOLERANCE_STDS * std_m
