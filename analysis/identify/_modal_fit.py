@@ -327,7 +327,10 @@ class _ModalSearch:
             comparison = comparison.fill_unknown_torque(modal_model)
             noise_power = smooth_power(residual_spectrum, finely=True)
             noise_power = noise_power_with_peaks(
-                residual_spectrum, noise_power, ~search.is_near_mode()
+                residual_spectrum,
+                noise_power,
+                ~search.is_near_mode(),
+                ~search.is_near_mode(within_resonance=True),
             )
             noise_power /= comparison.measurement.known_torque_fraction
             used_bins = search.noise.counts
@@ -339,8 +342,12 @@ class _ModalSearch:
                 break
         return search.descend_to_minimum()
 
-    def is_near_mode(self) -> NDArray[np.bool_]:
-        """Return a mask of the bins in which the residual may belong to a mode, shape (K,)."""
+    def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
+        """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
+
+        The bins `within_resonance` are those up to half of this distance from a mode. A peak of the
+        noise does not begin nearer to a mode than the whole distance, and ends there.
+        """
         hz = self.comparison.frequency_hz[:, None]
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         margin_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
@@ -348,6 +355,8 @@ class _ModalSearch:
             np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * mode_hz
             + margin_hz
         )
+        if within_resonance:
+            reach_hz = reach_hz / 2
         near_mode_mask: NDArray[np.bool_] = np.any(np.abs(hz - mode_hz) < reach_hz, axis=1)
         return near_mode_mask
 

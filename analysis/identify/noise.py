@@ -201,6 +201,7 @@ def noise_power_with_peaks(
     residual: NDArray[np.complex128],
     smooth_noise_power: NDArray[np.float64],
     is_peak_allowed: NDArray[np.bool_],
+    may_continue: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.float64]:
     """Return the noise power of each bin, with peaks narrower than the smoothing blocks, (K,).
 
@@ -212,6 +213,8 @@ def noise_power_with_peaks(
         Smooth power of the residual, as `smooth_power` returns it.
     is_peak_allowed : ndarray of bool, shape (K,)
         True for bins at which a peak is possible.
+    may_continue : ndarray of bool, shape (K,), optional
+        True for bins to which a peak may continue from a neighbouring bin.
     """
     power_ratio = (residual.real**2 + residual.imag**2) / smooth_noise_power
     local_ratio = np.convolve(power_ratio, np.full(_PEAK_BINS, 1 / _PEAK_BINS), mode="same")
@@ -219,11 +222,24 @@ def noise_power_with_peaks(
     is_peak = (
         np.convolve(local_ratio > _PEAK_POWER_RATIO, np.ones(2 * _PEAK_BINS + 1), mode="same") > 0
     )
+    if may_continue is not None:
+        is_peak_allowed = is_peak_allowed | _continued(
+            is_peak & is_peak_allowed, is_peak & may_continue
+        )
     return np.where(
         is_peak & is_peak_allowed,
         smooth_noise_power * np.maximum(local_ratio, 1.0),
         smooth_noise_power,
     )
+
+
+def _continued(is_start: NDArray[np.bool_], may_continue: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Return the bins that are connected with a start by bins to which it may continue."""
+    is_connected = is_start | may_continue
+    run_numbers = np.cumsum(np.diff(is_connected, prepend=False) & is_connected)
+    has_start = np.bincount(run_numbers[is_start], minlength=run_numbers[-1] + 1) > 0
+    connected: NDArray[np.bool_] = is_connected & has_start[run_numbers]
+    return connected
 
 
 def _block_borders(bin_count: int) -> NDArray[np.intp]:

@@ -115,6 +115,15 @@ def test_an_internal_order_that_a_taper_contradicts_is_flagged():
     assert "from root to tip would explain the modes, too" in flags["alpha"]
 
 
+@pytest.mark.further
+@pytest.mark.fit
+def test_noise_that_begins_beside_a_mode_flags_nothing():
+    found = judge(DefectTask(300060, None, command_line=False, documents=None))
+    assert found.coloured
+    assert not found.not_given
+    assert not found.wrong
+
+
 @pytest.mark.fit
 def test_a_record_is_judged_from_the_document(tmp_path: Path):
     found = judge(DefectTask(0, "none", command_line=False, documents=tmp_path))

@@ -4,7 +4,11 @@ import numpy as np
 import pytest
 
 from analysis.identify._data import Decimation, fast_length, fast_length_below, interpolate_gaps
-from analysis.identify.noise import estimate_noise, smooth_power
+from analysis.identify.noise import (
+    estimate_noise,
+    noise_power_with_peaks,
+    smooth_power,
+)
 
 
 def test_gaps_of_a_band_limited_signal_are_closed():
@@ -146,3 +150,23 @@ def test_a_resonance_is_never_left_out():
         noise = estimate_noise(hum, FREQUENCY_HZ, SAMPLES, near_mode=near_mode)
         assert noise.lines == ()
         assert noise.counts.all()
+
+
+def test_a_peak_of_the_noise_continues_towards_a_mode_and_does_not_begin_there():
+    bins = 4000
+    parts = np.random.default_rng(3).normal(size=(2, bins))
+    residual = parts[0] + 1j * parts[1]
+    residual[1000:1100] *= 4  # begins beside the mode, and reaches into its surroundings
+    residual[1150:1160] *= 8  # of the mode itself
+    residual[1230:1260] *= 4  # within its surroundings alone
+    level = np.full(bins, 2.0)
+    bin_number = np.arange(bins)
+    surroundings, resonance = abs(bin_number - 1155) < 120, abs(bin_number - 1155) < 40
+    found = noise_power_with_peaks(residual, level, ~surroundings, ~resonance)
+    assert np.median(found[1010:1030]) == pytest.approx(32, rel=0.4)
+    assert np.median(found[1050:1090]) == pytest.approx(32, rel=0.4)
+    assert (found[1150:1160] == 2).all()
+    assert (found[1230:1260] == 2).all()
+    alone = noise_power_with_peaks(residual, level, ~surroundings)
+    assert (alone[surroundings] == 2).all()
+    assert (alone[~surroundings] == found[~surroundings]).all()
