@@ -143,6 +143,7 @@ def fit_modes_with_drag(
         modal_fit, DragLaw(0.0), 0.0, candidate_set.comparison, drag_spectrum[None]
     )
     last_estimate_m = math.inf
+    explaining: ModesWithDrag | None = None  # the last one whose residual is noise
     for remaining in reversed(range(max_computations)):
         fit_with_drag = fit_modes(
             current.comparison,
@@ -152,7 +153,7 @@ def fit_modes_with_drag(
         )
         if fit_with_drag is None or fit_with_drag.visible != modal_fit.visible:
             # Drag of any size imitates a mode that hardly shows.
-            return None if math.isinf(last_estimate_m) else current
+            return None if math.isinf(last_estimate_m) else explaining or current
         [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
         law = DragLaw(current.law.constant_m + change_m)
         is_converged = abs(law.constant_m - last_estimate_m) < _TOLERANCE_STDS * std_m
@@ -160,6 +161,8 @@ def fit_modes_with_drag(
             replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m),
             law.constant_m,
         )
+        if fit_with_drag.explained:
+            explaining = current
         if is_converged or not remaining:
             break
         # Negative drag is an error of the estimate. Its torque is that of hardly any drag, whose
@@ -182,7 +185,7 @@ def fit_modes_with_drag(
             comparison=comparison,
             drag_spectra=comparison.drag.by_law[:1],
         )
-    return current
+    return explaining or current
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:
