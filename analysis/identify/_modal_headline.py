@@ -60,6 +60,9 @@ def uniform_beam_refusal_reason(test: UniformBeamTest) -> str | None:
     return f"a uniform beam does not predict the modal constants ({test.summary.chance})"
 
 
+_CHANGED_BY_DRAG: Final = "air drag of unknown size would change it"
+"""Reason against a damping ratio that is not known apart from the drag."""
+
 _CONTRADICTION_STDS: Final = 3.0
 """Distance of a number with a cause from the reported one, in standard deviations by the side of
 the 95 % interval that faces it, from which the cause makes the reported number doubtful."""
@@ -172,6 +175,25 @@ def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) ->
         for loss_factor in headline.sizes
     ]
     return replace(headline, parameters=parameters, sizes=tuple(sizes))
+
+
+def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) -> Headline:
+    """Return the headline with a flag on the damping ratios of some modes.
+
+    Parameters
+    ----------
+    headline : Headline
+        Reported numbers.
+    mode_numbers : sequence of int
+        Modes whose damping ratio depends on air drag of unknown size.
+    """
+    modes = tuple(
+        replace(mode, damping_ratio=mode.damping_ratio.flagged(_CHANGED_BY_DRAG))
+        if mode.number in mode_numbers
+        else mode
+        for mode in headline.modes
+    )
+    return replace(headline, modes=modes)
 
 
 def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:

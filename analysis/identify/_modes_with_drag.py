@@ -53,6 +53,10 @@ MAX_DRAG_COMPUTATIONS: Final = 8
 _LEAST_DRAG_M: Final = 1e-6
 """C_D d that hardly brakes a beam, for which the torque is computed if the estimate is less."""
 
+_CHANGED_STDS: Final = 3.0
+"""Change of a damping ratio by drag, in its standard deviations without drag, from which the value
+without drag is doubtful although drag does not explain the record as well."""
+
 _TOLERANCE_STDS: Final = 0.2
 """Change of the drag, in standard deviations, below which its computation has converged."""
 
@@ -186,6 +190,23 @@ def fit_modes_with_drag(
             drag_spectra=comparison.drag.by_law[:1],
         )
     return explaining or current
+
+
+def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:
+    """Return the modes whose damping ratio drag changes by more than chance, by number.
+
+    Parameters
+    ----------
+    modal_fit, with_drag : ModalFit
+        Modes of the same record without and with drag.
+    """
+    changed = []
+    for mode_number in set(modal_fit.visible) & set(with_drag.visible):
+        without = modal_fit.mode(mode_number)
+        change = without.damping_ratio - with_drag.mode(mode_number).damping_ratio
+        if abs(change) > _CHANGED_STDS * without.damping_ratio_std:
+            changed.append(mode_number)
+    return tuple(sorted(changed))
 
 
 def _mode_starts(modal_fit: ModalFit) -> list[tuple[int, float, float]]:

@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.identify._drag import refit_with_air_drag, small_drag_spectrum
 from analysis.identify._modal_fit import fit_modes
-from analysis.identify._modes_with_drag import fit_modes_with_drag
+from analysis.identify._modes_with_drag import fit_modes_with_drag, modes_that_drag_changes
 from analysis.identify._nonlinear import add_nonlinear_forces
 from analysis.identify._small_effects import LARGE_DEVIANCE_REDUCTION, small_effect
 from analysis.identify._step_in_time import best_stiffness_step
@@ -118,6 +118,8 @@ class RecordModel:
         Changes along the record; the first is the likeliest.
     stiffness_step : StiffnessStep or None
         Step of the stiffness in time that may explain the residual.
+    modes_changed_by_drag : tuple of int
+        Modes whose damping ratio depends on a drag that was not accepted.
     """
 
     linear_candidates: CandidateSet
@@ -130,6 +132,7 @@ class RecordModel:
     nonlinear_forces: tuple[NonlinearForce, ...] = ()
     temporal_changes: tuple[TemporalChange, ...] = ()
     stiffness_step: StiffnessStep | None = None
+    modes_changed_by_drag: tuple[int, ...] = ()
 
     @property
     def findings(self) -> tuple[Finding, ...]:
@@ -154,7 +157,7 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
         linear_fit.plant_with_modal_frequencies(linear_candidates.likeliest.plant),
         drag_spectrum,
     )
-    modes_with_drag = None
+    modes_with_drag, changed_by_drag = None, tuple[int, ...]()
     # In a single sweep another effect, or large drag, has a model of its own.
     if effect is None or not is_single_sweep or (effect.kind == "air drag" and not effect.large):
         modes_with_drag = fit_modes_with_drag(linear_candidates, linear_fit, drag_spectrum)
@@ -167,11 +170,14 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
         ):
             effect = None
     else:
+        if modes_with_drag is not None:
+            changed_by_drag = modes_that_drag_changes(linear_fit, modes_with_drag.modal_fit)
         modes_with_drag, modal_fit = None, linear_fit
         explains_record = _explains_record(linear_candidates, linear_fit, band_hz)
     model = RecordModel(
         linear_candidates, linear_fit, linear_candidates, modal_fit, explains_record,
         modes_with_drag=modes_with_drag,
+        modes_changed_by_drag=changed_by_drag,
     )  # fmt: skip
     return model if effect is None else _with_small_effect(model, effect, band_hz)
 
@@ -225,8 +231,10 @@ def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> Rec
 
 def fit_drag_with_modes(
     candidate_set: CandidateSet, modal_fit: ModalFit, *, max_computations: int
-) -> ModesWithDrag | None:
+) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
     """Return the modes fitted with drag if these explain the record, else None.
+
+    Return also the modes whose damping ratio depends on a drag that is not accepted.
 
     Parameters
     ----------
@@ -243,9 +251,11 @@ def fit_drag_with_modes(
         _small_drag(candidate_set, modal_fit),
         max_computations=max_computations,
     )
-    if modes_with_drag is None or not modes_with_drag.modal_fit.explained:
-        return None
-    return modes_with_drag
+    if modes_with_drag is None:
+        return None, ()
+    if not modes_with_drag.modal_fit.explained:
+        return None, modes_that_drag_changes(modal_fit, modes_with_drag.modal_fit)
+    return modes_with_drag, ()
 
 
 def fit_modal_model(

@@ -21,6 +21,7 @@ from analysis.identify._fit import BAND_HZ
 from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts
 from analysis.identify._modal_headline import (
     flag_contradicted_damping,
+    flag_modes_changed_by_drag,
     order_verdict_with_geometry_tolerance,
     replace_by_modal_model,
 )
@@ -290,6 +291,7 @@ def _select_with_known_impacts(
     if check.doubt_reason is not None:
         reported_headline = reported_headline.doubted(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
+    reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
     effect_findings, cause_flags = model.findings, dict[str, str]()
     if uniform_beam_refused and check.model_reason is None:
         assert modal_fit is not None
@@ -482,8 +484,9 @@ def _fit_freest_with_known_impacts(
     if not misread_findings:
         candidate_set = candidate_set.fit_special_cases()
     modal_fit, modes_with_drag = fit_modal_model(candidate_set), None
+    changed_by_drag: tuple[int, ...] = ()
     if modal_fit is not None and not measurement.is_single_sweep:
-        modes_with_drag = fit_drag_with_modes(
+        modes_with_drag, changed_by_drag = fit_drag_with_modes(
             candidate_set, modal_fit, max_computations=_ONLINE_DRAG_COMPUTATIONS
         )
     if modes_with_drag is not None:
@@ -500,6 +503,7 @@ def _fit_freest_with_known_impacts(
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
+    reported_headline = flag_modes_changed_by_drag(reported_headline, changed_by_drag)
     all_findings = check.reported_findings(
         reported_headline, () if modes_with_drag is None else (modes_with_drag.finding(),)
     )
