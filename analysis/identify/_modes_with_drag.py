@@ -165,7 +165,8 @@ def fit_modes_with_drag(
             replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m),
             law.constant_m,
         )
-        if fit_with_drag.explained:
+        is_first_order = current.comparison is candidate_set.comparison
+        if fit_with_drag.explained and not is_first_order:
             explaining = current
         if is_converged or not remaining:
             break
