@@ -30,7 +30,6 @@ from rigd.session.quick_look import (
     read_quick_look,
 )
 from rigd.spectral import WINDOW
-from rigd.units import decimals
 
 if TYPE_CHECKING:
     from collections.abc import Iterator, Mapping, Sequence
@@ -386,7 +385,6 @@ def _compare_modes(modes: list[EstimatedMode], other_document: Mapping[str, Any]
             change_between(other_mode.frequency_hz, mode.frequency_hz),
             change_between(other_mode.damping_ratio, mode.damping_ratio),
         )
-        change_hz = frequency_change.difference
         change_percent = mode.damping_ratio.percent_above(other_mode.damping_ratio)
         is_significant = [
             change.significant is True for change in (frequency_change, damping_change)
@@ -394,14 +392,15 @@ def _compare_modes(modes: list[EstimatedMode], other_document: Mapping[str, Any]
         compared_modes.append(
             {
                 "mode": mode.number,
-                "frequency_hz_change": change_hz,
+                "frequency_hz_change": frequency_change.difference,
                 "damping_ratio_change_percent": change_percent,
                 "significant": any(is_significant),
             }
         )
-        std_hz = mode.frequency_hz.std
-        decimal_digits = decimals(std_hz) if std_hz else 4
-        change_texts = (f"{change_hz:+.{decimal_digits}f} Hz", f"damping {change_percent:+.2g} %")
+        change_texts = (
+            mode.frequency_change_text(other_mode),
+            f"damping {change_percent:+.2g} %",
+        )
         significant_texts = [
             change_text
             for change_text, is_different in zip(change_texts, is_significant, strict=True)

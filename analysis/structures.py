@@ -17,7 +17,14 @@ import numpy as np
 
 from analysis.models import STRUCTURES, Structure, described
 from rigd.beam import PARAMETERS, Parameter
-from rigd.plugins import Plugin, find_plugin, installed_plugins, load_plugin, plugin_errors
+from rigd.plugins import (
+    Plugin,
+    find_plugin,
+    installed_plugins,
+    load_declaration,
+    plugin_errors,
+    refuse_built_in,
+)
 from rigd.printable import listed, printable
 from rigd.units import unit_of
 
@@ -168,11 +175,8 @@ def load_structure(plugin: Plugin) -> Structure:
     PluginError
         If it cannot be used.
     """
-    structure = load_plugin(plugin, Structure)
-    if plugin.name.upper() in STRUCTURES:
-        raise plugin.error("this structure is built into the analyser and cannot be replaced.")
-    if structure.name != plugin.name:
-        raise plugin.error(f'it declares the structure "{structure.name}"; rename one of the two.')
+    refuse_built_in(plugin, {name.lower() for name in STRUCTURES}, "the analyser")
+    structure = load_declaration(plugin, Structure)
     with plugin_errors(plugin):
         try:
             check_structure(structure)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Final, Literal, get_args
 
 from rigd.printable import listed, printable
-from rigd.units import finite_number, with_half_width
+from rigd.units import decimals, finite_number, with_half_width
 
 ModeSource = Literal["modal", "beam"]
 """Model that provides the numbers of a mode: the modal model, or the beam."""
@@ -222,6 +222,12 @@ class EstimatedMode:
             source=source if source in get_args(ModeSource) else None,
             participation=participation,
         )
+
+    def frequency_change_text(self, earlier: "EstimatedMode") -> str:
+        """Return the change of the frequency since an earlier estimate, in Hz with its sign."""
+        change_hz = self.frequency_hz.value - earlier.frequency_hz.value
+        decimal_digits = decimals(self.frequency_hz.std) if self.frequency_hz.std else 4
+        return f"{change_hz:+.{decimal_digits}f} Hz"
 
     def line(self) -> str:
         """Return one line of text with frequency, damping and inertia.

@@ -36,21 +36,15 @@ D = TypeVar("D", bound=Declaration)
 """Type of the declaration that an entry point names."""
 
 GROUPS: Final = {
-    "rigd.devices": "rigd.profile:check_device_plugin",
-    "rigd.controllers": "rigd.profile:check_controller_plugin",
-    "rigd.excitations": "rigd.excitation:check_excitation_plugin",
-    "analysis.formats": "analysis.exchange:check_format_plugin",
-    "analysis.structures": "analysis.structures:check_structure_plugin",
+    "rigd.devices": ("device", "rigd.profile:check_device_plugin"),
+    "rigd.controllers": ("controller", "rigd.profile:check_controller_plugin"),
+    "rigd.excitations": ("excitation", "rigd.excitation:check_excitation_plugin"),
+    "analysis.formats": ("file format", "analysis.exchange:check_format_plugin"),
+    "analysis.structures": ("structure", "analysis.structures:check_structure_plugin"),
 }
-"""Groups of entry points, each with the function that checks an entry point of the group."""
+"""Groups of entry points, each with the word for its parts in messages, and with the function that
+checks an entry point of the group."""
 
-_NOUNS: Final = {
-    "rigd.devices": "device",
-    "rigd.controllers": "controller",
-    "rigd.excitations": "excitation",
-    "analysis.formats": "file format",
-}
-"""Words for a part of each group, for messages."""
 _NAME = re.compile(r"[a-z][a-z0-9_]{0,31}")
 """Pattern of the names that a package can add; they are keys of profiles and options."""
 _REFERENCE = re.compile(r"[A-Za-z_][\w.]*:[A-Za-z_]\w*")
@@ -85,7 +79,7 @@ class Plugin:
     @property
     def noun(self) -> str:
         """Word for a part of the group, for messages."""
-        return _NOUNS[self.group]
+        return GROUPS[self.group][0]
 
     @property
     def label(self) -> str:
@@ -160,7 +154,7 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
         raise
     except BaseException as error:  # SystemExit is no Exception
         raise plugin.error(
-            f"{plugin.reference} cannot be imported ({_described(error)}); repair, upgrade or "
+            f"{plugin.reference} cannot be imported ({error_text(error)}); repair, upgrade or "
             "uninstall the package."
         ) from error
     if not isinstance(found, expected):
@@ -171,7 +165,7 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
     return found
 
 
-def refuse_built_in(plugin: Plugin, built_in: Container[str]) -> None:
+def refuse_built_in(plugin: Plugin, built_in: Container[str], program: str = "rigd") -> None:
     """Raise if a package adds a part whose name is built in.
 
     Parameters
@@ -180,6 +174,8 @@ def refuse_built_in(plugin: Plugin, built_in: Container[str]) -> None:
         Part of an installed package.
     built_in
         Names of the parts that come with rigd.
+    program
+        Program that has them, for the message.
 
     Raises
     ------
@@ -188,7 +184,7 @@ def refuse_built_in(plugin: Plugin, built_in: Container[str]) -> None:
     """
     if plugin.name in built_in:
         raise plugin.error(
-            f"this {plugin.noun} is built into rigd and cannot be replaced; rename it."
+            f"this {plugin.noun} is built into {program} and cannot be replaced; rename it."
         )
 
 
@@ -224,7 +220,7 @@ def check_plugin(plugin: Plugin) -> str:
     PluginError
         If the part cannot be used.
     """
-    module_name, _, function_name = GROUPS[plugin.group].partition(":")
+    module_name, _, function_name = GROUPS[plugin.group][1].partition(":")
     summary: str = getattr(importlib.import_module(module_name), function_name)(plugin)
     return summary
 
@@ -254,11 +250,11 @@ def plugin_errors(
         if plugin is None:
             raise
         raise plugin.error(
-            f"its code failed ({_described(error)}); report that to the package's author."
+            f"its code failed ({error_text(error)}); report that to the package's author."
         ) from error
 
 
-def _described(error: BaseException) -> str:
+def error_text(error: BaseException) -> str:
     """Return type and message of an exception."""
     return f"{type(error).__name__}: {error}".removesuffix(": ")
 

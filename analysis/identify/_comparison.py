@@ -456,6 +456,8 @@ class Comparison:
         DragError
             The drag is too large for the time steps.
         """
+        if not isinstance(self.incoherent_rad, np.ndarray):
+            return self.remove_drag_torque(plant, law, poles_rad_s)
         drag_nm = self.drag_response(plant, poles_rad_s).torque(law).torque_nm
         renewed = self.renewed(modal_model, noise, drag_nm[: self._recorded_samples])
         return renewed.remove_drag_torque(plant, law, poles_rad_s)

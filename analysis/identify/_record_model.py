@@ -26,7 +26,7 @@ from analysis.identify.residual_tests import harmonics, input_relation, whitenes
 from rigd.beam import clamped_free_eigenvalues
 
 if TYPE_CHECKING:
-    from collections.abc import Iterable
+    from collections.abc import Callable, Iterable
 
     from numpy.typing import NDArray
 
@@ -160,20 +160,20 @@ def fit_linear_model(linear_candidates: CandidateSet, band_hz: tuple[float, floa
     modes_with_drag, changed_by_drag = None, tuple[int, ...]()
     # In a single sweep another effect, or large drag, has a model of its own.
     if effect is None or not is_single_sweep or (effect.kind == "air drag" and not effect.large):
-        modes_with_drag = fit_modes_with_drag(linear_candidates, linear_fit, drag_spectrum)
-    if modes_with_drag is not None and _explains_record(
-        linear_candidates, modes_with_drag.modal_fit, band_hz
-    ):
+        modes_with_drag, changed_by_drag = _accepted_drag(
+            linear_fit,
+            fit_modes_with_drag(linear_candidates, linear_fit, drag_spectrum),
+            lambda modal_fit: _explains_record(linear_candidates, modal_fit, band_hz),
+        )
+    if modes_with_drag is None:
+        modal_fit = linear_fit
+        explains_record = _explains_record(linear_candidates, linear_fit, band_hz)
+    else:
         modal_fit, explains_record = modes_with_drag.modal_fit, True
         if effect is not None and (
             effect.kind == "air drag" or not effect.significant_with(modal_fit)
         ):
             effect = None
-    else:
-        if modes_with_drag is not None:
-            changed_by_drag = modes_that_drag_changes(linear_fit, modes_with_drag.modal_fit)
-        modes_with_drag, modal_fit = None, linear_fit
-        explains_record = _explains_record(linear_candidates, linear_fit, band_hz)
     model = RecordModel(
         linear_candidates, linear_fit, linear_candidates, modal_fit, explains_record,
         modes_with_drag=modes_with_drag,
@@ -215,8 +215,10 @@ def add_further_effects(model: RecordModel, band_hz: tuple[float, float]) -> Rec
     )
     modal_fit = fit_modal_model(candidate_set)
     # A small effect that explains the record is replaced only by effects that do so, too.
-    if _explains_record(model.linear_candidates, model.modal_fit, band_hz) and not _explains_record(
-        candidate_set, modal_fit, band_hz
+    if (
+        model.explains_record
+        and _explains_record(model.linear_candidates, model.modal_fit, band_hz)
+        and not _explains_record(candidate_set, modal_fit, band_hz)
     ):
         return model
     return replace(
@@ -251,11 +253,18 @@ def fit_drag_with_modes(
         _small_drag(candidate_set, modal_fit),
         max_computations=max_computations,
     )
-    if modes_with_drag is None:
-        return None, ()
-    if not modes_with_drag.modal_fit.explained:
-        return None, modes_that_drag_changes(modal_fit, modes_with_drag.modal_fit)
-    return modes_with_drag, ()
+    return _accepted_drag(modal_fit, modes_with_drag, lambda with_drag: with_drag.explained)
+
+
+def _accepted_drag(
+    modal_fit: ModalFit,
+    modes_with_drag: ModesWithDrag | None,
+    explains_record: Callable[[ModalFit], bool],
+) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
+    """Return modes with drag if they explain the record, else None and the modes in doubt."""
+    if modes_with_drag is None or explains_record(modes_with_drag.modal_fit):
+        return modes_with_drag, ()
+    return None, modes_that_drag_changes(modal_fit, modes_with_drag.modal_fit)
 
 
 def fit_modal_model(

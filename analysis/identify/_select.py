@@ -292,7 +292,7 @@ def _select_with_known_impacts(
         reported_headline = reported_headline.doubted(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
     reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
-    effect_findings, cause_flags = model.findings, dict[str, str]()
+    effect_findings = model.findings
     if uniform_beam_refused and check.model_reason is None:
         assert modal_fit is not None
         assert beam_test is not None
@@ -300,20 +300,15 @@ def _select_with_known_impacts(
             measurement, leading_candidates, modal_fit, beam_test
         )
         effect_findings += cause_findings
-        earlier_flags = reported_headline.flags
         reported_headline = flag_contradicted_damping(reported_headline, causes)
-        cause_flags = {
-            name: flag
-            for name, flag in reported_headline.flags.items()
-            if name not in earlier_flags
-        }
     if reported_headline.tolerant is not None:
+        flags = reported_headline.flags
         alpha_verdict, lambda_verdict = (
             order_verdict_with_geometry_tolerance(
                 each.order,
                 reported_headline.tolerant,
                 each,
-                check.doubt_reason or cause_flags.get(each.order),
+                check.doubt_reason or flags.get(each.order),
                 refused=uniform_beam_refused,
             )
             for each in order_profiles

@@ -4,7 +4,7 @@ from math import isfinite
 
 from rigd.control._pid import PidController
 from rigd.control.contracts import Controller, ControllerError
-from rigd.plugins import Plugin
+from rigd.plugins import Plugin, error_text
 
 
 class AddedController:
@@ -68,7 +68,7 @@ class AddedController:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit is no Exception
-            raise self._failure("reset", error) from error
+            raise self._failure("reset", error_text(error)) from error
 
     def step(self, reference_rad: float, angle_rad: float, coupling_torque_nm: float) -> float:
         """Return the torque command of a tick in N·m, within the limit.
@@ -84,9 +84,9 @@ class AddedController:
         except KeyboardInterrupt:
             raise
         except BaseException as error:  # SystemExit is no Exception
-            raise self._failure("step", error) from error
+            raise self._failure("step", error_text(error)) from error
         if not is_usable:
-            raise self._failure("step", None, f"it returned {output!r}")
+            raise self._failure("step", f"it returned {output!r}")
         pid = self._pid
         if pid is not None:
             torque_nm = pid.step(reference_rad + output, angle_rad, coupling_torque_nm)
@@ -97,9 +97,8 @@ class AddedController:
         self.saturated = not -limit_nm <= output <= limit_nm
         return min(max(float(output), -limit_nm), limit_nm)
 
-    def _failure(self, method: str, error: BaseException | None, what: str = "") -> ControllerError:
-        """Return the error that names the package, its method and what went wrong."""
-        found = what or f"{type(error).__name__}: {error}".removesuffix(": ")
+    def _failure(self, method: str, found: str) -> ControllerError:
+        """Return the error that names the package, its method and what was found."""
         return ControllerError(
             str(
                 self._owner.error(

@@ -39,10 +39,8 @@ def find_kind(name: str) -> DeviceKind | None:
     PluginError
         If the package that adds the kind cannot be used.
     """
-    if name in SHIPPED:
-        return SHIPPED[name]
-    plugin = find_plugin(DEVICE_GROUP, name)
-    return None if plugin is None else load_kind(plugin)
+    owner = find_owner(name)
+    return SHIPPED.get(name) if owner is None else load_kind(owner)
 
 
 def load_kind(plugin: Plugin) -> DeviceKind:

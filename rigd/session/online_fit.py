@@ -6,7 +6,6 @@ from typing import Any
 
 from rigd.estimates import EstimatedMode, modes_from_json, unseen_modes
 from rigd.session._validity import Validity
-from rigd.units import decimals
 
 
 def estimate_lines(
@@ -48,8 +47,6 @@ def estimate_lines(
 
 def _change_text(earlier_mode: EstimatedMode, mode: EstimatedMode) -> str:
     """Return text with the change of a mode's frequency in Hz and of its damping in percent."""
-    change_hz = mode.frequency_hz.value - earlier_mode.frequency_hz.value
-    decimal_digits = decimals(mode.frequency_hz.std) if mode.frequency_hz.std else 4
     change_percent = mode.damping_ratio.percent_above(earlier_mode.damping_ratio)
     percent_text = "" if isnan(change_percent) else f", {change_percent:+.2g} %"
-    return f"; change {change_hz:+.{decimal_digits}f} Hz{percent_text}"
+    return f"; change {mode.frequency_change_text(earlier_mode)}{percent_text}"
