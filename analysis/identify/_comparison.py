@@ -344,6 +344,23 @@ class Comparison:
             return self
         return self._use_coherent_angle(self.angle_rad, coherent_rad, plant)
 
+    def use_whole_angle(self) -> Comparison:
+        """Return a comparison whose input is the whole angle.
+
+        The torque of the part that is incoherent with the reference is added again.
+        """
+        if not isinstance(self.incoherent_rad, np.ndarray):
+            return self
+        angle_rad = self.angle_rad + self.incoherent_rad
+        return replace(
+            self,
+            angle_rad=angle_rad,
+            prediction=self.prediction.with_angle(angle_rad),
+            incoherent_rad=0.0,
+            incoherent_nm=0.0,
+            incoherent_in_gaps_nm=0.0,
+        )._remove_torque(-np.asarray(self.incoherent_nm), -np.asarray(self.incoherent_in_gaps_nm))
+
     def _use_coherent_angle(
         self,
         angle_rad: NDArray[np.float64],
@@ -382,12 +399,7 @@ class Comparison:
             incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
         )
 
-    def renewed(
-        self,
-        plant: Plant | ModalModel,
-        noise: NoiseSpectrum,
-        additional_nm: NDArray[np.float64] | float = 0.0,
-    ) -> Comparison:
+    def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
         """Return the comparison with the reference-coherent angle estimated with a better plant.
 
         Parameters
@@ -396,14 +408,12 @@ class Comparison:
             Plant fitted to this comparison.
         noise : NoiseSpectrum
             Noise under which the plant was fitted.
-        additional_nm : ndarray, shape (m,), or float
-            Torque on the motor in addition to that of the plant, such as that by air drag.
 
         Returns
         -------
         Comparison
-            `self` if there is no additional torque, and the new torque of the incoherent part would
-            move no parameter by more than a third of its standard deviation.
+            `self` if the new torque of the incoherent part would move no parameter by more than a
+            third of its standard deviation.
         """
         updated_comparison = self.recompute_incoherent_torque(plant)
         if updated_comparison is self:
@@ -412,8 +422,7 @@ class Comparison:
             self.spectrum(updated_comparison.incoherent_nm - np.asarray(self.incoherent_nm))
             * noise.weight
         )
-        is_small = np.vdot(whitened_change, whitened_change).real <= _MAX_REMOVED_TORQUE_CHANGE
-        if is_small and not np.any(additional_nm):
+        if np.vdot(whitened_change, whitened_change).real <= _MAX_REMOVED_TORQUE_CHANGE:
             return self
         whole_angle_rad, coherent_rad = self.angle_rad + self.incoherent_rad, self.angle_rad
         coherent_prediction = TorquePredictor(
@@ -422,45 +431,8 @@ class Comparison:
         # The torque of a ringing beam moves the motor, and that motion changes the ringing.
         for _ in range(_FEEDBACK_ITERATIONS):
             torque_nm = coherent_prediction.with_angle(coherent_rad).torque(plant)[0]
-            coherent_rad = self._coherent_angle_rad(whole_angle_rad, torque_nm + additional_nm)
+            coherent_rad = self._coherent_angle_rad(whole_angle_rad, torque_nm)
         return self._use_coherent_angle(whole_angle_rad, coherent_rad, plant)
-
-    def renewed_with_drag(
-        self,
-        plant: Plant,
-        law: DragLaw,
-        modal_model: ModalModel,
-        poles_rad_s: Mapping[int, complex],
-        noise: NoiseSpectrum,
-    ) -> Comparison:
-        """Return the comparison without the torque by air drag, with a renewed coherent angle.
-
-        The motor follows the torque of beam and drag together, in bands narrower than those of the
-        loop.
-
-        Parameters
-        ----------
-        plant : Plant
-            Beam on which the drag acts.
-        law : DragLaw
-            Drag coefficient as a function of the speed.
-        modal_model : ModalModel
-            Torque of the beam without drag.
-        poles_rad_s : mapping of int to complex
-            Measured upper poles of modes.
-        noise : NoiseSpectrum
-            Noise under which the modal model was fitted.
-
-        Raises
-        ------
-        DragError
-            The drag is too large for the time steps.
-        """
-        if not isinstance(self.incoherent_rad, np.ndarray):
-            return self.remove_drag_torque(plant, law, poles_rad_s)
-        drag_nm = self.drag_response(plant, poles_rad_s).torque(law).torque_nm
-        renewed = self.renewed(modal_model, noise, drag_nm[: self._recorded_samples])
-        return renewed.remove_drag_torque(plant, law, poles_rad_s)
 
     @property
     def hum_nm(self) -> NDArray[np.float64] | float:
@@ -491,12 +463,10 @@ class Comparison:
         plant : Plant
             Beam on which the drag acts.
         poles_rad_s : mapping of int to complex, optional
-            Measured upper poles of modes, as for `DragResponse`. The motion then is the part of the
-            angle that is coherent with the reference.
+            Measured upper poles of modes, as for `DragResponse`.
         """
-        # Drag acts on the whole motion. But the sensor's noise moves the motor as well, and drag of
-        # that motion is correlated with the noise. The damping of measured modes includes it.
-        angle_rad = self.angle_rad if poles_rad_s else self.angle_rad + self.incoherent_rad
+        # Drag acts on the whole motion, whether or not it follows the reference.
+        angle_rad = self.angle_rad + self.incoherent_rad
         return DragResponse(angle_rad, self.decimation.rate_hz, plant, poles_rad_s)
 
     def remove_drag_torque(

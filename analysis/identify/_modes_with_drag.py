@@ -8,6 +8,10 @@ then are those without air, and as uncertain as the drag makes them.
 
 The drag torque depends on the poles of the modes, and these depend on the drag that is fitted with
 them. The torque is computed for the last poles and the last drag, until the drag does not change.
+
+The whole motor angle is the input of such a fit. The motor also follows the drag torque, and a part
+of the angle that is coherent with the reference for one drag is not so for another: if the torque
+of the remaining part were removed, the estimate would hardly leave the drag that was assumed.
 """
 
 from __future__ import annotations
@@ -23,6 +27,8 @@ from analysis.identify._modal_fit import fit_modes
 from analysis.identify.drag_torque import DragError, DragLaw
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from numpy.typing import NDArray
 
     from analysis.identify._candidates import CandidateSet
@@ -58,7 +64,8 @@ _CHANGED_STDS: Final = 3.0
 without drag is doubtful although drag does not explain the record as well."""
 
 _TOLERANCE_STDS: Final = 0.2
-"""Change of the drag, in standard deviations, below which its computation has converged."""
+"""Remaining change of the drag, in standard deviations, below which its computation has converged.
+"""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,6 +84,8 @@ class ModesWithDrag:
         Record without the torque of this drag, which the expansion of the torque corrects.
     drag_spectra : ndarray of complex, shape (1, K)
         Derivative of the torque by the first number of the law.
+    converged : bool
+        Whether another computation of the drag torque would hardly change the drag.
     """
 
     modal_fit: ModalFit
@@ -84,6 +93,7 @@ class ModesWithDrag:
     std_m: float
     comparison: Comparison
     drag_spectra: NDArray[np.complex128]
+    converged: bool = False
 
     def fit_with_effect(
         self, candidate_set: CandidateSet, effect_spectrum: NDArray[np.complex128]
@@ -143,11 +153,9 @@ def fit_modes_with_drag(
     """
     if not _drag_matters(modal_fit, drag_spectrum):
         return None
-    current = ModesWithDrag(
-        modal_fit, DragLaw(0.0), 0.0, candidate_set.comparison, drag_spectrum[None]
-    )
-    last_estimate_m = math.inf
-    explaining: ModesWithDrag | None = None  # the last one whose residual is noise
+    without_drag = candidate_set.comparison.use_whole_angle()
+    current = ModesWithDrag(modal_fit, DragLaw(0.0), 0.0, without_drag, drag_spectrum[None])
+    estimates_m = [0.0]
     for remaining in reversed(range(max_computations)):
         fit_with_drag = fit_modes(
             current.comparison,
@@ -157,32 +165,30 @@ def fit_modes_with_drag(
         )
         if fit_with_drag is None or fit_with_drag.visible != modal_fit.visible:
             # Drag of any size imitates a mode that hardly shows.
-            return None if math.isinf(last_estimate_m) else explaining or current
+            return None if len(estimates_m) == 1 else current
         [change_m], [std_m] = fit_with_drag.effect_sizes, fit_with_drag.effect_stds
         law = DragLaw(current.law.constant_m + change_m)
-        is_converged = abs(law.constant_m - last_estimate_m) < _TOLERANCE_STDS * std_m
-        current, last_estimate_m = (
-            replace(current, modal_fit=fit_with_drag, law=law, std_m=std_m),
-            law.constant_m,
+        estimates_m.append(law.constant_m)
+        is_first_order = len(estimates_m) == 2  # which misses that drag limits the amplitude
+        has_converged = _remaining_change_m(estimates_m) < _TOLERANCE_STDS * std_m
+        current = replace(
+            current,
+            modal_fit=fit_with_drag,
+            law=law,
+            std_m=std_m,
+            converged=has_converged and not is_first_order,
         )
-        is_first_order = current.comparison is candidate_set.comparison
-        if fit_with_drag.explained and not is_first_order:
-            explaining = current
-        if is_converged or not remaining:
+        if current.converged or not remaining:
             break
         # Negative drag is an error of the estimate. Its torque is that of hardly any drag, whose
         # derivatives belong to these poles; those of a small drag may be too far off.
         assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
         try:
-            comparison = candidate_set.comparison.renewed_with_drag(
-                candidate_set.likeliest.plant,
-                assumed_law,
-                fit_with_drag.model,
-                fit_with_drag.poles_rad_s,
-                candidate_set.noise,
+            comparison = without_drag.remove_drag_torque(
+                candidate_set.likeliest.plant, assumed_law, fit_with_drag.poles_rad_s
             )
         except DragError:
-            break  # the last fit has the uncertainty of the drag, if not its exact torque
+            break  # that of the last fit is not exact
         assert comparison.drag is not None
         current = replace(
             current,
@@ -190,7 +196,17 @@ def fit_modes_with_drag(
             comparison=comparison,
             drag_spectra=comparison.drag.by_law[:1],
         )
-    return explaining or current
+    return current
+
+
+def _remaining_change_m(estimates_m: Sequence[float]) -> float:
+    """Return the change of the drag in m that another computation of its torque would cause.
+
+    Each change is the same fraction of the one before.
+    """
+    changes_m = np.abs(np.diff(estimates_m))[-2:]
+    largest_m = float(changes_m.max())
+    return float(changes_m[-1]) ** 2 / largest_m if largest_m else 0.0
 
 
 def modes_that_drag_changes(modal_fit: ModalFit, with_drag: ModalFit) -> tuple[int, ...]:

@@ -262,7 +262,9 @@ def _accepted_drag(
     explains_record: Callable[[ModalFit], bool],
 ) -> tuple[ModesWithDrag | None, tuple[int, ...]]:
     """Return modes with drag if they explain the record, else None and the modes in doubt."""
-    if modes_with_drag is None or explains_record(modes_with_drag.modal_fit):
+    if modes_with_drag is None:
+        return None, ()
+    if modes_with_drag.converged and explains_record(modes_with_drag.modal_fit):
         return modes_with_drag, ()
     return None, modes_that_drag_changes(modal_fit, modes_with_drag.modal_fit)
 

@@ -75,7 +75,7 @@ if TYPE_CHECKING:
     from analysis.identify.uniform_beam import UniformBeamTest
 
 
-_ONLINE_DRAG_COMPUTATIONS: Final = 3
+_ONLINE_DRAG_COMPUTATIONS: Final = 4
 """Number of computations of the drag torque in a fit of the freest structure alone, which a running
 session repeats."""
 
