@@ -254,28 +254,28 @@ def fit_modes(
     columns : ndarray of complex, shape (c, K), optional
         Torque spectra of known form and unknown amplitude, as for `Objective`.
     """
-    starts_in_band = [
-        mode_start for mode_start in starts if mode_start[1] <= comparison.frequency_hz[-1]
-    ]
-    if not starts_in_band:
+    search = _ModalSearch.starting_at(comparison, noise, starts, columns)
+    if search is None:
         return None
-    effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
-    effect_spectra = effect_spectra if columns is None else columns
-    lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
-    used_bins = noise.counts & (comparison.frequency_hz >= lowest_hz)
-    search = _ModalSearch(
-        comparison,
-        replace(noise, counts=used_bins),
-        effect_spectra,
-        tuple(mode_number for mode_number, _, _ in starts_in_band),
-        np.array(
-            [
-                [math.log(2 * math.pi * hz), 2 * damping_ratio]
-                for _, hz, damping_ratio in starts_in_band
-            ]
-        ).ravel(),
-    )
     return search.remove_unexcited_modes().converge_with_noise().add_resonances().fit()
+
+
+def modes_with_poles(
+    comparison: Comparison, noise: NoiseSpectrum, poles: Sequence[tuple[int, float, float]]
+) -> ModalFit | None:
+    """Return the modal model with given poles and the best residues, without a search.
+
+    Parameters
+    ----------
+    comparison : Comparison
+        Record, reduced to the band.
+    noise : NoiseSpectrum
+        Noise of the record.
+    poles : sequence of (int, float, float)
+        Mode number, frequency (Hz) and damping ratio of each mode.
+    """
+    search = _ModalSearch.starting_at(comparison, noise, poles)
+    return None if search is None else search.fit()
 
 
 @dataclass(frozen=True, slots=True)
@@ -290,6 +290,37 @@ class _ModalSearch:
     effect_spectra: NDArray[np.complex128]
     numbers: tuple[int, ...]
     x: NDArray[np.float64]
+
+    @classmethod
+    def starting_at(
+        cls,
+        comparison: Comparison,
+        noise: NoiseSpectrum,
+        starts: Sequence[tuple[int, float, float]],
+        columns: NDArray[np.complex128] | None = None,
+    ) -> _ModalSearch | None:
+        """Return the search that starts at the modes in the band, or None if there is none."""
+        starts_in_band = [
+            mode_start for mode_start in starts if mode_start[1] <= comparison.frequency_hz[-1]
+        ]
+        if not starts_in_band:
+            return None
+        effect_spectra = np.zeros((0, comparison.frequency_hz.size), dtype=np.complex128)
+        effect_spectra = effect_spectra if columns is None else columns
+        lowest_hz = _LOWEST_RELATIVE_FREQUENCY * min(hz for _, hz, _ in starts_in_band)
+        used_bins = noise.counts & (comparison.frequency_hz >= lowest_hz)
+        return cls(
+            comparison,
+            replace(noise, counts=used_bins),
+            effect_spectra,
+            tuple(mode_number for mode_number, _, _ in starts_in_band),
+            np.array(
+                [
+                    [math.log(2 * math.pi * hz), 2 * damping_ratio]
+                    for _, hz, damping_ratio in starts_in_band
+                ]
+            ).ravel(),
+        )
 
     def problem(self) -> _ModalProblem:
         """Return the least-squares problem of the modes of this search under its noise estimate."""

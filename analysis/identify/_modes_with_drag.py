@@ -23,7 +23,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.identify._finding import Finding
-from analysis.identify._modal_fit import fit_modes
+from analysis.identify._modal_fit import fit_modes, modes_with_poles
 from analysis.identify.drag_torque import DragError, DragLaw
 
 if TYPE_CHECKING:
@@ -151,9 +151,11 @@ def fit_modes_with_drag(
     max_computations : int
         Maximum number of computations of the drag torque.
     """
-    if not _drag_matters(modal_fit, drag_spectrum):
-        return None
     without_drag = candidate_set.comparison.use_whole_angle()
+    mode_starts = _mode_starts(modal_fit)
+    whole_angle_fit = modes_with_poles(without_drag, modal_fit.noise, mode_starts)
+    if whole_angle_fit is None or not _drag_matters(whole_angle_fit, drag_spectrum):
+        return None
     current = ModesWithDrag(modal_fit, DragLaw(0.0), 0.0, without_drag, drag_spectrum[None])
     estimates_m = [0.0]
     for remaining in reversed(range(max_computations)):

@@ -220,7 +220,7 @@ def _detail_range_hz(mode: ModeEstimate, frequency_hz: NDArray[np.float64]) -> t
 _LOSS_POINTS: Final = 400
 """Number of frequencies at which the loss factors are drawn."""
 _CURVE_STYLES: Final = {
-    "internal (material)": (style.VERMILION, (0, (4, 2))),
+    "internal (material and clamp)": (style.VERMILION, (0, (4, 2))),
     "external (surroundings)": (style.GREEN, (0, (1, 1.2))),
     "total": (style.BLUE, "-"),
 }

@@ -169,14 +169,14 @@ def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_resu
     axes, description = loss_axes(careful)
     labels = [line.get_label() for line in axes.get_lines()]
     assert "total" in labels
-    assert "internal (material)" not in labels
+    assert "internal (material and clamp)" not in labels
     (total,) = [line for line in axes.get_lines() if line.get_label() == "total"]
     modes = careful.whole.fit.modes
     assert total.get_xdata()[0] == pytest.approx(modes[0].frequency_hz)
     assert total.get_xdata()[-1] == pytest.approx(modes[1].frequency_hz)
     assert "do not support" in description
     axes, description = loss_axes(record_result)
-    assert {"total", "internal (material)"} <= {line.get_label() for line in axes.get_lines()}
+    assert {"total", "internal (material and clamp)"} <= {line.get_label() for line in axes.get_lines()}
     assert "do not support" not in description
 
 

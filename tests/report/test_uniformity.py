@@ -190,7 +190,7 @@ def test_losses_that_no_beam_explains_are_points_alone(unexplained_losses):
     assert loss_estimate(unexplained_losses.whole) is None
     figures = drawn(unexplained_losses)
     labels = [handle.get_label() for handle in figures["loss_factor"].figure.axes[0].get_lines()]
-    assert not {"total", "internal (material)", "external (surroundings)"} & set(labels)
+    assert not {"total", "internal (material and clamp)", "external (surroundings)"} & set(labels)
     assert "There is no curve" in figures["loss_factor"].description
     assert "not properties of the material" in figures["uniform_beam"].description
     content = document([unexplained_losses])
