@@ -160,6 +160,7 @@ class OnlineEstimate:
             "doubt": self.doubt,
             "warnings": self.warnings,
             "findings": [finding.sentence for finding in self.findings],
+            "with_air_drag": any(finding.kind == "air drag" for finding in self.findings),
             "modes": [],
         }
         headline, fit, plant = self.headline, self.predicting, self.plant

@@ -204,9 +204,10 @@ class SegmentSearch:
         record: RecordSoFar,
         tip_slope_rad: float,
         time_left_s: float = inf,
+        limit_fraction: float = 1.0,
     ) -> None:
         self.estimate, self.quantities, self.plant = estimate, quantities, plant
-        self.record = record
+        self.record, self.limit_fraction = record, limit_fraction
         self.modes = estimate.modes()
         if not self.modes:
             raise ExcitationError(
@@ -214,15 +215,19 @@ class SegmentSearch:
             )
         self.model = TorqueModel.for_records(estimate, plant.rate_hz, record.ringing.shape[1])
         self.samples = record.ahead.shape[1]
-        self.limits = LIMIT_FRACTION * np.array(
-            [
-                max(plant.angle_rad - abs(start_rad), 1e-6),
-                plant.velocity_rad_s,
-                plant.tracking_error_rad,
-                plant.peak_torque_nm - plant.friction_nm,
-                plant.coupling_torque_nm,
-                tip_slope_rad,
-            ]
+        self.limits = (
+            LIMIT_FRACTION
+            * limit_fraction
+            * np.array(
+                [
+                    max(plant.angle_rad - abs(start_rad), 1e-6),
+                    plant.velocity_rad_s,
+                    plant.tracking_error_rad,
+                    plant.peak_torque_nm - plant.friction_nm,
+                    plant.coupling_torque_nm,
+                    tip_slope_rad,
+                ]
+            )
         )
         # The torque of the remaining vibration acts on the motor that holds, and on the sensor.
         torque_nm, slope_rad = record.ringing
@@ -692,6 +697,7 @@ class SegmentSearch:
             expected=quantities.precisions(later_covariance),
             forecast=self.forecast(time_left_s),
             fraction_of_limits=LIMIT_FRACTION
+            * self.limit_fraction
             * float(np.abs(ringing_channels + amplitude_fraction * segment_channels).max()),
         )
 

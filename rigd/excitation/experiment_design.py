@@ -89,6 +89,7 @@ def next_segment(
     *,
     tip_slope_rad: float = SMALL_SLOPE_RAD,
     through: Collection[int] = (),
+    limit_fraction: float = 1.0,
 ) -> Segment:
     """Return the segment of excitation that reduces the targets' standard deviations most.
 
@@ -111,6 +112,8 @@ def next_segment(
     through
         Numbers of modes of which the segment must drive one; empty: the segment drives the most
         informative modes.
+    limit_fraction
+        Largest fraction of the limits that the segment uses, to vary its amplitude.
 
     Raises
     ------
@@ -126,7 +129,14 @@ def next_segment(
         angle_rad_so_far, estimate, move_plant.rate_hz, HORIZON_S
     )
     segment_search = SegmentSearch(
-        estimate, quantities, move_plant, rig.start_rad, record_so_far, tip_slope_rad, time_left_s
+        estimate,
+        quantities,
+        move_plant,
+        rig.start_rad,
+        record_so_far,
+        tip_slope_rad,
+        time_left_s,
+        limit_fraction,
     )
     return segment_search.segment(
         segment_search.best_candidate(time_left_s, driven_modes), time_left_s

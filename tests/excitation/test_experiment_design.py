@@ -105,6 +105,11 @@ def test_a_tighter_limit_lowers_the_amplitude(rig, scanned):
     assert slopes[1] < 0.7 * slopes[0]
 
 
+def test_a_fraction_of_the_limits_is_kept(rig):
+    piece = next_segment(ESTIMATE, np.zeros(1000), DAMPING, rig, 10.0, limit_fraction=0.4)
+    assert 0.2 < piece.fraction_of_limits <= 0.4 * LIMIT_FRACTION + 1e-9
+
+
 def test_it_takes_no_longer_than_is_left(rig, scanned):
     piece = next_segment(ESTIMATE, scanned, DAMPING, rig, 1.2)
     assert piece.reference_rad.size <= 1200

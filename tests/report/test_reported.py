@@ -176,7 +176,9 @@ def test_the_loss_factor_is_drawn_where_the_data_support_it(careful, record_resu
     assert total.get_xdata()[-1] == pytest.approx(modes[1].frequency_hz)
     assert "do not support" in description
     axes, description = loss_axes(record_result)
-    assert {"total", "internal (material and clamp)"} <= {line.get_label() for line in axes.get_lines()}
+    assert {"total", "internal (material and clamp)"} <= {
+        line.get_label() for line in axes.get_lines()
+    }
     assert "do not support" not in description
 
 

@@ -32,7 +32,7 @@ def profile():
     return load_profile("sim")
 
 
-def answer(profile, tick, share, flag=None):
+def answer(profile, tick, share, flag=None, with_air_drag=False):
     """What the fit answers where every number has a share of itself as its deviation."""
     beam, damping = profile.rig.beam, profile.rig.damping
 
@@ -49,6 +49,7 @@ def answer(profile, tick, share, flag=None):
         "problem": "",
         "doubt": flag,
         "findings": ["Something struck the beam."] if flag else [],
+        "with_air_drag": with_air_drag,
         "modes": [
             {
                 "mode": number,
@@ -113,10 +114,14 @@ def test_a_search_may_state_the_uniformity_of_the_beam():
 
 
 def designed_at_once(monkeypatch, std):
-    """Pieces of a second of rest, in place of a design that takes its time."""
-    rest = np.zeros(RATE_HZ)
+    """Pieces of a second of rest, in place of a design that takes its time.
 
-    def design(estimate, angle_rad, targets, rig, time_left_s, **_):
+    Return the list of options with which each is asked for.
+    """
+    rest, planned = np.zeros(RATE_HZ), []
+
+    def design(estimate, angle_rad, targets, rig, time_left_s, **options):
+        planned.append(options)
         k = len(estimate.names)
         now = (Precision(targets[0], 1.0, std, 0.1),)
         return Segment(
@@ -124,6 +129,7 @@ def designed_at_once(monkeypatch, std):
         )
 
     monkeypatch.setattr("rigd.runner._precision_search.next_segment", design)
+    return planned
 
 
 @pytest.fixture
@@ -156,6 +162,16 @@ def test_a_piece_follows_where_more_is_to_be_known(bench):
     heads, row = fit.document["text"]
     assert heads.split()[:5] == ["time", "damping", "of", "mode", "1"]
     assert row.startswith("  6.0 s 0.9")
+
+
+def test_air_drag_is_told_from_damping_by_two_amplitudes(bench, monkeypatch):
+    planned = designed_at_once(monkeypatch, std=1.0)
+    for with_air_drag in (False, False, *8 * (True,)):
+        bench.told(ON_THE_WAY, with_air_drag=with_air_drag)
+    fractions = [options["limit_fraction"] for options in planned]
+    reduced = fractions[3]
+    assert 0.3 < reduced < 0.5
+    assert fractions == [1.0, 1.0, *2 * (reduced, reduced, 1.0, reduced)]
 
 
 def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
