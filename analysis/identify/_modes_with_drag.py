@@ -25,6 +25,7 @@ import numpy as np
 from analysis.identify._finding import Finding
 from analysis.identify._modal_fit import fit_modes, modes_with_poles
 from analysis.identify.drag_torque import DragError, DragLaw
+from rigd.units import to_uncertainty
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -116,12 +117,12 @@ class ModesWithDrag:
 
     def finding(self) -> Finding:
         """Return the finding that the damping ratios are those without air, and less certain."""
-        drag_mm, std_mm = 1e3 * self.law.constant_m, 1e3 * self.std_m
+        drag_mm, std_mm = to_uncertainty((self.law.constant_m, self.std_m), self.std_m, 1e3)
         return Finding(
             kind="air drag",
             sentence=(
                 "The modes were fitted together with air drag, since this record hardly "
-                f"distinguishes drag from other damping: C_D d = {drag_mm:.2g} ± {std_mm:.2g} mm "
+                f"distinguishes drag from other damping: C_D d = {drag_mm} ± {std_mm} mm "
                 "(standard deviation). Damping ratios are those without air."
             ),
             remedy="Repeat the session at twice and at half the amplitude.",

@@ -139,11 +139,13 @@ def _target_estimate(target: Target, estimate: Estimate | None) -> TargetEstimat
         return TargetEstimate(
             *quantity_and_mode, None, inf, target.std, "it is not part of what was found"
         )
+    # An estimate that is less than its uncertainty does not show how small the value is.
+    least_value = max(abs(estimate.value), estimate.std or 0.0)
     return TargetEstimate(
         *quantity_and_mode,
         estimate.value,
         inf if estimate.flag or estimate.std is None else estimate.std,
-        target.std * (abs(estimate.value) if target.relative else 1.0),
+        target.std * (least_value if target.relative else 1.0),
         estimate.flag or "",
     )
 
