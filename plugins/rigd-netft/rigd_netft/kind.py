@@ -22,9 +22,9 @@ def open_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
     settings = rig.settings_of(NetFtSettings)
     if opened.simulated_sensor is not None:
-        from rigd_netft.box import open_simulated_box
+        from rigd_netft.box import simulated_box
 
-        return open_simulated_box(rig, settings, opened.simulated_sensor)
+        return NetFtSensor(rig, settings, simulated_box(rig, settings, opened.simulated_sensor))
     if opened.simulated:
         raise DeviceError(
             f"{rig.name}: rigd simulate has no Net F/T box; end it to use the hardware, or choose "
@@ -79,18 +79,13 @@ def address(rig: RigParameters) -> str:
     return f"{settings.host}, UDP port {settings.port}"
 
 
-def stream_hz(rig: RigParameters) -> float:
-    """Return the records per second that the box streams."""
-    return rig.settings_of(NetFtSettings).rate_hz
-
-
 NETFT: Final = DeviceKind(
     name="netft",
     summary="ATI Net F/T box by RDT over UDP",
     open_sensor=open_sensor,
     settings=NetFtSettings,
     address=address,
-    stream_hz=stream_hz,
+    stream_hz=lambda rig: rig.settings_of(NetFtSettings).rate_hz,
     contradictions=contradictions,
     metadata=metadata,
 )

@@ -36,3 +36,8 @@ class NetFtSettings:
     faults: Annotated[
         tuple[str, ...], doc("faults of a simulated box, such as loss=0.01 or silence@2")
     ] = ()
+
+    @property
+    def box_name(self) -> str:
+        """Name of the box in messages."""
+        return f"Net F/T box at {self.host}"
