@@ -6,7 +6,7 @@ from typing import Any, Final
 from rigd.devices.contracts import DeviceError, WrenchSensor
 from rigd.devices.declaration import DeviceKind, OpenedDrive
 from rigd.devices.parameters import RigParameters
-from rigd_netft.protocol import CUT_OFFS_HZ, rate_reached_hz
+from rigd_netft.protocol import rate_reached_hz
 from rigd_netft.settings import NetFtSettings
 
 
@@ -49,10 +49,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"netft.rate_hz = {rate_hz:g} Hz is below twice rig.rate_hz = {loop_hz:g} Hz; there "
             "would be ticks without a record: choose 7000."
         )
-    if values["netft.filter_hz"] not in CUT_OFFS_HZ:
-        choices = ", ".join(map(str, sorted(CUT_OFFS_HZ)))
-        yield f"netft.filter_hz = {values['netft.filter_hz']} Hz is none of {choices}."
-    elif values["netft.filter_hz"] and values["netft.filter_hz"] != values["sensor.filter_hz"]:
+    if values["netft.filter_hz"] not in (0, values["sensor.filter_hz"]):
         yield (
             f"netft.filter_hz = {values['netft.filter_hz']} Hz delays the torque; state it as "
             "sensor.filter_hz, so that the analysis takes it into account, or choose 0."

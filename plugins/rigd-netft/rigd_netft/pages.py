@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import prod
-from typing import Final
+from typing import Final, get_args
 
 from rigd.devices.contracts import DeviceError
 from rigd_netft import protocol
@@ -53,7 +53,7 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
     communication = {
         "comrdte": "Enabled", "comrdtrate": f"{settings.rate_hz:g}", "comrdtbsiz": "1"
     }  # fmt: skip
-    setting = {"setuserfilter": str(protocol.CUT_OFFS_HZ.index(settings.filter_hz))}
+    setting = {"setuserfilter": str(get_args(protocol.CutOffHz).index(settings.filter_hz))}
     if settings.bias == "zero":
         setting["setbias"] = "0;0;0;0;0;0"
     try:

@@ -4,7 +4,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from struct import Struct
-from typing import Final
+from typing import Final, Literal
 
 PORT: Final = 49152
 """UDP port of the box."""
@@ -63,8 +63,8 @@ NEWTON_METRES: Final = {
 }  # fmt: skip
 """Units of torque that a box can have, in N·m, without the characters between their parts."""
 
-CUT_OFFS_HZ: Final = (0, 838, 326, 152, 73, 35, 18, 8, 5, 1500, 2000, 2500, 3000)
-"""Cut-off in Hz of the box's low-pass filter, by the number of the filter; 0: no filter."""
+CutOffHz = Literal[0, 838, 326, 152, 73, 35, 18, 8, 5, 1500, 2000, 2500, 3000]
+"""Cut-off in Hz of the box's low-pass filter, in the order of their numbers; 0: no filter."""
 
 
 def unit_key(name: str) -> str:

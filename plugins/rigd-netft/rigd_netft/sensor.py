@@ -28,7 +28,8 @@ _MAX_AGE_PERIODS = 2.0
 """Age of a record, in periods of the loop, above which it counts as stale."""
 _COUNTED = ("lost", "duplicates", "out_of_order", "malformed", "restarts")
 """What is counted of a stream."""
-_FRAME_BITS = 8 * (14 + 20 + 8 + protocol.RECORD.size + 4)
+_RECORD_BYTES: Final = protocol.RECORD.size
+_FRAME_BITS: Final = 8 * (14 + 20 + 8 + _RECORD_BYTES + 4)
 """Bits of a packet with one record on Ethernet."""
 _unpack_head: Final = Struct(">III").unpack_from
 """Function that returns the first three numbers of a record: sequence, counter, status."""
@@ -47,16 +48,16 @@ class NetFtSensor:
         self._box = BoxSettings((1.0,) * 6)
         self._period_ns = 1e9 / rig.rate_hz
         self.wrench_stale, self.wrench_saturated, self.wrench_time_ns = True, False, 0
-        self._status = self._due_ns = 0
+        self._status = 0
         self._wrench: Wrench = (0.0,) * 6
         self._forget_stream()
 
     def _forget_stream(self) -> None:
         """Forget records, counts and clock of an earlier stream."""
         self.counts = dict.fromkeys(_COUNTED, 0)
-        self._records = self._statuses = 0
-        self._sequences = self._counted = 0  # rise of both numbers of the records
-        self._last = 0, 0  # both numbers of the newest record
+        self._records = self._statuses = self._due_ns = 0
+        self._counted = self._before_first = 0  # rise of the counter; sequence before the first
+        self._last = 0, 0  # sequence and counter of the newest record
         self._candidate: int | None = None  # sequence of a record that does not fit
         self._newest = b""  # until it is read
         self._box_ns, self._offset_ns = 0, inf  # clock of the box, and what this one is ahead
@@ -158,18 +159,19 @@ class NetFtSensor:
             while self._records < _FIRST_RECORDS and time.monotonic() < deadline_s:
                 time.sleep(1e-3)
                 self._read()
-            if self._sequences > 1 and self._last[0] <= _MAX_FIRST_SEQUENCE:
+            records = protocol.difference(self._last[0], self._before_first)
+            if records > 1 and self._last[0] <= _MAX_FIRST_SEQUENCE:
                 break
         else:
             raise self._error(
                 f"no record came after {_START_ATTEMPTS} requests for its stream. Check that RDT "
                 f"is enabled, and that no firewall drops UDP from its port {self._settings.port}."
             )
-        if abs(self._counted - self._sequences * self._step) > 1:
+        if abs(self._counted - records * self._step) > 1:
             raise self._error(
-                f"its counter rises by {self._counted} in {self._sequences} records, so it does "
-                f"not send {self._settings.rate_hz:g} records per second; correct netft.rate_hz or "
-                "the rate in the box."
+                f"its counter rises by {self._counted} in {records} records, so it does not send "
+                f"{self._settings.rate_hz:g} records per second; correct netft.rate_hz or the rate "
+                "in the box."
             )
 
     def _read(self) -> int:
@@ -183,12 +185,13 @@ class NetFtSensor:
         counts, step, difference = self.counts, self._step, protocol.difference
         last_sequence, last_counter = self._last
         for packet in packets:
-            if len(packet) != protocol.RECORD.size:
+            if len(packet) != _RECORD_BYTES:
                 counts["malformed"] += 1
                 continue
             sequence, counter, status = _unpack_head(packet)
             if not self._records:
-                last_sequence, last_counter = sequence - 1, counter - round(step)
+                self._before_first = last_sequence = sequence - 1
+                last_counter = counter - round(step)
             self._records += 1
             ahead, rise = sequence - last_sequence, counter - last_counter
             if ahead != 1 or not -1 <= rise - step <= 1:  # the counter is rounded
@@ -202,7 +205,6 @@ class NetFtSensor:
                     counts["out_of_order" if ahead else "duplicates"] += 1
                     counts["lost"] -= ahead < 0  # as which it had been counted
                     continue
-            self._sequences += ahead
             self._counted += rise
             self._statuses |= status
             self._newest = packet
