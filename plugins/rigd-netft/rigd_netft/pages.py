@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from math import prod
 from typing import Final, get_args
+from urllib.parse import urlencode
 
 from rigd.devices.contracts import DeviceError
 from rigd_netft import protocol
@@ -55,12 +56,13 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
     }  # fmt: skip
     setting = {"setuserfilter": str(get_args(protocol.CutOffHz).index(settings.filter_hz))}
     if settings.bias == "zero":
-        setting["setbias"] = "0;0;0;0;0;0"
+        setting |= {f"setbias{axis}": "0" for axis in range(6)}
     try:
         tags = _tags(get(PAGE))
         for form, values in ((COMMUNICATION, communication), (SETTING, setting)):
             if not all(_agrees(tags, *each) for each in values.items()):
-                get(_form_path(form, values))
+                # All in one request: a box drops some of several. The form has 1 for Enabled.
+                get(f"{form}?{urlencode(values).replace('Enabled', '1')}")
         tags = _tags(get(PAGE))
     except OSError as error:
         raise DeviceError(
@@ -86,8 +88,10 @@ def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings
 
 
 def _tags(page: str) -> dict[str, str]:
-    """Return the settings on a page by their tags."""
-    return {tag: value.strip() for tag, value in _TAG.findall(page)}
+    """Return the settings on a page by their tags; the bias also by axis, as in the form."""
+    tags = {tag: value.strip() for tag, value in _TAG.findall(page)}
+    offsets = tags.get("setbias", "").split(";")
+    return tags | {f"setbias{axis}": counts for axis, counts in enumerate(offsets) if counts}
 
 
 def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
@@ -121,17 +125,6 @@ def _require(suits: bool, tags: Mapping[str, str], tag: str, reason: str) -> Non
     """Raise ValueError for a setting that does not suit."""
     if not suits:
         raise ValueError(f'{tag} is "{tags.get(tag, "")}", but {reason}')
-
-
-def _form_path(form: str, values: Mapping[str, str]) -> str:
-    """Return the path that sets values by a form, whose fields are not all as on the page."""
-    fields = []
-    for tag, value in values.items():
-        if tag == "setbias":
-            fields += [f"{tag}{axis}={counts}" for axis, counts in enumerate(value.split(";"))]
-        else:
-            fields.append(f"{tag}={'1' if value == 'Enabled' else value}")
-    return f"{form}?{'&'.join(fields)}"  # all in one request: a box drops some of several
 
 
 def _agrees(tags: Mapping[str, str], tag: str, wanted: str) -> bool:
