@@ -3,10 +3,11 @@
     python benchmarks/bench_netft_loop.py [SECONDS] [ROUNDS]
 
 A simulated box streams 7000 records a second from a process of its own, on the cores that are not
-the loop's. In each round, in changing order, three whole real-time sessions of the simulated rig:
+the loop's. In each round, in changing order, four whole real-time sessions of the simulated rig:
 its own sensor alone; the same while the box streams to a socket that nobody reads, which is what
-the box itself disturbs; and the driver of the box as the sensor. Ratios are of each round, and
-their median counts, because a computer with two cores and other users is never quiet.
+the box itself disturbs; the driver of the box as the sensor; and the driver with the box that is
+simulated in its process. Ratios are of each round, and their median counts, because a computer
+with two cores and other users is never quiet.
 """
 
 import os
@@ -27,11 +28,11 @@ from rigd.bench import _loops as loops
 from rigd.bench import cores_without_loop
 from rigd.bench.measure import LoopMeasurement, percentiles
 from rigd.checks.machine import settings_granted
-from rigd.profile import load_profile
+from rigd.profile import Profile, load_profile
 from rigd.runtime import use_one_thread
 
 RATE_HZ = 1000.0
-ALONE, STREAMING, READ = "no box", "box not read", "box read"
+ALONE, STREAMING, READ, SIMULATED = "no box", "box not read", "box read", "box simulated"
 MAX_LATENESS_RATIO, MAX_CPU_PERCENT = 1.1, 3.0
 """Targets: p99 of the lateness over that without the box, and the processor time added."""
 BOX = """
@@ -94,8 +95,17 @@ def measure(name: str, seconds: float, cores: set[int]) -> LoopMeasurement:
     """Measure the loop in one session."""
     plain = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
     plain = replace(plain, limits=replace(plain.limits, stale_ticks_in_a_row=10**9))
+
+    def with_sensor(sensor: str, settings: NetFtSettings) -> Profile:
+        devices = replace(plain.rig.devices, sensor=sensor)
+        rig = replace(plain.rig, devices=devices, added_settings=(settings,))
+        return replace(plain, rig=rig)
+
     if name == ALONE:
         return loops.run_session(name, plain, seconds, lambda: None)
+    if name == SIMULATED:
+        profile = with_sensor("netft", NetFtSettings("127.0.0.1"))
+        return loops.run_session(name, profile, seconds, lambda: None)
     with box(cores) as port, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
         if name == STREAMING:
             reader.connect(("127.0.0.1", port))
@@ -104,9 +114,7 @@ def measure(name: str, seconds: float, cores: set[int]) -> LoopMeasurement:
             reader.send(STOP)
             return measurement
         settings = NetFtSettings("127.0.0.1", port=port, counts_per_n=1e6, counts_per_nm=1e6)
-        devices = replace(plain.rig.devices, sensor="distant_netft")
-        rig = replace(plain.rig, devices=devices, added_settings=(settings,))
-        profile = replace(plain, rig=rig)
+        profile = with_sensor("distant_netft", settings)
         return loops.run_session(name, profile, seconds, lambda: None)
 
 
@@ -138,16 +146,18 @@ def main() -> None:
     granted = settings_granted(load_profile("sim").realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     cores, rounds = cores_without_loop(granted), []
-    names = (ALONE, STREAMING, READ)
+    names = (ALONE, STREAMING, READ, SIMULATED)
     with tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder:
         install(Path(folder))
         for number in range(count):
             print(f"round {number + 1}, load {os.getloadavg()[0]:.2f}")
-            turned = names[number % 3 :] + names[: number % 3]
+            turned = names[number % 4 :] + names[: number % 4]
             rounds.append({name: measure(name, seconds, cores) for name in turned})
             for name in names:
                 show(rounds[-1][name])
-    for over, under in ((STREAMING, ALONE), (READ, STREAMING), (READ, ALONE)):
+    for over, under in (
+        (STREAMING, ALONE), (READ, STREAMING), (READ, ALONE), (SIMULATED, ALONE)
+    ):  # fmt: skip
         p50, p99 = (ratio(rounds, over, under, which) for which in ("p50", "p99"))
         cpu_percent, work_us = (
             statistics.median(value(found[over]) - value(found[under]) for found in rounds)
