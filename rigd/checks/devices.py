@@ -239,9 +239,8 @@ def calibration_rows(calibration: Mapping[str, object], rig: RigParameters) -> I
     ]
     if other_values:
         detail_text = f"Sensor: {'; '.join(other_values)}."
-        yield CheckRow(
-            "sensor", "more", f"{len(other_values)} values, below", "", CheckResult.OK, detail_text
-        )
+        count_text = "1 value" if len(other_values) == 1 else f"{len(other_values)} values"
+        yield CheckRow("sensor", "more", f"{count_text}, below", "", CheckResult.OK, detail_text)
 
 
 def _measured_rows(

@@ -164,11 +164,10 @@ def new(
         fail(f"{target} exists already; choose another folder (--folder).", EXIT_WRONG_USE)
     except OSError as error:
         fail(f"{target} cannot be written ({error.strerror}).", EXIT_FAILED)
+    made = printable(str(target))
     typer.echo(
-        printable(
-            f"{target} is made. In the environment of rigd: pip install --editable {target}, "
-        )
-        + f"rigd plugins, python -m pytest {printable(str(target))}/tests."
+        f"{made} is made. In the environment of rigd: pip install --editable '{made}[test]', "
+        f"rigd plugins, python -m pytest {made}/tests."
     )
 
 

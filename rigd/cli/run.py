@@ -9,9 +9,10 @@ import json
 from collections.abc import Callable, Mapping
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, get_args
 
 import typer
+from annotated_types import DocInfo, doc
 from typer.core import TyperGroup
 
 from rigd.cli.options import (
@@ -39,10 +40,12 @@ from rigd.cli.options import (
     session_notes,
 )
 from rigd.cli.start import SessionCommands, start_processes, start_sessions
+from rigd.excitation import RestS, RingDownS
 from rigd.extras import require_extra
+from rigd.units import unit_of
 
 if TYPE_CHECKING:
-    from rigd.excitation import ExcitationOption, Value
+    from rigd.excitation import Value
     from rigd.runner.session import RunResult
 
 
@@ -94,8 +97,6 @@ Amplitude = Annotated[float, typer.Option("--amplitude", help="Amplitude (rad)."
 StartHz = Annotated[float, typer.Option("--start-hz", help="Frequency where the band starts (Hz).")]
 StopHz = Annotated[float, typer.Option("--stop-hz", help="Frequency where the band ends (Hz).")]
 Duration = Annotated[float, typer.Option("--duration", help="Duration of the excitation (s).")]
-Rest = Annotated[float, typer.Option("--rest", help="Rest before the excitation (s).")]
-RingDown = Annotated[float, typer.Option("--ring-down", help="Ring-down after the excitation (s).")]
 Taper = Annotated[float, typer.Option("--taper", help="Fade-in and fade-out time (s).")]
 
 Model = Annotated[
@@ -128,7 +129,7 @@ def excitation_command(parameters: Parameters) -> Parameters:
 def _add_subcommand(app: typer.Typer, perform: Callable[..., None], parameters: Parameters) -> None:
     """Add the subcommand of an excitation to a command; `perform` runs its sessions."""
     excitation_kind = parameters.__name__
-    own_parameters = list(inspect.signature(parameters).parameters.values())
+    own_parameters = list(map(_command_option, inspect.signature(parameters).parameters.values()))
     common_parameters = list(inspect.signature(perform).parameters.values())[2:]
 
     def command(**options: Any) -> None:  # noqa: ANN401 - as typer hands them over
@@ -178,10 +179,7 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
                 option.name,
                 inspect.Parameter.KEYWORD_ONLY,
                 default=option.default,
-                annotation=Annotated[
-                    option.value_type,
-                    typer.Option(_option_flag(option.name), help=_option_help(option)),
-                ],
+                annotation=Annotated[option.value_type, doc(option.help)],
             )
             for option in excitation_options(name)
         ]
@@ -191,15 +189,19 @@ def _added_command(app_name: str, name: str) -> Any:  # noqa: ANN401 - typer's c
     return typer.main.get_command(app)
 
 
-def _option_flag(option: str) -> str:
-    """Return the flag of an option: without the units s and rad, as of rigd's own."""
-    return "--" + option.removesuffix("_s").removesuffix("_rad").replace("_", "-")
+def _command_option(parameter: inspect.Parameter) -> inspect.Parameter:
+    """Return a parameter with a declared help (`doc`) as an option of the command line.
 
-
-def _option_help(option: "ExcitationOption") -> str:
-    """Return the help of an option, with its unit in parentheses."""
-    unit = f" ({option.unit})" if option.unit else ""
-    return f"{option.help or option.name}{unit}."
+    Its flag has no units s and rad; its help has the unit in parentheses.
+    """
+    value_type, *extras = get_args(parameter.annotation) or (None,)
+    declared = next((each for each in extras if isinstance(each, DocInfo)), None)
+    if declared is None:
+        return parameter
+    name, unit = parameter.name, unit_of(parameter.name)
+    flag = "--" + name.removesuffix("_s").removesuffix("_rad").replace("_", "-")
+    text = (declared.documentation or name).removesuffix(".") + (f" ({unit})." if unit else ".")
+    return parameter.replace(annotation=Annotated[value_type, typer.Option(flag, help=text)])
 
 
 def run_sessions(
@@ -278,8 +280,8 @@ def chirp(
     start_hz: StartHz = 0.05,
     stop_hz: StopHz = 50.0,
     duration_s: Duration = 120.0,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Taper = 0.0,
     there_and_back: Annotated[
         bool,
@@ -299,7 +301,7 @@ def chirp(
 
 @excitation_command
 def hold(
-    duration_s: Duration = 10.0, rest_s: Rest = 1.0, ring_down_s: RingDown = 0.0
+    duration_s: Duration = 10.0, rest_s: RestS = 1.0, ring_down_s: RingDownS = 0.0
 ) -> "dict[str, Value]":
     """Hold the motor at its start angle, to measure noise and drift.
 
@@ -312,8 +314,8 @@ def hold(
 def step(
     amplitude_rad: Amplitude = 0.025,
     duration_s: Duration = 10.0,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
 ) -> "dict[str, Value]":
     """Apply a step to the reference.
 
@@ -329,8 +331,8 @@ def multisine(
     stop_hz: StopHz = 50.0,
     period_s: Annotated[float, typer.Option("--period", help="Period of the signal (s).")] = 20.0,
     duration_s: Duration = 120.0,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Taper = 0.0,
     phase_seed: Annotated[
         int, typer.Option("--phase-seed", min=0, help="Seed of the random phases.")
@@ -357,8 +359,8 @@ def file(
             help="Text with columns time_s and angle_rad, or a column of angles (rad).",
         ),
     ],
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
 ) -> "dict[str, Value]":
     """Follow a reference from a text file.
 
@@ -389,8 +391,8 @@ def modes(
         float, typer.Option("--widths", help="Band half-width, in half-power widths of its mode.")
     ] = 1.0,
     duration_s: Duration = 120.0,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Annotated[
         float, typer.Option("--taper", help="Fade-in and fade-out time of each sweep (s).")
     ] = 1.0,
@@ -426,8 +428,8 @@ def touch(
         float, typer.Option("--force-limit", help="Largest contact force; more is a fault (N).")
     ] = 10.0,
     path: Model = None,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 1.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 1.0,
 ) -> "dict[str, Value]":
     """Slew until the beam meets something; brake, hold and withdraw.
 
@@ -451,8 +453,8 @@ def move(
         typer.Option("--robust", help="Bear frequencies that are wrong by 1 %; takes longer."),
     ] = False,
     path: Model = None,
-    rest_s: Rest = 1.0,
-    ring_down_s: RingDown = 5.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 5.0,
 ) -> "dict[str, Value]":
     """Move to an angle without leaving a vibration, and stay there.
 
@@ -506,7 +508,7 @@ def until(
         float, typer.Option("--stop-hz", help="Frequency where the scan ends (Hz).")
     ] = 52.0,
     scan_s: Annotated[float, typer.Option("--scan", help="Duration of the scan (s).")] = 5.0,
-    rest_s: Rest = 1.0,
+    rest_s: RestS = 1.0,
     uniformity_percent: Annotated[
         float | None,
         typer.Option(

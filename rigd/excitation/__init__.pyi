@@ -12,6 +12,8 @@ from ._named import make_excitation as make_excitation
 from ._narrow_sweeps import modes as modes
 from ._options import RIG_ARGUMENTS as RIG_ARGUMENTS
 from ._options import ExcitationOption as ExcitationOption
+from ._options import RestS as RestS
+from ._options import RingDownS as RingDownS
 from ._segment_search import SHORTEST_S as SHORTEST_S
 from ._segment_search import PrecisionForecast as PrecisionForecast
 from ._segment_search import Segment as Segment

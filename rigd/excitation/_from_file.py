@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from annotated_types import doc
 
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -44,8 +44,8 @@ def from_csv(
     ],
     *,
     rate_hz: Annotated[float, doc("Ticks a second.")],
-    rest_s: Annotated[float, doc("Time in s before the trajectory.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s after the trajectory.")] = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
 ) -> Excitation:
     """Return an excitation whose reference angles are read from a text file.
 

@@ -31,7 +31,7 @@ from rigd.beam import (
 )
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.documents import DocumentError, read_json
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
     Excitation,
@@ -462,8 +462,8 @@ def modes(
         ),
     ] = 1.0,
     duration_s: Annotated[float, doc("Total duration of all sweeps in s.")] = 120.0,
-    rest_s: Annotated[float, doc("Time in s before the sweeps.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s after the sweeps.")] = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Annotated[
         float,
         doc(

@@ -9,12 +9,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Annotated, Any, Final, TypeVar, get_args, get_origin
 
-from annotated_types import DocInfo
+from annotated_types import DocInfo, doc
 
 from rigd.units import unit_of
 
 F = TypeVar("F", bound=Callable[..., Any])
 """Type of a function that returns an excitation."""
+
+RestS = Annotated[float, doc("Rest before the excitation.")]
+"""Type of the option ``rest_s`` of every excitation: duration of the rest in s."""
+RingDownS = Annotated[float, doc("Ring-down after the excitation.")]
+"""Type of the option ``ring_down_s`` of every excitation: duration of the ring-down in s."""
 
 RIG_ARGUMENTS: Final = frozenset({"rate_hz", "rig", "tip_slope_rad"})
 """Names of arguments of these functions that are data or limits of the rig, not options of the

@@ -16,7 +16,7 @@ import numpy as np
 from annotated_types import doc
 from numpy.typing import NDArray
 
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.excitation._residual_vibration import predict_move_end
 from rigd.excitation._signals import (
     LIMIT_FRACTION,
@@ -625,8 +625,8 @@ def move(
             "longer. 0: the move is the shortest."
         ),
     ] = 0,
-    rest_s: Annotated[float, doc("Time in s before the move.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s after the move.")] = 5.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 5.0,
     rig: Annotated[MoveRig | None, doc("Rig that is moved.")] = None,
 ) -> Excitation:
     """Return the shortest move to another angle that leaves no vibration; the motor stays there.

@@ -10,7 +10,7 @@ from annotated_types import doc
 from numpy.typing import NDArray
 
 from rigd.errors import UserError
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.session import sweep_frequency_hz
 from rigd.session.limits import MAX_SAMPLES
 from rigd.units import is_usable_size
@@ -264,8 +264,8 @@ def chirp(
         float,
         doc("Duration T of a sweep in s; with ``there_and_back``, of each of the two sweeps."),
     ] = 120.0,
-    rest_s: Annotated[float, doc("Time in s before the sweep.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s after the sweep.")] = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Annotated[
         float,
         doc(
@@ -345,8 +345,8 @@ def hold(
     *,
     rate_hz: Annotated[float, doc("Ticks a second.")],
     duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 10.0,
-    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 0.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 0.0,
 ) -> Excitation:
     """Return an excitation that holds the start angle, to record noise and drift of the sensor.
 
@@ -373,8 +373,8 @@ def step(
     rate_hz: Annotated[float, doc("Ticks a second.")],
     amplitude_rad: Annotated[float, doc("Angle of the step, of either sign and not 0.")] = 0.025,
     duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 10.0,
-    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
 ) -> Excitation:
     """Return an excitation with a step of the reference angle at the sweep's first tick.
 
@@ -418,8 +418,8 @@ def multisine(
         doc("Period in s, a whole number of ticks. ``duration_s`` is a whole number of periods."),
     ] = 20.0,
     duration_s: Annotated[float, doc("Duration of the segment ``sweep`` in s.")] = 120.0,
-    rest_s: Annotated[float, doc("Time in s before and after this segment.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s before and after this segment.")] = 15.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 15.0,
     taper_s: Annotated[
         float,
         doc(

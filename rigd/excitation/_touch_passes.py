@@ -15,7 +15,7 @@ import numpy as np
 from annotated_types import doc
 from numpy.typing import NDArray
 
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, RingDownS, documented
 from rigd.excitation._shortest_move import MoveRig, shortest_braking
 from rigd.excitation._signals import (
     Excitation,
@@ -89,8 +89,8 @@ def touch(
             "fault. It is checked if the rig measures the base shear."
         ),
     ] = 10.0,
-    rest_s: Annotated[float, doc("Time in s before and after all passes.")] = 1.0,
-    ring_down_s: Annotated[float, doc("Time in s before and after all passes.")] = 1.0,
+    rest_s: RestS = 1.0,
+    ring_down_s: RingDownS = 1.0,
     path: Annotated[
         str | Path,
         doc(

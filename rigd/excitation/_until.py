@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.beam.tip import SMALL_SLOPE_RAD
 from rigd.excitation._beam_estimate import BeamEstimate
-from rigd.excitation._options import documented
+from rigd.excitation._options import RestS, documented
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
@@ -135,7 +135,7 @@ def until(
     start_hz: Annotated[float, doc("Lowest frequency of the scan.")] = 0.5,
     stop_hz: Annotated[float, doc("Highest frequency of the scan.")] = 52.0,
     scan_s: Annotated[float, doc("Duration of the scan in s.")] = 5.0,
-    rest_s: Annotated[float, doc("Time in s before the scan.")] = 1.0,
+    rest_s: RestS = 1.0,
     uniformity_percent: Annotated[
         float | None,
         doc(

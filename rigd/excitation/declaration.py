@@ -26,7 +26,8 @@ class ExcitationKind:
 
     Units are in the names; ranges and help (``annotated_types.doc``) are in ``Annotated``. The
     options ``duration_s``, ``rest_s`` and ``ring_down_s`` are required: the lengths of the segments
-    in seconds."""
+    in seconds; `rigd.excitation.RestS` and `rigd.excitation.RingDownS` are types of the last two,
+    with their help."""
     reference_rad: Callable[[Any, NDArray[np.float64]], NDArray[np.float64]]
     """Function of the options and the times in s since the start of the sweep, shape (n,).
 

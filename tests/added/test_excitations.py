@@ -47,6 +47,11 @@ def test_its_options_are_declared_for_the_form_and_the_command(packages):
     assert options["amplitude_rad"].help == "peak of the triangle"
     assert (options["amplitude_rad"].unit, options["amplitude_rad"].default) == ("rad", 0.01)
     assert options["rest_s"].value_type is float
+    for name in ("rest_s", "ring_down_s"):  # declared once for all
+        helps = {
+            each.help for kind in KINDS for each in excitation_options(kind) if each.name == name
+        }
+        assert helps == {options[name].help}
 
 
 def test_the_page_s_form_offers_it(packages, request):
@@ -102,7 +107,7 @@ WRONG = {  # code of a package, and the reason that is stated
     "type": ("TRIANGLE = 'triangle'", "is a str and no ExcitationKind"),
     "other": (EXCITATION, 'declares the excitation "triangle"'),
     "lacks": (
-        EXCITATION.replace('"triangle", "S', '"lacks", "S').replace("rest_s: float", "rest: float"),
+        EXCITATION.replace('"triangle", "S', '"lacks", "S').replace("rest_s: RestS", "rest: float"),
         "lack rest_s",
     ),
     "range": (

@@ -2,8 +2,10 @@
 
 import os
 import re
+import socket
 import subprocess
 import sys
+import threading
 import tomllib
 from pathlib import Path
 
@@ -35,7 +37,7 @@ def made(folder, name, *options):
 @pytest.mark.parametrize(
     ("options", "passed", "shown"),
     [
-        ((), 9, '# address of the instrument\nhost = "…"\n'),
+        ((), 10, '# address of the instrument\nhost = "…"\n'),
         (("--kind", "controller"), 8, '# In [control]: controller = "mypart"\n[mypart]\n'),
     ],
     ids=["device", "controller"],
@@ -90,6 +92,27 @@ def test_it_runs_as_its_page_says(
             assert chosen == 1
             profile.write_text(text + section)
     assert list(tmp_path.glob("sessions/*-chirp.mcap"))
+
+
+@pytest.mark.process
+def test_the_new_driver_reads_an_instrument_as_its_page_says(tmp_path):
+    (code,) = blocks("your_own_device", "python")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as instrument:
+        instrument.bind(("127.0.0.1", 0))
+        settings = f'host="127.0.0.1", port={instrument.getsockname()[1]}, timeout_us=1e6'
+        code = code.replace('host="192.168.1.20"', settings)
+
+        def answer_twice():
+            for _ in range(2):
+                instrument.sendto(b"1 2 3 4 5 6", instrument.recvfrom(16)[1])
+
+        answers = threading.Thread(target=answer_twice, daemon=True)
+        answers.start()
+        package = made(tmp_path / "own", "mysensor")
+        status, output, errors = rigd_with(package, program=("-P", "-c", code))
+        answers.join(10.0)
+    assert (status, errors) == (0, "")
+    assert output.startswith("(1.0, 2.0, 3.0, 4.0, 5.0, 6.0) False LineHealth(")
 
 
 def blocks(page, language):

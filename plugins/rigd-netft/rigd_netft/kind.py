@@ -6,7 +6,7 @@ from typing import Any, Final
 from rigd.devices.contracts import DeviceError, WrenchSensor
 from rigd.devices.declaration import DeviceKind, OpenedDrive
 from rigd.devices.parameters import RigParameters
-from rigd_netft.protocol import CUT_OFFS_HZ, rate_reached_hz
+from rigd_netft.protocol import rate_reached_hz
 from rigd_netft.settings import NetFtSettings
 
 
@@ -22,9 +22,9 @@ def open_sensor(rig: RigParameters, opened: OpenedDrive) -> WrenchSensor:
 
     settings = rig.settings_of(NetFtSettings)
     if opened.simulated_sensor is not None:
-        from rigd_netft.box import open_simulated_box
+        from rigd_netft.box import simulated_box
 
-        return open_simulated_box(rig, settings, opened.simulated_sensor)
+        return NetFtSensor(rig, settings, simulated_box(rig, settings, opened.simulated_sensor))
     if opened.simulated:
         raise DeviceError(
             f"{rig.name}: rigd simulate has no Net F/T box; end it to use the hardware, or choose "
@@ -49,10 +49,7 @@ def contradictions(values: Mapping[str, Any]) -> Iterator[str]:
             f"netft.rate_hz = {rate_hz:g} Hz is below twice rig.rate_hz = {loop_hz:g} Hz; there "
             "would be ticks without a record: choose 7000."
         )
-    if values["netft.filter_hz"] not in CUT_OFFS_HZ:
-        choices = ", ".join(map(str, sorted(CUT_OFFS_HZ)))
-        yield f"netft.filter_hz = {values['netft.filter_hz']} Hz is none of {choices}."
-    elif values["netft.filter_hz"] and values["netft.filter_hz"] != values["sensor.filter_hz"]:
+    if values["netft.filter_hz"] not in (0, values["sensor.filter_hz"]):
         yield (
             f"netft.filter_hz = {values['netft.filter_hz']} Hz delays the torque; state it as "
             "sensor.filter_hz, so that the analysis takes it into account, or choose 0."
@@ -79,18 +76,13 @@ def address(rig: RigParameters) -> str:
     return f"{settings.host}, UDP port {settings.port}"
 
 
-def stream_hz(rig: RigParameters) -> float:
-    """Return the records per second that the box streams."""
-    return rig.settings_of(NetFtSettings).rate_hz
-
-
 NETFT: Final = DeviceKind(
     name="netft",
     summary="ATI Net F/T box by RDT over UDP",
     open_sensor=open_sensor,
     settings=NetFtSettings,
     address=address,
-    stream_hz=stream_hz,
+    stream_hz=lambda rig: rig.settings_of(NetFtSettings).rate_hz,
     contradictions=contradictions,
     metadata=metadata,
 )

@@ -1,21 +1,26 @@
 """The box's web page: its settings, how they are read, set and checked."""
 
-import http.client
 import re
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from math import prod
+from typing import Final, get_args
+from urllib.parse import urlencode
 
 from rigd.devices.contracts import DeviceError
-from rigd_netft.protocol import CUT_OFFS_HZ, INTERNAL_HZ, NEWTON_METRES, NEWTONS
+from rigd_netft import protocol
 from rigd_netft.settings import NetFtSettings
 
 PAGE, COMMUNICATION, SETTING = "/netftapi2.xml", "/comm.cgi", "/setting.cgi"
 """Paths on the box: its settings, and the forms by which two groups of them are set."""
-_TIMEOUT_S = 2.0
-"""Longest time in seconds for a connection, and for each read from it."""
-_MAX_PAGE_BYTES = 1 << 16
-"""Largest size in bytes of a page that is read."""
-_TAG = re.compile(r"<(\w{1,32})>([^<]{0,400})</\1>")
+_TAG: Final = re.compile(r"<(\w{1,32})>([^<]{0,400})</\1>")
 """Pattern of a setting on the page."""
+_IDENTITY: Final = {
+    "serial_number": "cfgcalsn", "firmware": "mfgdigver", "calibration": "cfgcalsel",
+    "bias_counts": "setbias", "tool_transform": "cfgtfx", "mac_address": "nethwaddr",
+    "unit_of_force": "scfgfu", "unit_of_torque": "scfgtu",
+}  # fmt: skip
+"""Settings that the session file states, with their tags on the page."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,146 +29,108 @@ class BoxSettings:
 
     scales: tuple[float, ...]
     """N or N·m per count of each axis."""
-    is_axia: bool = False
-    """Whether the device is an Ethernet Axia, whose status bits have other meanings."""
-    counter_hz: float = INTERNAL_HZ
+    kind: protocol.BoxKind = protocol.NETFT
+    """Kind of box."""
+    counter_hz: float = protocol.INTERNAL_HZ
     """Rate in Hz of the box's own counter."""
-    identity: tuple[tuple[str, object], ...] = ()
-    """What the box reported, for the session file."""
+    identity: Mapping[str, object] = field(default_factory=dict)
+    """Identity and settings that the box reported, for the session file."""
 
 
-class BoxPage:
-    """Web page of a box, with error messages that name the box.
+def configure(settings: NetFtSettings, get: Callable[[str], str]) -> BoxSettings:
+    """Set rate, filter and bias where they differ from the profile, and read all back.
 
-    Parameters
-    ----------
-    settings
-        Settings of the profile.
-    name
-        Name of the box in messages.
+    `get` returns the answer to a request for a path, or raises OSError without one.
+
+    Raises
+    ------
+    DeviceError
+        If the page does not answer, or a value does not suit the profile.
     """
-
-    def __init__(self, settings: NetFtSettings, name: str) -> None:
-        self._settings, self._name = settings, name
-
-    def configure(self) -> BoxSettings:
-        """Set rate, filter and bias where they differ from the profile, and read all back.
-
-        Raises
-        ------
-        DeviceError
-            If the page does not answer, or a value does not suit the profile.
-        """
-        settings, tags = self._settings, self.read()
-        wanted = {"comrdte": "Enabled", "comrdtrate": f"{settings.rate_hz:g}", "comrdtbsiz": "1"}
-        if not _agrees(tags, wanted):  # all in one request: a box drops some of several
-            self._get(_query(COMMUNICATION, wanted | {"comrdte": "1"}))
-        wanted_setting = {"setuserfilter": str(CUT_OFFS_HZ.index(settings.filter_hz))}
-        zero_bias = {f"setbias{axis}": "0" for axis in range(6)}
-        set_bias = settings.bias == "zero" and any(_numbers(tags.get("setbias", "")))
-        if set_bias or not _agrees(tags, wanted_setting):
-            self._get(_query(SETTING, wanted_setting | (zero_bias if set_bias else {})))
-        tags = self.read()
-        for key, value in (wanted | wanted_setting).items():
-            if key in tags and not _agrees(tags, {key: value}):
-                self._refuse(key, tags[key], f"{value} was set", "set it on the page of the box")
-        if settings.bias == "zero" and any(_numbers(tags.get("setbias", ""))):
-            self._refuse("setbias", tags["setbias"], "zero was set", "clear it on the page")
-        transform = _numbers(tags.get("cfgtfx", ""))
-        if transform and tuple(transform) != settings.tool_transform:
-            self._refuse(
-                "cfgtfx", tags["cfgtfx"], f"netft.tool_transform is {settings.tool_transform}",
-                "correct the tool transformation in the box or in the profile",
-            )  # fmt: skip
-        serial = tags.get("cfgcalsn", "")
-        if settings.serial_number and serial != settings.serial_number:
-            self._refuse(
-                "cfgcalsn", serial, f"netft.serial_number is {settings.serial_number}",
-                "connect the sensor of the profile, or correct the profile",
-            )  # fmt: skip
-        return self._box_settings(tags)
-
-    def read(self) -> dict[str, str]:
-        """Return the settings on the page by their tags."""
-        tags = dict(_TAG.findall(self._get(PAGE)))
-        if not {"cfgcpf", "cfgcpt"} <= tags.keys():
-            raise DeviceError(f"{self._name}: its page {PAGE} has no counts per force and torque.")
-        return {key: value.strip() for key, value in tags.items()}
-
-    def _box_settings(self, tags: dict[str, str]) -> BoxSettings:
-        """Return scales, kind and identity from the settings on the page."""
-        scales = []
-        for count_tag, unit_tags, units in (
-            ("cfgcpf", ("scfgfu", "cfgfu"), NEWTONS),
-            ("cfgcpt", ("scfgtu", "cfgtu"), NEWTON_METRES),
-        ):
-            unit_tag = next((tag for tag in unit_tags if tag in tags), unit_tags[0])
-            unit = re.sub(r"[^a-z]", "", tags.get(unit_tag, "").lower())
-            if unit not in units:
-                self._refuse(unit_tag, tags.get(unit_tag, ""), "unknown unit", "choose another")
-            counts = _numbers(tags[count_tag])
-            if len(counts) != 1 or not counts[0] > 0:
-                self._refuse(count_tag, tags[count_tag], "no number above 0", "check the box")
-            scales.append(units[unit] / counts[0])
-        per_axis = (scales[0],) * 3 + (scales[1],) * 3
-        ratings, counter_hz = _numbers(tags.get("cfgmr", "")), _numbers(tags.get("runrate", ""))
-        counts_per_unit = (_numbers(tags["cfgcpf"])[0],) * 3 + (_numbers(tags["cfgcpt"])[0],) * 3
-        identity: dict[str, object] = {
-            "serial_number": tags.get("cfgcalsn", ""), "firmware": tags.get("mfgdigver", ""),
-            "calibration": tags.get("cfgcalsel", ""), "bias_counts": tags.get("setbias", ""),
-            "tool_transform": tags.get("cfgtfx", ""), "mac_address": tags.get("nethwaddr", ""),
-            "unit_of_force": tags.get("scfgfu", ""), "unit_of_torque": tags.get("scfgtu", ""),
-        }  # fmt: skip
-        if len(ratings) == 6:
-            identity["range"] = [
-                rating * counts * scale
-                for rating, counts, scale in zip(ratings, counts_per_unit, per_axis, strict=True)
-            ]
-        is_axia = "axia" in tags.get("prodname", "").lower() or bool(
-            {"setadcrate", "setrate"} & tags.keys()
-        )
-        return BoxSettings(
-            per_axis, is_axia, counter_hz[0] if counter_hz and counter_hz[0] > 0 else INTERNAL_HZ,
-            tuple(identity.items()),
+    if settings.counts_per_n > 0:
+        scales = (1 / settings.counts_per_n,) * 3 + (1 / settings.counts_per_nm,) * 3
+        assumed = {"assumed": "counts, N and N·m, rate and filter of netft"}
+        return BoxSettings(scales, identity=assumed)
+    communication = {
+        "comrdte": "Enabled", "comrdtrate": f"{settings.rate_hz:g}", "comrdtbsiz": "1"
+    }  # fmt: skip
+    setting = {"setuserfilter": str(get_args(protocol.CutOffHz).index(settings.filter_hz))}
+    if settings.bias == "zero":
+        setting |= {f"setbias{axis}": "0" for axis in range(6)}
+    try:
+        tags = _tags(get(PAGE))
+        for form, values in ((COMMUNICATION, communication), (SETTING, setting)):
+            if not all(_agrees(tags, *each) for each in values.items()):
+                # All in one request: a box drops some of several. The form has 1 for Enabled.
+                get(f"{form}?{urlencode(values).replace('Enabled', '1')}")
+        tags = _tags(get(PAGE))
+    except OSError as error:
+        raise DeviceError(
+            f"{settings.box_name}: its web page http://{settings.host}:{settings.http_port}{PAGE} "
+            f"does not answer ({error}). Check address and cable; for a box without a page, state "
+            "netft.counts_per_n and netft.counts_per_nm."
+        ) from error
+    try:
+        for tag, value in (communication | setting).items():
+            _require(_agrees(tags, tag, value), tags, tag, f"{value} was set; set it on the page")
+        _require(
+            _agrees(tags, "cfgtfx", ";".join(map(str, settings.tool_transform))), tags, "cfgtfx",
+            f"netft.tool_transform is {settings.tool_transform}; correct the one or the other",
         )  # fmt: skip
-
-    def _refuse(self, tag: str, found: str, why: str, remedy: str) -> None:
-        """Raise the error for a setting that does not suit the profile."""
-        raise DeviceError(f'{self._name}: its setting {tag} is "{found}", but {why}; {remedy}.')
-
-    def _get(self, path: str) -> str:
-        """Return the answer of the box to a request for a path."""
-        settings = self._settings
-        connection = http.client.HTTPConnection(settings.host, settings.http_port, _TIMEOUT_S)
-        try:
-            connection.request("GET", path)
-            answer = connection.getresponse()
-            content = answer.read(_MAX_PAGE_BYTES).decode("utf-8", errors="replace")
-        except (OSError, http.client.HTTPException) as error:
-            raise DeviceError(
-                f"{self._name}: its web page http://{settings.host}:{settings.http_port}{path} "
-                f"does not answer ({error}). Check address and cable; for a box without a page, "
-                "state netft.counts_per_n and netft.counts_per_nm."
-            ) from error
-        finally:
-            connection.close()
-        if answer.status not in (200, 302):
-            raise DeviceError(f"{self._name}: {path} was answered with HTTP {answer.status}.")
-        return content
+        _require(
+            settings.serial_number in ("", tags.get("cfgcalsn")), tags, "cfgcalsn",
+            f"netft.serial_number is {settings.serial_number}; connect the sensor of the profile, "
+            "or correct the profile",
+        )  # fmt: skip
+        return _box_settings(tags)
+    except ValueError as error:
+        raise DeviceError(f"{settings.box_name}: its setting {error}.") from error
 
 
-def _query(path: str, values: dict[str, str]) -> str:
-    """Return the path that sets values by a form of the page."""
-    return f"{path}?" + "&".join(f"{key}={value}" for key, value in values.items())
+def _tags(page: str) -> dict[str, str]:
+    """Return the settings on a page by their tags; the bias also by axis, as in the form."""
+    tags = {tag: value.strip() for tag, value in _TAG.findall(page)}
+    offsets = tags.get("setbias", "").split(";")
+    return tags | {f"setbias{axis}": counts for axis, counts in enumerate(offsets) if counts}
 
 
-def _agrees(tags: dict[str, str], wanted: dict[str, str]) -> bool:
-    """Return whether settings on the page have the wanted values; absent ones are not compared."""
-    return all(
-        tags.get(key, value).lower() == value.lower()
-        or (_numbers(tags[key]) == _numbers(value) != [])
-        for key, value in wanted.items()
+def _box_settings(tags: Mapping[str, str]) -> BoxSettings:
+    """Return scales, kind and identity from the settings on the page."""
+    counts, scales = list[float](), list[float]()
+    for tag, unit_tags, units in (
+        ("cfgcpf", ("scfgfu", "cfgfu"), protocol.NEWTONS),
+        ("cfgcpt", ("scfgtu", "cfgtu"), protocol.NEWTON_METRES),
+    ):
+        unit_tag = next((each for each in unit_tags if each in tags), unit_tags[0])
+        unit = protocol.unit_key(tags.get(unit_tag, ""))
+        _require(unit in units, tags, unit_tag, "unknown unit; choose another")
+        per_unit = _numbers(tags.get(tag, ""))
+        positive = len(per_unit) == 1 and per_unit[0] > 0
+        _require(positive, tags, tag, "no number above 0; check the box")
+        counts += 3 * per_unit
+        scales += 3 * [units[unit] / per_unit[0]]
+    identity: dict[str, object] = {name: tags.get(tag, "") for name, tag in _IDENTITY.items()}
+    ratings = _numbers(tags.get("cfgmr", ""))
+    if len(ratings) == 6:
+        identity["range"] = list(map(prod, zip(ratings, counts, scales, strict=True)))
+    counter_hz = max(0.0, *_numbers(tags.get("runrate", "0"))) or protocol.INTERNAL_HZ
+    is_axia = (
+        "axia" in tags.get("prodname", "").lower() or "setadcrate" in tags or "setrate" in tags
     )
+    kind = protocol.AXIA if is_axia else protocol.NETFT
+    return BoxSettings(tuple(scales), kind, counter_hz, identity)
+
+
+def _require(suits: bool, tags: Mapping[str, str], tag: str, reason: str) -> None:
+    """Raise ValueError for a setting that does not suit."""
+    if not suits:
+        raise ValueError(f'{tag} is "{tags.get(tag, "")}", but {reason}')
+
+
+def _agrees(tags: Mapping[str, str], tag: str, wanted: str) -> bool:
+    """Return whether a setting has the wanted value; an absent one is not compared."""
+    found = tags.get(tag, wanted)
+    return found.lower() == wanted.lower() or _numbers(found) == _numbers(wanted) != []
 
 
 def _numbers(text: str) -> list[float]:

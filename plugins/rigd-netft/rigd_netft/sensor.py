@@ -1,114 +1,146 @@
-"""Driver of a Net F/T box: newest record of its stream, its age, and what was lost on the way."""
+"""Driver of a Net F/T box: its line, newest record of its stream, its age, and what was lost."""
 
 import contextlib
-import select
+import http.client
 import socket
 import time
-from collections.abc import Callable
+from math import inf
 from operator import mul
 from struct import Struct
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 from rigd.devices.contracts import DeviceError, LineHealth, Wrench
 from rigd.devices.parameters import RigParameters
 from rigd_netft import protocol
-from rigd_netft.pages import BoxPage, BoxSettings
+from rigd_netft.pages import BoxSettings, configure
 from rigd_netft.settings import NetFtSettings
 
+if TYPE_CHECKING:
+    from rigd_netft.box import SimulatedBox
+
+_TIMEOUT_S = 2.0
+"""Longest time in seconds for a connection to the page, and for each read from it."""
+_MAX_PAGE_BYTES = 1 << 16
+"""Largest size in bytes of a page that is read."""
 _BUFFER_BYTES = 4 << 20
 """Requested size of the kernel's buffer; the usual 212 992 bytes hold 256 small packets only."""
 _MAX_PACKETS_PER_TICK = 1024
 """Most packets that are read in a tick, so that a flood does not stop the loop."""
 _START_ATTEMPTS, _START_WAIT_S = 10, 0.2
-"""Number of start requests, each of which can be lost, and the wait for a record after each."""
+"""Number of start requests, each of which can be lost, and the wait for records after each."""
 _FIRST_RECORDS = 8
 """Number of records from which the rate is checked."""
 _MAX_FIRST_SEQUENCE = 1000
 """Largest sequence number of a stream that has just been started; older streams are beyond."""
-_CLOCK_WINDOW_NS = 2_000_000_000
-"""Time in ns over which the clocks are compared; a difference of 100 ppm makes 0.2 ms in it."""
+_MAX_DRIFT = 1e-4
+"""Largest difference of the rates of two clocks, of box and computer."""
 _MAX_AGE_PERIODS = 2.0
 """Age of a record, in periods of the loop, above which it counts as stale."""
-_COUNTER_JITTER = 1
-"""Largest deviation of the counter from its step, as it is rounded."""
 _COUNTED = ("lost", "duplicates", "out_of_order", "malformed", "restarts")
 """What is counted of a stream."""
-_NEVER_NS = 1 << 62
-"""Offset of the clocks in ns that no comparison gives."""
-_FRAME_BITS = 8 * (14 + 20 + 8 + protocol.RECORD.size + 4)
+_RECORD_BYTES: Final = protocol.RECORD.size
+_FRAME_BITS: Final = 8 * (14 + 20 + 8 + _RECORD_BYTES + 4)
 """Bits of a packet with one record on Ethernet."""
+_unpack_head: Final = Struct(">III").unpack_from
+"""Function that returns the first three numbers of a record: sequence, counter, status."""
+
+
+class NetworkLine:
+    """Line to a box on the network."""
+
+    def __init__(self, settings: NetFtSettings) -> None:
+        self._settings = settings
+        self._socket: socket.socket | None = None
+
+    def get(self, path: str) -> str:
+        """Return the answer to a request for a path of the page; raise OSError without one."""
+        settings = self._settings
+        connection = http.client.HTTPConnection(settings.host, settings.http_port, _TIMEOUT_S)
+        try:
+            connection.request("GET", path)
+            answer = connection.getresponse()
+            content = answer.read(_MAX_PAGE_BYTES)
+        except http.client.HTTPException as error:
+            raise OSError(str(error)) from error
+        finally:
+            connection.close()
+        if answer.status not in (200, 302):
+            raise OSError(f"HTTP status {answer.status}")
+        return content.decode("utf-8", errors="replace")
+
+    def open(self) -> None:
+        """Open the socket for requests and records."""
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
+        self._socket.setblocking(False)
+        # Connected, the kernel drops packets from elsewhere.
+        self._socket.connect((self._settings.host, self._settings.port))
+
+    def send(self, request: bytes) -> None:
+        """Send a request; nothing tells whether it arrives."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # nobody listens there: no record will come
+                self._socket.send(request)
+
+    def receive(self, _due_ns: int) -> tuple[list[bytes], int]:
+        """Return the packets that have arrived, so that none waits for a later tick, and the time.
+
+        The argument is for a simulated box.
+        """
+        assert self._socket is not None
+        receive, packets = self._socket.recv, list[bytes]()
+        try:
+            while len(packets) < _MAX_PACKETS_PER_TICK:
+                packets.append(receive(64))
+        except OSError:  # nothing is there, or the box answered that its port is closed
+            pass
+        return packets, time.monotonic_ns()
+
+    def close(self) -> None:
+        """Release the socket; never raises."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
 
 class NetFtSensor:
-    """Force-torque sensor behind a Net F/T box.
-
-    Parameters
-    ----------
-    rig
-        Parameters of the rig.
-    settings
-        Section ``[netft]`` of its profile.
-    on_request
-        Function that advances a simulated box and returns the number of its packets; None: a box
-        that streams by itself.
-    """
+    """Force-torque sensor behind a Net F/T box; `counts` has the errors of its stream."""
 
     def __init__(
         self,
         rig: RigParameters,
         settings: NetFtSettings,
-        on_request: Callable[[], int] | None = None,
+        simulated_box: "SimulatedBox | None" = None,
     ) -> None:
-        self._settings, self._on_request = settings, on_request
-        self._name = f"Net F/T box at {settings.host}"
-        self._socket: socket.socket | None = None
+        self._settings, self._line = settings, simulated_box or NetworkLine(settings)
         self._box = BoxSettings((1.0,) * 6)
-        self._buffer, self._newest = bytearray(2048), bytearray(2048)
-        self._step = 1.0
         self._period_ns = 1e9 / rig.rate_hz
         self.wrench_stale, self.wrench_saturated, self.wrench_time_ns = True, False, 0
-        self._status = self._due_ns = 0
+        self._status = 0
         self._wrench: Wrench = (0.0,) * 6
         self._forget_stream()
 
     def _forget_stream(self) -> None:
         """Forget records, counts and clock of an earlier stream."""
         self.counts = dict.fromkeys(_COUNTED, 0)
-        self._records = self._statuses = self._count = 0
-        self._is_new = False
-        self._first: tuple[int, int] | None = None
-        self._last: tuple[int, int] | None = None
-        self._candidate: tuple[int, int] | None = None
-        self._window, self._offsets_ns = -1, (_NEVER_NS, _NEVER_NS)
-
-    # Contract of a sensor
+        self._records = self._statuses = self._due_ns = 0
+        self._counted = self._before_first = 0  # rise of the counter; sequence before the first
+        self._last = 0, 0  # sequence and counter of the newest record
+        self._candidate: int | None = None  # sequence of a record that does not fit
+        self._newest = b""  # until it is read
+        self._box_ns, self._offset_ns = 0, inf  # clock of the box, and what this one is ahead
 
     def connect(self) -> None:
         """Read and set the box's settings, start its stream, and check status and rate."""
-        settings = self._settings
-        if settings.counts_per_n > 0:
-            per_axis = (1 / settings.counts_per_n,) * 3 + (1 / settings.counts_per_nm,) * 3
-            assumed = (("assumed", "counts, N and N·m, rate and filter of netft"),)
-            self._box = BoxSettings(per_axis, identity=assumed)
-        else:
-            self._box = BoxPage(settings, self._name).configure()
-        if self._box.is_axia:
-            self._bits, self._saturated = protocol.AXIA_BITS, protocol.AXIA_SATURATED
-        else:
-            self._bits, self._saturated = protocol.NETFT_BITS, protocol.SATURATED
-        self._no_fault = self._saturated | protocol.ANY_ERROR | protocol.THRESHOLD
-        self._step = self._box.counter_hz / settings.rate_hz
-        self._ns_per_count = 1e9 / self._box.counter_hz
         try:
-            # Connected, the kernel drops packets from elsewhere.
-            self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
-            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BUFFER_BYTES)
-            self._socket.setblocking(False)
-            self._socket.connect((settings.host, settings.port))
+            self._box = configure(self._settings, self._line.get)
+            self._step = self._box.counter_hz / self._settings.rate_hz
+            self._line.open()
             self._start()
+            self.read_wrench()
         except OSError as error:
             self.close()
-            raise DeviceError(f"{self._name}: {error}; check address and cable.") from error
+            raise self._error(f"{error}; check address and cable.") from error
         except DeviceError:
             self.close()
             raise
@@ -116,223 +148,161 @@ class NetFtSensor:
     def calibration(self) -> dict[str, object]:
         """Return identity and settings that the box reported."""
         return {
-            "device": "Axia" if self._box.is_axia else "Net F/T",
-            **dict(self._box.identity),
+            "device": self._box.kind.device,
+            **self._box.identity,
             "records_hz": self._settings.rate_hz,
             "filter_hz": self._settings.filter_hz,
-            "status": protocol.status_texts(self._status, self._bits),
+            "status": self._box.kind.status_texts(self._status),
             "scales_n_nm": list(self._box.scales),
         }
 
     def request(self, due_ns: int) -> None:
-        """Note the time of the tick: the box streams by itself, unless it is simulated."""
+        """Note the time of the tick: the box streams by itself."""
         self._due_ns = due_ns
-        if self._on_request is not None:
-            self._wait_for(self._on_request())
 
     def read_wrench(self) -> Wrench:
         """Return the wrench of the newest record, after all that have arrived were read."""
-        self._drain()
-        if not self._is_new:
+        now_ns = self._read()
+        if not self._newest:
             self.wrench_stale = True
             return self._wrench
-        self._is_new = False
-        status, self._statuses = self._statuses, 0
-        self._status = status
-        if status & ~self._no_fault:
-            texts = "; ".join(protocol.status_texts(status & ~self._no_fault, self._bits))
-            raise DeviceError(f"{self._name}: its status {status:#010x} reports {texts}.")
-        self.wrench_saturated = bool(status & self._saturated)
-        fx, fy, fz, tx, ty, tz = map(
-            mul, protocol.RECORD.unpack_from(self._newest)[3:], self._box.scales
-        )
+        _, _, _, *counts = protocol.RECORD.unpack(self._newest)
+        self._newest = b""
+        kind, self._status, self._statuses = self._box.kind, self._statuses, 0
+        harmful = self._status & ~(kind.saturated | protocol.ANY_ERROR | protocol.THRESHOLD)
+        if harmful:
+            texts = "; ".join(kind.status_texts(harmful))
+            raise self._error(f"its status {self._status:#010x} reports {texts}.")
+        self.wrench_saturated = self._status & kind.saturated != 0
+        fx, fy, fz, tx, ty, tz = map(mul, counts, self._box.scales)
         self._wrench = fx, fy, fz, tx, ty, tz
-        now_ns = self._due_ns if self._on_request is not None else time.monotonic_ns()
         self.wrench_time_ns = self._time_ns(now_ns)
         self.wrench_stale = now_ns - self.wrench_time_ns > _MAX_AGE_PERIODS * self._period_ns
         return self._wrench
 
     def health(self) -> LineHealth:
         """Return errors of the stream, and the box's last status word."""
+        silent = (
+            f"{self._settings.box_name} sends no records: it is off or its cable is unplugged, or "
+            "another program has started a stream, which ends this one; close that program."
+        )
         return LineHealth(
             bits=self._records * _FRAME_BITS,
             bit_rate_bit_s=100e6,
             errors=sum(self.counts.values()),
             status=self._status,
-            cause=(
-                f"{self._name} sends no records: it is off or its cable is unplugged, or another "
-                "program has started a stream, which ends this one; close that program."
-                if self.wrench_stale
-                else ""
-            ),
+            cause=silent if self.wrench_stale else "",
         )
 
     def close(self) -> None:
-        """End the stream and release the socket; never raises."""
-        if self._socket is not None:
-            self._send(protocol.STOP)
-            self._socket.close()
-            self._socket = None
+        """End the stream and release the line; never raises."""
+        self._line.send(protocol.STOP)
+        self._line.close()
 
     def measure(self, duration_s: float) -> dict[str, float]:
         """Read the stream for a time; return its rate, longest gap and errors."""
-        self._drain()
-        records, before = self._records, dict(self.counts)
+        self._read()
+        records, before = self._records, self.counts.copy()
         start_s = last_s = now_s = time.monotonic()
         longest_s = 0.0
         while now_s < start_s + duration_s:
-            self._wait(start_s + duration_s - now_s)
-            self._drain()
+            time.sleep(1e-4)
+            known = self._records
+            self._read()
             now_s = time.monotonic()
-            longest_s, last_s = max(longest_s, now_s - last_s), now_s
+            if self._records > known:
+                longest_s, last_s = max(longest_s, now_s - last_s), now_s
         rate_hz = (self._records - records) / (now_s - start_s)
         errors = {name: self.counts[name] - before[name] for name in _COUNTED}
         return {"records_hz": rate_hz, "longest_gap_s": longest_s, **errors}
 
-    # Stream
-
     def _start(self) -> None:
         """Start the stream, and check that records of the profile's rate come without a fault."""
         for _ in range(_START_ATTEMPTS):
-            self._send(protocol.STOP)
-            self._drain()  # records of an earlier stream
+            self._line.send(protocol.STOP)
+            self._line.receive(0)  # records of an earlier stream
             self._forget_stream()
-            self._send(protocol.STREAM)
+            self._line.send(protocol.STREAM)
             deadline_s = time.monotonic() + _START_WAIT_S
-            while time.monotonic() < deadline_s and self._records < _FIRST_RECORDS:
-                if self._on_request is not None:
-                    self._wait_for(self._on_request())
-                self._wait(_START_WAIT_S)
-                self._drain()
-            if (
-                self._last is not None
-                and self._first != self._last
-                and self._last[0] <= _MAX_FIRST_SEQUENCE
-            ):
+            while self._records < _FIRST_RECORDS and time.monotonic() < deadline_s:
+                time.sleep(1e-3)
+                self._read()
+            records = protocol.difference(self._last[0], self._before_first)
+            if records > 1 and self._last[0] <= _MAX_FIRST_SEQUENCE:
                 break
         else:
-            raise DeviceError(
-                f"{self._name}: no record came after {_START_ATTEMPTS} requests for its stream. "
-                "Check that RDT is enabled, and that no firewall drops UDP from its port "
-                f"{self._settings.port}."
+            raise self._error(
+                f"no record came after {_START_ATTEMPTS} requests for its stream. Check that RDT "
+                f"is enabled, and that no firewall drops UDP from its port {self._settings.port}."
             )
-        assert self._first is not None
-        records = protocol.difference(self._last[0], self._first[0])
-        counted = protocol.difference(self._last[1], self._first[1])
-        if abs(counted - records * self._step) > 1:
-            raise DeviceError(
-                f"{self._name}: its counter rises by {counted} in {records} records, so it does "
-                f"not send {self._settings.rate_hz:g} records per second; correct netft.rate_hz or "
-                "the rate in the box."
+        if abs(self._counted - records * self._step) > 1:
+            raise self._error(
+                f"its counter rises by {self._counted} in {records} records, so it does not send "
+                f"{self._settings.rate_hz:g} records per second; correct netft.rate_hz or the rate "
+                "in the box."
             )
-        self.read_wrench()
-        if self._on_request is not None:  # its clock is that of the ticks, which have not begun
-            self._offsets_ns = _NEVER_NS, _NEVER_NS
 
-    def _send(self, command: int) -> None:
-        """Send a request; nothing tells whether it arrives."""
-        assert self._socket is not None
-        with contextlib.suppress(OSError):  # nobody listens there: no record will come
-            self._socket.send(protocol.request(command))
-
-    def _wait(self, timeout_s: float) -> None:
-        """Wait until a packet is there, or a time has passed."""
-        assert self._socket is not None
-        select.select([self._socket], [], [], max(0.0, timeout_s))
-
-    def _wait_for(self, packets: int) -> None:
-        """Read the packets that a simulated box has just sent."""
-        for _ in range(packets):
-            self._wait(_START_WAIT_S)
-            self._drain(1)
-
-    def _drain(self, max_packets: int = _MAX_PACKETS_PER_TICK) -> None:
-        """Read the packets that have arrived, so that none waits for a later tick."""
-        assert self._socket is not None
-        receive, head, step = self._socket.recv_into, _HEAD.unpack_from, self._step
-        for _ in range(max_packets):
-            try:
-                size = receive(self._buffer)
-            except OSError:  # nothing is there, or the box answered that its port is closed
-                return
-            if size == protocol.RECORD.size and self._last is not None:
-                sequence, counter, status = head(self._buffer)
-                last_sequence, last_counter = self._last
-                rise = counter - last_counter
-                if sequence - last_sequence == 1 and -1 <= rise - step <= 1:  # as nearly always
-                    self._records += 1
-                    self._count += rise
-                    self._last = sequence, counter
-                    self._statuses |= status
-                    self._is_new = True
-                    self._buffer, self._newest = self._newest, self._buffer
-                    continue
-            if size == 0 or size % protocol.RECORD.size:
-                self.counts["malformed"] += 1
-                continue
-            for offset in range(0, size, protocol.RECORD.size):
-                self._take(offset)
-
-    def _take(self, offset: int) -> None:
-        """Count a record, and keep it if it is the newest.
+    def _read(self) -> int:
+        """Count the records that have arrived, store the newest, and return the time in ns.
 
         The box's counter decides: it rises by the same step with each record of a stream. A record
         that does not fit belongs to another stream, or the box was restarted; it is believed when
         the next record follows it.
         """
-        sequence, counter, status = _HEAD.unpack_from(self._buffer, offset)
-        self._records += 1
-        last, candidate = self._last, self._candidate
-        if last is None:
-            self._first = sequence, counter
-            self._adopt(sequence, counter, status, offset)
-            return
-        ahead = protocol.difference(sequence, last[0])
-        if abs(protocol.difference(counter, last[1]) - ahead * self._step) <= _COUNTER_JITTER:
-            if ahead > 0:
-                self.counts["lost"] += ahead - 1
-                self._adopt(sequence, counter, status, offset)
-            elif ahead == 0:
-                self.counts["duplicates"] += 1
-            else:  # it had been counted as lost
-                self.counts["out_of_order"] += 1
-                self.counts["lost"] -= 1
-            return
-        self._candidate = sequence, counter
-        if candidate is None or protocol.difference(sequence, candidate[0]) != 1:
-            return
+        packets, now_ns = self._line.receive(self._due_ns)
+        counts, step, difference = self.counts, self._step, protocol.difference
+        last_sequence, last_counter = self._last
+        for packet in packets:
+            if len(packet) != _RECORD_BYTES:
+                counts["malformed"] += 1
+                continue
+            sequence, counter, status = _unpack_head(packet)
+            if not self._records:
+                self._before_first = last_sequence = sequence - 1
+                last_counter = counter - round(step)
+            self._records += 1
+            ahead, rise = sequence - last_sequence, counter - last_counter
+            if ahead != 1 or not -1 <= rise - step <= 1:  # the counter is rounded
+                ahead, rise = difference(ahead, 0), difference(rise, 0)
+                if not -1 <= rise - ahead * step <= 1:
+                    if not self._is_restarted(sequence, rise):
+                        continue
+                elif ahead > 1:
+                    counts["lost"] += ahead - 1
+                elif ahead < 1:
+                    counts["out_of_order" if ahead else "duplicates"] += 1
+                    counts["lost"] -= ahead < 0  # as which it had been counted
+                    continue
+            self._counted += rise
+            self._statuses |= status
+            self._newest = packet
+            last_sequence, last_counter = sequence, counter
+        self._last = last_sequence, last_counter
+        return now_ns
+
+    def _is_restarted(self, sequence: int, rise: int) -> bool:
+        """Return whether a record that does not fit follows another one, as in a new stream."""
+        candidate, self._candidate = self._candidate, sequence
+        if candidate is None or protocol.difference(sequence, candidate) != 1:
+            return False
         self.counts["restarts"] += 1
         self._candidate = None
-        if protocol.difference(counter, last[1]) < 0:
-            raise DeviceError(
-                f"{self._name} has restarted; its bias may have changed. Start a new session."
-            )
-        self._adopt(sequence, counter, status, offset)
-
-    def _adopt(self, sequence: int, counter: int, status: int, offset: int) -> None:
-        """Take a record as the newest."""
-        if self._last is not None:
-            self._count += protocol.difference(counter, self._last[1])
-        self._last = sequence, counter
-        self._statuses |= status
-        self._is_new = True
-        record = self._buffer[offset : offset + protocol.RECORD.size]
-        self._newest[: protocol.RECORD.size] = record
+        if rise < 0:
+            raise self._error("it has restarted; its bias may have changed. Start a new session.")
+        return True
 
     def _time_ns(self, now_ns: int) -> int:
         """Return when the newest record was sampled, by the box's counter, on this clock.
 
-        The record that arrived soonest within the last seconds fixes the offset of the clocks;
-        others were delayed on the way. The constant part of the delay is sensor.delay_s.
+        The record that arrived soonest fixes the offset of the clocks; others were delayed on the
+        way. The offset may grow as slowly as clocks drift apart. The constant part of the delay is
+        sensor.delay_s.
         """
-        box_ns = round(self._count * self._ns_per_count)
-        offset_ns = now_ns - box_ns
-        if box_ns // _CLOCK_WINDOW_NS != self._window:
-            self._window = box_ns // _CLOCK_WINDOW_NS
-            self._offsets_ns = self._offsets_ns[1], offset_ns
-        self._offsets_ns = self._offsets_ns[0], min(self._offsets_ns[1], offset_ns)
-        return box_ns + min(self._offsets_ns)
+        box_ns = round(self._counted * 1e9 / self._box.counter_hz)
+        drifted_ns = self._offset_ns + _MAX_DRIFT * (box_ns - self._box_ns)
+        self._box_ns, self._offset_ns = box_ns, min(drifted_ns, now_ns - box_ns)
+        return round(box_ns + self._offset_ns)
 
-
-_HEAD: Final = Struct(">III")
-"""First three numbers of a record: sequence, counter, status."""
+    def _error(self, text: str) -> DeviceError:
+        """Return an error that names the box."""
+        return DeviceError(f"{self._settings.box_name}: {text}")

@@ -5,7 +5,7 @@ from typing import Annotated, Literal
 
 from annotated_types import Ge, Gt, Le, MinLen, doc
 
-from rigd_netft.protocol import PORT
+from rigd_netft.protocol import PORT, CutOffHz
 
 
 @dataclass(frozen=True, slots=True)
@@ -16,7 +16,7 @@ class NetFtSettings:
     rate_hz: Annotated[
         float, Gt(0), Le(7000), doc("records per second: 7000 over a whole number")
     ] = 7000.0
-    filter_hz: Annotated[int, Ge(0), doc("cut-off of the box's low-pass filter; 0: none")] = 0
+    filter_hz: Annotated[CutOffHz, doc("cut-off of the box's low-pass filter; 0: none")] = 0
     bias: Annotated[
         Literal["keep", "zero"], doc("whether the box keeps its bias or it is set to zero")
     ] = "keep"
@@ -36,3 +36,8 @@ class NetFtSettings:
     faults: Annotated[
         tuple[str, ...], doc("faults of a simulated box, such as loss=0.01 or silence@2")
     ] = ()
+
+    @property
+    def box_name(self) -> str:
+        """Name of the box in messages."""
+        return f"Net F/T box at {self.host}"

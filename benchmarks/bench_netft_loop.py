@@ -1,0 +1,177 @@
+"""What the Net F/T box costs the control loop: lateness, work of a tick, and processor time.
+
+    python benchmarks/bench_netft_loop.py [SECONDS] [ROUNDS]
+
+A simulated box streams 7000 records a second from a process of its own, on the cores that are not
+the loop's. In each round, in changing order, four whole real-time sessions of the simulated rig:
+its own sensor alone; the same while the box streams to a socket that nobody reads, which is what
+the box itself disturbs; the driver of the box as the sensor; and the driver with the box that is
+simulated in its process. Ratios are of each round, and their median counts, because a computer
+with two cores and other users is never quiet.
+"""
+
+import os
+import socket
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+
+from rigd_netft.protocol import STOP, STREAM
+from rigd_netft.settings import NetFtSettings
+
+from rigd.bench import _loops as loops
+from rigd.bench import cores_without_loop
+from rigd.bench.measure import LoopMeasurement, percentiles
+from rigd.checks.machine import settings_granted
+from rigd.profile import Profile, load_profile
+from rigd.runtime import use_one_thread
+
+RATE_HZ = 1000.0
+ALONE, STREAMING, READ, SIMULATED = "no box", "box not read", "box read", "box simulated"
+MAX_LATENESS_RATIO, MAX_CPU_PERCENT = 1.1, 3.0
+"""Targets: p99 of the lateness over that without the box, and the processor time added."""
+BOX = """
+import os, random, sys
+from loopback_netft import UdpBox
+from rigd_netft.box import SimulatedBox
+os.sched_setaffinity(0, {int(core) for core in sys.argv[1].split(",")})
+try:
+    os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(30))
+except OSError:
+    pass
+box = UdpBox(SimulatedBox(lambda: tuple(random.gauss(0.0, 0.005) for _ in range(6))))
+print(box.port, flush=True)
+box.stream(lambda: False, 1 / 7000)
+"""
+"""Program of the box: by its priority it streams as evenly as one that is no part of this
+computer."""
+PACKAGE = """
+from dataclasses import replace
+from rigd_netft.kind import NETFT
+from rigd_netft.sensor import NetFtSensor
+from rigd_netft.settings import NetFtSettings
+
+def open_sensor(rig, opened):
+    return NetFtSensor(rig, rig.settings_of(NetFtSettings))
+
+DEVICE = replace(NETFT, name="distant_netft", open_sensor=open_sensor, contradictions=None)
+"""
+"""Package with the driver of a box in another process, although the drive is simulated."""
+
+
+def install(folder: Path) -> None:
+    """Add the package to this process and its children."""
+    metadata = folder / "distant_netft-1.dist-info"
+    metadata.mkdir()
+    (folder / "distant_netft.py").write_text(PACKAGE)
+    (metadata / "METADATA").write_text("Name: distant-netft\nVersion: 1\n")
+    (metadata / "entry_points.txt").write_text(
+        "[rigd.devices]\ndistant_netft = distant_netft:DEVICE\n"
+    )
+    sys.path.insert(0, str(folder))
+    os.environ["PYTHONPATH"] = str(folder)
+
+
+@contextmanager
+def box(cores: set[int]) -> Iterator[int]:
+    """Run the box in this context, and yield its port."""
+    command = [sys.executable, "-c", BOX, ",".join(map(str, cores))]
+    with subprocess.Popen(
+        command, stdout=subprocess.PIPE, text=True, cwd=Path(__file__).parent
+    ) as process:
+        try:
+            assert process.stdout is not None
+            yield int(process.stdout.readline())
+        finally:
+            process.kill()
+
+
+def measure(name: str, seconds: float, cores: set[int]) -> LoopMeasurement:
+    """Measure the loop in one session."""
+    plain = loops.simulated_profile(load_profile("sim"), RATE_HZ, 0.0)
+    plain = replace(plain, limits=replace(plain.limits, stale_ticks_in_a_row=10**9))
+
+    def with_sensor(sensor: str, settings: NetFtSettings) -> Profile:
+        devices = replace(plain.rig.devices, sensor=sensor)
+        rig = replace(plain.rig, devices=devices, added_settings=(settings,))
+        return replace(plain, rig=rig)
+
+    if name == ALONE:
+        return loops.run_session(name, plain, seconds, lambda: None)
+    if name == SIMULATED:
+        profile = with_sensor("netft", NetFtSettings("127.0.0.1"))
+        return loops.run_session(name, profile, seconds, lambda: None)
+    with box(cores) as port, socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as reader:
+        if name == STREAMING:
+            reader.connect(("127.0.0.1", port))
+            reader.send(STREAM)
+            measurement = loops.run_session(name, plain, seconds, lambda: None)
+            reader.send(STOP)
+            return measurement
+        settings = NetFtSettings("127.0.0.1", port=port, counts_per_n=1e6, counts_per_nm=1e6)
+        profile = with_sensor("distant_netft", settings)
+        return loops.run_session(name, profile, seconds, lambda: None)
+
+
+def show(one: LoopMeasurement) -> None:
+    """Print a session, in µs."""
+    late, work = percentiles(one.lateness_us), percentiles(one.work_us)
+    print(
+        f"  {one.name:13s} late p50 {late.p50:5.1f} p99 {late.p99:6.1f} max {late.largest:6.0f}  "
+        f"missed {one.missed}  work p50 {work.p50:5.1f} p99 {work.p99:5.1f}  "
+        f"CPU {one.cpu_percent:.1f} %",
+        flush=True,
+    )
+
+
+def ratio(rounds: list[dict[str, LoopMeasurement]], over: str, under: str, which: str) -> float:
+    """Return the median over the rounds of the ratio of two lateness figures."""
+    return statistics.median(
+        getattr(percentiles(found[over].lateness_us), which)
+        / getattr(percentiles(found[under].lateness_us), which)
+        for found in rounds
+    )
+
+
+def main() -> None:
+    """Print every round, then what the box adds."""
+    seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
+    count = int(sys.argv[2]) if len(sys.argv) > 2 else 10
+    use_one_thread()
+    granted = settings_granted(load_profile("sim").realtime)
+    print("; ".join(f"{name} {text}" for name, text in granted.items()))
+    cores, rounds = cores_without_loop(granted), []
+    names = (ALONE, STREAMING, READ, SIMULATED)
+    with tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder:
+        install(Path(folder))
+        for number in range(count):
+            print(f"round {number + 1}, load {os.getloadavg()[0]:.2f}")
+            turned = names[number % 4 :] + names[: number % 4]
+            rounds.append({name: measure(name, seconds, cores) for name in turned})
+            for name in names:
+                show(rounds[-1][name])
+    for over, under in (
+        (STREAMING, ALONE), (READ, STREAMING), (READ, ALONE), (SIMULATED, ALONE)
+    ):  # fmt: skip
+        p50, p99 = (ratio(rounds, over, under, which) for which in ("p50", "p99"))
+        cpu_percent, work_us = (
+            statistics.median(value(found[over]) - value(found[under]) for found in rounds)
+            for value in (
+                lambda one: one.cpu_percent,
+                lambda one: percentiles(one.work_us).p50,
+            )
+        )
+        print(
+            f"{over} over {under}: lateness p50 {p50:.2f}, p99 {p99:.2f}; "
+            f"work {work_us:+.1f} µs, CPU {cpu_percent:+.1f} %"
+        )
+    print(f"targets of {READ} over {ALONE}: p99 {MAX_LATENESS_RATIO:g}, CPU {MAX_CPU_PERCENT:g} %")
+
+
+if __name__ == "__main__":
+    main()
