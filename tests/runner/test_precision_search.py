@@ -174,6 +174,11 @@ def test_air_drag_is_told_from_damping_by_two_amplitudes(bench, monkeypatch):
     assert fractions == [1.0, 1.0, *2 * (reduced, reduced, 1.0, reduced)]
 
 
+def test_a_value_below_its_uncertainty_does_not_put_a_relative_precision_out_of_reach(profile):
+    [estimate] = target_estimates(answer(profile, 0, 50.0), [parse_target("damping", "1:10%")])
+    assert estimate.ratio == pytest.approx(10.0)
+
+
 def test_what_is_certain_is_looked_at_once_more_with_all_structures(bench):
     """Only after a pause, and a fit of every structure, does anything count as reached."""
     bench.told(ON_THE_WAY)
