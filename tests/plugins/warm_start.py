@@ -65,11 +65,16 @@ def _settings_of_python(environment):
 _OWN_SETTINGS = _settings_of_python(os.environ)
 
 
-def start(command, *, env=None, **options):
-    """Start a command, in a new process if its environment changes how Python itself starts."""
+def start(command, *, env=None, packages=None, **options):
+    """Start a command, in a new process if its environment changes how Python itself starts.
+
+    What is in the folder `packages` is installed for it.
+    """
     env = dict(os.environ if env is None else env)
     if _settings_of_python(env) != _OWN_SETTINGS:
         return subprocess.Popen(command, env=env, **options)
+    if packages is not None:
+        env["PYTHONPATH"] = os.fspath(packages)
     return Copy(list(map(os.fspath, command)), env, **options)
 
 
@@ -255,6 +260,9 @@ def _become_new_process(job, descriptors, importing):
     os.dup2(importing, 3, inheritable=False)
     os.closerange(4, os.sysconf("SC_OPEN_MAX"))
     _open_standard_streams()
+    if _settings_of_python(environment) != _OWN_SETTINGS:  # packages are installed for it
+        sys.path.insert(0, environment["PYTHONPATH"])
+        _OWN_SETTINGS["PYTHONPATH"] = environment["PYTHONPATH"]
     atexit.register(_report_imports, frozenset(sys.modules))
     subprocess.Popen = _PopenOfCopy
     return command
