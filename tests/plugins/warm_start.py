@@ -324,6 +324,7 @@ class _PopenOfCopy(subprocess.Popen):
             command[:3] != [sys.executable, "-P", "-m"]
             or not command[3].startswith(_RIG_PROCESSES)
             or _settings_of_python(os.environ if env is None else env) != _OWN_SETTINGS
+            or not _commands_can_be_stated()
         ):
             super()._execute_child(*arguments)
             return
@@ -406,15 +407,33 @@ def _state_command(command):
     memory.write(content)
     _command_lines.append(memory)
     first = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    _set_command_memory(first, first + len(content))
+
+
+def _commands_can_be_stated():
+    """Return whether the system lets a process change the command that the table shows."""
+    try:
+        _set_command_memory(*_addresses_of_process(48, 50))
+    except OSError:
+        return False
+    return True
+
+
+def _addresses_of_process(first, end):
+    """Return fields of /proc/self/stat by their numbers in its documentation."""
     fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
-    # From field 3 on: start and end of code, start of stack; data, break; environment.
-    code, code_end, stack = map(int, fields[23:26])
-    data, data_end, heap = map(int, fields[42:45])
-    environment = map(int, fields[47:49])
+    return map(int, fields[first - 3 : end - 3])
+
+
+def _set_command_memory(first, end):
+    """Have the process table show what is in a part of the memory."""
+    code, code_end, stack = _addresses_of_process(26, 29)
+    data, data_end, heap = _addresses_of_process(45, 48)
+    environment = _addresses_of_process(50, 52)
     c = ctypes.CDLL(None, use_errno=True)
     c.sbrk.restype = ctypes.c_void_p
-    regions = (code, code_end, data, data_end, heap, c.sbrk(0), stack, first, first + len(content))
-    stated = struct.pack("=12QIi", *regions, *environment, 0, 0, -1)
+    regions = (code, code_end, data, data_end, heap, c.sbrk(0), stack, first, end, *environment)
+    stated = struct.pack("=12QIi", *regions, 0, 0, -1)
     if c.prctl(_PR_SET_MM, _PR_SET_MM_MAP, stated, len(stated), 0):
         raise OSError(ctypes.get_errno(), "the command line cannot be set")
 
