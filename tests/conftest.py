@@ -64,7 +64,7 @@ settings.load_profile("same")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """One more than processors, for the time in which tests wait for processes and for real time."""
+    """One more than processors, for the time in which tests wait for processes and real time."""
     return (os.cpu_count() or 1) + 1
 
 
