@@ -27,6 +27,8 @@ def main() -> None:
     use_one_thread()
     if sys.argv[1:] == ["stop"]:
         from rigd.cli.stop_report import main as run
+    elif sys.argv[1:] in (["status"], ["status", "--json"]):
+        from rigd.cli.status_report import main as run
     else:
         from rigd.cli.app import main as run
     try:

@@ -64,8 +64,8 @@ settings.load_profile("same")
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:
-    """More workers than processors: every second test waits for processes and for real time."""
-    return (os.cpu_count() or 1) + 2
+    """One more than processors, for the time in which tests wait for processes and real time."""
+    return (os.cpu_count() or 1) + 1
 
 
 def pytest_collection_finish(session: pytest.Session) -> None:

@@ -152,13 +152,9 @@ def status(
         return
     with daemon_of(profile) as client:
         daemon_reply = client.ask("status")
-    if as_json:
-        del daemon_reply["reply"], daemon_reply["ok"]
-        typer.echo(json.dumps(daemon_reply))
-        return
-    from rigd.cli.status_view import print_status
+    from rigd.cli.status_report import report_status
 
-    print_status(daemon_reply)
+    report_status(daemon_reply, as_json=as_json)
 
 
 def stop(

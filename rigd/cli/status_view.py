@@ -9,7 +9,6 @@ from rich.console import Console, Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from rigd.daemon import page_address
 from rigd.engine.shared_state import Phase
 
 _STATE_STYLES = {  # Style of each state of the daemon
@@ -95,6 +94,8 @@ def _summary_rows(status: dict[str, Any]) -> Iterator[tuple[str, Text]]:
     if rig is not None and rig["live_view"] is not None:
         yield "live view", Text(rig["live_view"]["url"])
     if daemon.get("web") is not None:
+        from rigd.daemon import page_address  # late: it is slow to import
+
         yield "page", Text(page_address(daemon["profile"]) or daemon["web"])
     yield "output", Text(daemon["output"])
 

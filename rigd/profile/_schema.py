@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 from annotated_types import DocInfo, Ge, Gt, Le, MinLen
-from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from rigd.beam import Beam, Damping, Plant
 from rigd.control import SHIPPED_CONTROLLER, ControlSettings, LoopModel
@@ -220,6 +219,9 @@ def _settings_problem(settings: type) -> str:
     parameters = getattr(settings, "__dataclass_params__", None)
     if parameters is None or not parameters.frozen:
         return "they are no frozen dataclass; declare them with @dataclass(frozen=True)."
+    # Late: the processes of a session, which get a loaded profile, do not need it.
+    from pydantic import ConfigDict, TypeAdapter, ValidationError
+
     try:
         for key, value_type in get_type_hints(settings, include_extras=True).items():
             default = next((f.default for f in fields(settings) if f.name == key), MISSING)

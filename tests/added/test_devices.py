@@ -179,7 +179,7 @@ def test_nothing_comes_from_the_working_folder_and_help_does_not_search(packages
     install(tmp_path / "here", "here-only", "1", "KIND = 1", "[rigd.devices]\nhere = here_only:K\n")
     for program in (("-m", "rigd"), ("-P", "-m", "rigd")):
         code, output, _ = rigd_with(
-            packages, "plugins", "--json", cwd=tmp_path / "here", program=program
+            packages, "plugins", "--json", cwd=tmp_path / "here", program=program, cold=True
         )
         assert code == 0
         assert {row["name"] for row in json.loads(output)["plugins"]} >= {"twin", "scaled"}
@@ -190,4 +190,4 @@ def test_nothing_comes_from_the_working_folder_and_help_does_not_search(packages
         "try: main()\nexcept SystemExit: pass\n"
         "sys.exit(len({'importlib.metadata', 'rigd.plugins', 'lab_devices'} & set(sys.modules)))"
     )
-    assert rigd_with(packages, program=("-c", code))[0] == 0
+    assert rigd_with(packages, program=("-c", code), cold=True)[0] == 0

@@ -68,3 +68,15 @@ def test_the_processes_of_a_rig_are_started_before_numpy_is_imported():
     told = subprocess.check_output([sys.executable, "-c", code], text=True)
 
     assert told == "False\n"
+
+
+def test_a_status_imports_no_parser_of_options(runtime_folder):
+    code = (
+        "import sys; sys.argv = ['rigd', 'status']; from rigd.__main__ import main\n"
+        "try: main()\nexcept SystemExit as end: print(end.code)\n"
+        "print([name for name in ('numpy', 'pydantic', 'typer') if name in sys.modules])"
+    )
+
+    told = subprocess.check_output([sys.executable, "-c", code], text=True)
+
+    assert told == "1\n[]\n"

@@ -5,6 +5,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import warm_start
+
 
 def install(folder, package, version, code, entry_points):
     """Write module and metadata of a package; `entry_points` is the text of its file."""
@@ -17,13 +19,18 @@ def install(folder, package, version, code, entry_points):
     (metadata / "entry_points.txt").write_text(entry_points)
 
 
-def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd")):
-    """Run rigd with the packages of a folder; return exit code, output and errors."""
-    done = subprocess.run(
-        [sys.executable, *program, *map(str, arguments)],
-        cwd=cwd or folder, capture_output=True, text=True, check=False,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, map(str, (folder,))))},
-    )  # fmt: skip
+def rigd_with(folder, *arguments, cwd=None, program=("-P", "-m", "rigd"), cold=False):
+    """Run rigd with the packages of a folder; return exit code, output and errors.
+
+    A `cold` start is of a new interpreter.
+    """
+    command = [sys.executable, *program, *map(str, arguments)]
+    options = {"cwd": cwd or folder, "capture_output": True, "text": True}
+    if cold:
+        environment = os.environ | {"PYTHONPATH": str(folder)}
+        done = subprocess.run(command, check=False, env=environment, **options)
+    else:
+        done = warm_start.run(command, check=False, packages=folder, **options)
     return done.returncode, done.stdout, done.stderr
 
 

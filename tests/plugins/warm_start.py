@@ -1,24 +1,31 @@
 """Run commands of this project in copies of a process that has imported the project already.
 
 The imports of one `rigd` take half a second of a processor, a copy takes a twentieth. `run` is used
-like that of `subprocess`, `start` like its `Popen`. What depends on how Python itself starts is
-tested with `subprocess`, and so are a session and an analysis from end to end.
+like that of `subprocess`, `start` like its `Popen`. The processes that a copy starts, such as those
+of a session, are copies of it in turn. What depends on how Python itself starts is tested with
+`subprocess`, and so are a session and an analysis from end to end.
 """
 
 import atexit
 import contextlib
+import ctypes
 import functools
 import gc
+import inspect
 import io
 import json
+import mmap
 import os
 import runpy
 import selectors
 import signal
 import socket
+import struct
 import subprocess
 import sys
 import threading
+import traceback
+import warnings
 from importlib import import_module
 from pathlib import Path
 from subprocess import DEVNULL, PIPE, STDOUT, CalledProcessError, CompletedProcess, TimeoutExpired
@@ -27,6 +34,9 @@ _MAX_REQUEST_BYTES = 1 << 17
 _MAX_REPORT_BYTES = 1 << 16
 _STARTS_THREADS = ("pyarrow", "rerun", "rerun_bindings")
 """Packages whose import starts threads, which would be missing in a copy."""
+_RIG_PROCESSES = ("rigd.engine.", "rigd.runner.", "rigd.daemon.", "rigd.web")
+"""Modules that copies start as copies; the live view's import starts threads."""
+_PR_SET_MM, _PR_SET_MM_MAP = 35, 14  # linux/prctl.h
 
 
 def run(command, *, capture_output=False, timeout=None, check=False, input=None, **options):  # noqa: A002
@@ -55,11 +65,16 @@ def _settings_of_python(environment):
 _OWN_SETTINGS = _settings_of_python(os.environ)
 
 
-def start(command, *, env=None, **options):
-    """Start a command, in a new process if its environment changes how Python itself starts."""
+def start(command, *, env=None, packages=None, **options):
+    """Start a command, in a new process if its environment changes how Python itself starts.
+
+    What is in the folder `packages` is installed for it.
+    """
     env = dict(os.environ if env is None else env)
     if _settings_of_python(env) != _OWN_SETTINGS:
         return subprocess.Popen(command, env=env, **options)
+    if packages is not None:
+        env["PYTHONPATH"] = os.fspath(packages)
     return Copy(list(map(os.fspath, command)), env, **options)
 
 
@@ -244,6 +259,17 @@ def _become_new_process(job, descriptors, importing):
     os.write(descriptors[3], _number(os.getpid()))
     os.dup2(importing, 3, inheritable=False)
     os.closerange(4, os.sysconf("SC_OPEN_MAX"))
+    _open_standard_streams()
+    if _settings_of_python(environment) != _OWN_SETTINGS:  # packages are installed for it
+        sys.path.insert(0, environment["PYTHONPATH"])
+        _OWN_SETTINGS["PYTHONPATH"] = environment["PYTHONPATH"]
+    atexit.register(_report_imports, frozenset(sys.modules))
+    subprocess.Popen = _PopenOfCopy
+    return command
+
+
+def _open_standard_streams():
+    """Make streams of the standard descriptors, which have changed."""
     sys.stdin = sys.__stdin__ = os.fdopen(0, closefd=False)
     for number, name in ((1, "stdout"), (2, "stderr")):
         before = getattr(sys, name)
@@ -256,14 +282,13 @@ def _become_new_process(job, descriptors, importing):
         )
         setattr(sys, name, stream)
         setattr(sys, f"__{name}__", stream)
-    atexit.register(_report_imports, frozenset(sys.modules))
-    return command
 
 
 def _report_imports(before):
     new = (name for name in sys.modules if name not in before and not name.endswith("__main__"))
     harmless = [name for name in new if name.partition(".")[0] not in _STARTS_THREADS]
-    os.write(3, "\n".join(harmless).encode())
+    with contextlib.suppress(BrokenPipeError):  # the tests are over
+        os.write(3, "\n".join(harmless).encode())
 
 
 def _run(command):
@@ -281,6 +306,136 @@ def _run(command):
         sys.argv = [program, *arguments]
         sys.path.insert(0, str(Path(program).parent))
         runpy.run_path(program, run_name="__main__")
+
+
+# Processes that a copy starts
+
+
+_EXECUTE_CHILD = inspect.signature(subprocess.Popen._execute_child)
+
+
+class _PopenOfCopy(subprocess.Popen):
+    """Start of a process by a copy: a process of the rig is a copy of the copy."""
+
+    def _execute_child(self, *arguments):
+        given = _EXECUTE_CHILD.bind(self, *arguments).arguments
+        command, env = list(map(os.fspath, given["args"])), given["env"]
+        if (
+            command[:3] != [sys.executable, "-P", "-m"]
+            or not command[3].startswith(_RIG_PROCESSES)
+            or _settings_of_python(os.environ if env is None else env) != _OWN_SETTINGS
+            or not _commands_can_be_stated()
+        ):
+            super()._execute_child(*arguments)
+            return
+        try:
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", DeprecationWarning)  # of threads
+                self.pid = os.fork()
+            if not self.pid:
+                _be_child(command, given)
+            self._child_created = True
+        finally:
+            pipes = ("p2cread", "p2cwrite", "c2pread", "c2pwrite", "errread", "errwrite")
+            self._close_pipe_fds(*(given[name] for name in pipes))
+
+
+def _be_child(command, given):
+    """Run a command in this copy of a copy, as a new process would, and end it."""
+    gc.freeze()  # what is garbage here has descriptors whose numbers will be others'
+    exit_code = 1
+    try:
+        before = frozenset(sys.modules)
+        _forget_parent(given)
+        _state_command(command)
+        try:
+            _run(command)
+            exit_code = 0
+        except SystemExit as end:
+            exit_code = end.code if isinstance(end.code, int) else int(end.code is not None)
+        for thread in threading.enumerate():
+            if thread is not threading.current_thread() and not thread.daemon:
+                thread.join()
+        atexit._run_exitfuncs()
+        for stream in (sys.stdout, sys.stderr):
+            stream.flush()
+        _report_imports(before)
+    except BaseException:
+        traceback.print_exc()
+    finally:
+        os._exit(exit_code)  # the finalizers are of what is the parent's
+
+
+_streams_of_parent = []
+"""Streams whose content the parent will write."""
+
+
+def _forget_parent(given):
+    """Undo what a process does not inherit from its parent, and set what it is given."""
+    atexit._clear()
+    signal.set_wakeup_fd(-1)
+    sys.unraisablehook = sys.__unraisablehook__
+    for number in signal.valid_signals():
+        if callable(signal.getsignal(number)):
+            signal.signal(number, signal.SIG_DFL)
+    if signal.getsignal(signal.SIGINT) is signal.SIG_DFL:
+        signal.signal(signal.SIGINT, signal.default_int_handler)
+    if given["env"] is not None:
+        os.environ.clear()
+        os.environ.update(given["env"])
+    if given["cwd"] is not None:
+        os.chdir(given["cwd"])
+    _streams_of_parent.extend((sys.stdin, sys.stdout, sys.stderr))
+    for number, end in enumerate((given["p2cread"], given["c2pwrite"], given["errwrite"])):
+        if end != -1:
+            os.dup2(end, number)
+    first = 4
+    for descriptor in (*sorted(given["pass_fds"]), os.sysconf("SC_OPEN_MAX")):
+        os.closerange(first, descriptor)
+        first = descriptor + 1
+    _open_standard_streams()
+
+
+_command_lines = []
+"""Memory with the command lines that this process has had."""
+
+
+def _state_command(command):
+    """Have the process table show a command; the memory of the first one is too short for it."""
+    content = b"".join(os.fsencode(word) + b"\0" for word in command)
+    memory = mmap.mmap(-1, len(content), mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
+    memory.write(content)
+    _command_lines.append(memory)
+    first = ctypes.addressof(ctypes.c_char.from_buffer(memory))
+    _set_command_memory(first, first + len(content))
+
+
+def _commands_can_be_stated():
+    """Return whether the system lets a process change the command that the table shows."""
+    try:
+        _set_command_memory(*_addresses_of_process(48, 50))
+    except OSError:
+        return False
+    return True
+
+
+def _addresses_of_process(first, end):
+    """Return fields of /proc/self/stat by their numbers in its documentation."""
+    fields = Path("/proc/self/stat").read_text().rpartition(")")[2].split()
+    return map(int, fields[first - 3 : end - 3])
+
+
+def _set_command_memory(first, end):
+    """Have the process table show what is in a part of the memory."""
+    code, code_end, stack = _addresses_of_process(26, 29)
+    data, data_end, heap = _addresses_of_process(45, 48)
+    environment = _addresses_of_process(50, 52)
+    c = ctypes.CDLL(None, use_errno=True)
+    c.sbrk.restype = ctypes.c_void_p
+    regions = (code, code_end, data, data_end, heap, c.sbrk(0), stack, first, end, *environment)
+    stated = struct.pack("=12QIi", *regions, 0, 0, -1)
+    if c.prctl(_PR_SET_MM, _PR_SET_MM_MAP, stated, len(stated), 0):
+        raise OSError(ctypes.get_errno(), "the command line cannot be set")
 
 
 def _number(value):
