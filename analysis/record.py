@@ -6,7 +6,7 @@ incomplete sweep. This module interpolates such samples within limits, counts an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -16,12 +16,8 @@ from analysis.record_checks import (
     MAX_TICKS,
     MAX_UNKNOWN_FRACTION,
     RecordError,
-    check_clock,
-    check_fillable,
     check_finite,
     check_sensor,
-    check_span,
-    longest_run,
     stated_axis_tilt_deg,
     stated_beam,
     stated_delay_s,
@@ -32,8 +28,9 @@ from analysis.record_checks import (
     stated_uncertainty,
     stated_uniformity,
 )
+from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
+from analysis.record_ticks import Gaps, TickGrid
 from rigd.session import Session, read_session, readable_texts
-from rigd.session.layout import Status
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,6 +38,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.record_part import PartOption
     from rigd.beam import Beam
 
 __all__ = [
@@ -60,52 +58,6 @@ MAX_SAMPLES = MAX_TICKS
 
 RECORD_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
 """Fields of the samples that an analysis needs."""
-
-_REPORTED_FLAGS = (
-    (Status.TORQUE_SATURATED, "torque command saturated"),
-    (Status.WRENCH_SATURATED, "wrench saturated"),
-    (Status.ANGLE_STALE, "angle stale"),
-    (Status.WRENCH_STALE, "wrench stale"),
-    (Status.LIMIT_WARNING, "limit warning"),
-    (Status.TORQUE_OFF, "torque off"),
-    (Status.LATE, "late tick"),
-)
-"""Flags of a sample that are counted, with their meanings."""
-
-_UNKNOWN_SAMPLES_TEXT = (
-    "do not count in the whole-record fits; for the Welch fits they are interpolated."
-)
-"""End of the sentence on missing or stale samples."""
-
-_FLAG_CONSEQUENCES: tuple[tuple[str, str], ...] = (
-    ("wrench saturated", "The torque is clipped there and the estimate is wrong near it."),
-    ("torque command saturated", "The angle did not follow its reference there."),
-    ("torque off", "The motor was not driven there."),
-)
-"""Consequence for the analysis of each flag that causes a warning."""
-
-
-@dataclass(frozen=True, slots=True)
-class Gaps:
-    """Counts of the samples that were filled by linear interpolation.
-
-    Attributes
-    ----------
-    missing_ticks
-        Ticks between the first and the last sample that have no sample.
-    longest_gap_ticks
-        Number of ticks in the longest gap.
-    sweep_missing_ticks
-        Missing ticks inside the sweep.
-    sweep_stale_angles, sweep_stale_torques
-        Recorded samples of the sweep whose angle or torque is flagged as held from an earlier tick.
-    """
-
-    missing_ticks: int
-    longest_gap_ticks: int
-    sweep_missing_ticks: int
-    sweep_stale_angles: int
-    sweep_stale_torques: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +113,12 @@ class Record:
         Metadata `session` of the file, as strings.
     outcome
         End of the session: ``complete``, ``stopped``, ``fault`` or ``unknown``.
+    part_s
+        Beginning and end of the part of the session that the record covers, in seconds since the
+        session's start; None for the whole session. The angles of a part without the segment
+        ``rest`` are relative to the angle held there.
+    swept_hz
+        Lowest and highest frequency of the sweep in a part of a session; None for the whole one.
     """
 
     path: Path
@@ -188,6 +146,20 @@ class Record:
     warnings: tuple[str, ...]
     metadata: Mapping[str, str]
     outcome: str
+    part_s: tuple[float, float] | None = None
+    swept_hz: tuple[float, float] | None = None
+
+    @property
+    def part_json(self) -> dict[str, float] | None:
+        """Part of the session as a JSON value; None for the whole session."""
+        return None if self.part_s is None else {"from_s": self.part_s[0], "to_s": self.part_s[1]}
+
+    @property
+    def part_text(self) -> str | None:
+        """Part of the session in words, such as "10 to 60 s of the session"; None for the whole."""
+        if self.part_s is None:
+            return None
+        return f"{self.part_s[0]:g} to {self.part_s[1]:g} s of the session"
 
     @property
     def sweep_samples(self) -> int:
@@ -205,7 +177,7 @@ class Record:
         return int(self.first_sweep.stop - self.first_sweep.start)
 
 
-def load_record(path: Path) -> Record:
+def load_record(path: Path, part_s: PartOption | None = None) -> Record:
     """Read a session file and return its record on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
@@ -217,6 +189,9 @@ def load_record(path: Path) -> Record:
     ----------
     path
         Session file (docs/session_format.md).
+    part_s
+        Beginning and end of the part to be read, in seconds since the session's start; None for the
+        session's beginning or end. By default, the whole session is read.
 
     Raises
     ------
@@ -233,16 +208,18 @@ def load_record(path: Path) -> Record:
     >>> print(record.sweep_samples, record.gaps.missing_ticks)
     20000 0
     """
-    return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES))
+    return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES), part_s)
 
 
-def record_of(session: Session) -> Record:
+def record_of(session: Session, part_s: PartOption | None = None) -> Record:
     """Return the record of a session on a uniform time grid (see `load_record`).
 
     Parameters
     ----------
     session
         Session from a file, or a running one so far. Its samples need the `RECORD_FIELDS`.
+    part_s
+        Part of the session, as for `load_record`.
 
     Raises
     ------
@@ -251,59 +228,31 @@ def record_of(session: Session) -> Record:
     RecordError
         The samples cannot be analysed.
     """
-    path, samples = session.path, session.samples
-    if len(samples) == 0:
+    path, whole_session = session.path, session
+    if len(session.samples) == 0:
         raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
     rate_hz = stated_rate_hz(session)
-    ticks = samples["tick"].astype(np.int64)
-    check_span(path, ticks)
-    check_clock(path, ticks, samples["t_ns"], rate_hz)
+    covered_s = None
+    if part_s is not None:
+        session, covered_s = part_of_session(session, part_s, rate_hz)
+    grid = TickGrid.of(session, rate_hz)
+    samples = session.samples
+    ticks = samples["tick"]
     for field_name in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
         check_finite(path, field_name, samples[field_name], ticks)
     check_sensor(path, samples["coupling_torque_nm"])
-
-    first_tick = int(ticks[0])
-    tick_indices = ticks - first_tick
-    tick_count = int(tick_indices[-1]) + 1
-    sweep, unrecorded_ticks = _sweep_range(session, first_tick, tick_count)
-    status_bits = np.zeros(
-        tick_count, dtype=np.uint32
-    )  # bits of `Status`; 0 where a tick is missing
-    status_bits[tick_indices] = samples["status"]
-    is_missing = np.ones(tick_count, dtype=bool)
-    is_missing[tick_indices] = False
-    is_angle_stale = (status_bits & Status.ANGLE_STALE) != 0
-    is_torque_stale = (status_bits & Status.WRENCH_STALE) != 0
-    for channel_name, is_unknown in (
-        ("angle", is_missing | is_angle_stale),
-        ("torque", is_missing | is_torque_stale),
-    ):
-        check_fillable(path, channel_name, is_unknown[sweep], first_tick + sweep.start, rate_hz)
-
-    gaps = Gaps(
-        missing_ticks=int(is_missing.sum()),
-        longest_gap_ticks=longest_run(is_missing)[0],
-        sweep_missing_ticks=int(is_missing[sweep].sum()),
-        sweep_stale_angles=int(is_angle_stale[sweep].sum()),
-        sweep_stale_torques=int(is_torque_stale[sweep].sum()),
-    )
-    flag_counts = _flag_counts(status_bits[sweep])
     metadata, unread_metadata = readable_texts(session.metadata, "keys of the metadata")
     outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
-    return Record(
+    record = Record(
         path=path,
-        time_s=(first_tick + np.arange(tick_count)) / rate_hz,
-        reference_rad=_fill_grid(samples["angle_reference_rad"], tick_indices, is_missing),
-        angle_rad=_fill_grid(samples["angle_rad"], tick_indices, is_missing | is_angle_stale),
-        torque_nm=_fill_grid(
-            samples["coupling_torque_nm"], tick_indices, is_missing | is_torque_stale
-        ),
-        angle_known=~(is_missing | is_angle_stale),
-        torque_known=~(
-            is_missing | is_torque_stale | ((status_bits & Status.WRENCH_SATURATED) != 0)
-        ),
+        time_s=(grid.first_tick + np.arange(grid.count)) / rate_hz,
+        reference_rad=_fill_grid(samples["angle_reference_rad"], grid.indices, grid.is_missing),
+        angle_rad=_fill_grid(samples["angle_rad"], grid.indices, grid.is_angle_unknown),
+        torque_nm=_fill_grid(samples["coupling_torque_nm"], grid.indices, grid.is_torque_unknown),
+        angle_known=~grid.is_angle_unknown,
+        torque_known=grid.is_torque_measured,
         rate_hz=rate_hz,
-        beam=stated_beam(session, rate_hz, tick_count),
+        beam=stated_beam(session, rate_hz, grid.count),
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
@@ -312,13 +261,13 @@ def record_of(session: Session) -> Record:
         uniformity=stated_uniformity(session),
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
-        sweep=sweep,
-        there=_first_sweep_range(session, first_tick, sweep),
-        rest_angle_rad=_rest_angle(session, ticks),
-        gaps=gaps,
-        flags=flag_counts,
+        sweep=grid.sweep,
+        there=grid.there,
+        rest_angle_rad=_rest_angle(session),
+        gaps=grid.gaps(),
+        flags=grid.flag_counts(),
         warnings=(
-            *_describe_faults(gaps, flag_counts, unrecorded_ticks, outcome, rate_hz, sweep),
+            *grid.fault_sentences(outcome),
             *(
                 f"Of the file: {fault_sentence}."
                 for fault_sentence in (*unread_metadata, *unread_outcome)
@@ -327,51 +276,37 @@ def record_of(session: Session) -> Record:
         metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
     )
+    if covered_s is None:
+        return record
+    return _record_of_part(record, covered_s, whole_session, grid.first_tick)
 
 
-def _sweep_range(session: Session, first_tick: int, tick_count: int) -> tuple[slice, int]:
-    """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
-    if "sweep" not in session.segments:
-        return slice(0, tick_count), 0
-    first_sweep_tick, end_sweep_tick = session.segments["sweep"]
-    first_index = max(first_sweep_tick - first_tick, 0)
-    end_index = min(end_sweep_tick - first_tick, tick_count)
-    if end_index <= first_index:
-        raise RecordError(
-            f"{session.path}: segment 'sweep' covers ticks {first_sweep_tick} to "
-            f"{end_sweep_tick - 1}, but the record "
-            f"holds ticks {first_tick} to {first_tick + tick_count - 1}, so nothing of the sweep "
-            "was recorded."
-        )
-    return slice(first_index, end_index), (end_sweep_tick - first_sweep_tick) - (
-        end_index - first_index
+def _record_of_part(
+    record: Record, covered_s: tuple[float, float], session: Session, first_tick: int
+) -> Record:
+    """Return the record of a part with what only the whole session states.
+
+    `first_tick` is the number of the part's first tick.
+    """
+    check_part_length(record.path, covered_s, record.beam)
+    sweep = record.first_sweep
+    rest_angle_rad = _rest_angle(session) if record.rest_angle_rad is None else None
+    origin_rad = rest_angle_rad or 0.0
+    return replace(
+        record,
+        reference_rad=record.reference_rad - origin_rad,
+        angle_rad=record.angle_rad - origin_rad,
+        part_s=covered_s,
+        swept_hz=swept_frequencies_hz(session, first_tick + sweep.start, first_tick + sweep.stop),
     )
 
 
-def _first_sweep_range(session: Session, first_tick: int, sweep: slice) -> slice | None:
-    """Return the range of the first of two sweeps; None if there is only one sweep."""
-    segment_first_tick, segment_end_tick = session.segments.get("there", (0, 0))
-    first_index, end_index = (
-        max(segment_first_tick - first_tick, sweep.start),
-        min(segment_end_tick - first_tick, sweep.stop),
-    )
-    return slice(first_index, end_index) if end_index > first_index else None
-
-
-def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
+def _rest_angle(session: Session) -> float | None:
     """Return the median angle in rad over the segment ``rest``; None without this segment."""
+    ticks = session.samples["tick"]
     first_tick, end_tick = session.segments.get("rest", (0, 0))
     is_at_rest = (ticks >= first_tick) & (ticks < end_tick)
     return float(np.median(session.samples["angle_rad"][is_at_rest])) if is_at_rest.any() else None
-
-
-def _flag_counts(status_bits: NDArray[np.uint32]) -> dict[str, int]:
-    """Return the number of samples with each flag that occurs."""
-    counts = {
-        meaning: int(np.count_nonzero(status_bits & status_flag))
-        for status_flag, meaning in _REPORTED_FLAGS
-    }
-    return {meaning: sample_count for meaning, sample_count in counts.items() if sample_count}
 
 
 def _fill_grid(
@@ -388,56 +323,3 @@ def _fill_grid(
             np.flatnonzero(is_unknown), known_indices, grid_values[known_indices]
         )
     return grid_values
-
-
-def _describe_faults(
-    gaps: Gaps,
-    flag_counts: Mapping[str, int],
-    unrecorded_ticks: int,
-    outcome: Mapping[str, str],
-    rate_hz: float,
-    sweep: slice,
-) -> tuple[str, ...]:
-    """Return sentences on an incomplete session, missing samples and flags."""
-    sentences = []
-    outcome_text = outcome.get("outcome", "unknown")
-    if outcome_text in ("stopped", "fault"):
-        stop_reason = outcome.get("reason")
-        sentences.append(
-            f"The session's outcome is '{outcome_text}', not 'complete'"
-            + (f": {stop_reason}" if stop_reason else ".")
-        )
-    elif "recovered_from" in outcome:
-        sentences.append(
-            f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
-        )
-    if outcome.get("recovered_protected") == "false":
-        sentences.append(
-            "The file was recovered from one whose metadata no checksum covered: compare rate, "
-            "beam and segments with what is known of the session."
-        )
-    if unrecorded_ticks:
-        recorded_s = (sweep.stop - sweep.start) / rate_hz
-        sentences.append(
-            f"The sweep was cut short: {recorded_s:.6g} s of it were recorded, "
-            f"{unrecorded_ticks / rate_hz:.6g} s were not."
-        )
-    if gaps.sweep_missing_ticks:
-        sentences.append(
-            f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
-            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
-        )
-    for channel_name, sample_count in (
-        ("angle", gaps.sweep_stale_angles),
-        ("torque", gaps.sweep_stale_torques),
-    ):
-        if sample_count:
-            sentences.append(
-                f"{sample_count} stale values of the {channel_name} {_UNKNOWN_SAMPLES_TEXT}"
-            )
-    for flag_name, flag_consequence in _FLAG_CONSEQUENCES:
-        if flag_name in flag_counts:
-            sentences.append(
-                f"{flag_counts[flag_name]} samples of the sweep: {flag_name}. {flag_consequence}"
-            )
-    return tuple(sentences)

@@ -436,6 +436,7 @@ def _record_facts(record: Record, warnings: Sequence[str]) -> dict[str, Any]:
         "file": str(record.path),
         "outcome": record.outcome,
         "rate_hz": record.rate_hz,
+        "part": record.part_json,
         "samples": len(record.time_s),
         "sweep_first": record.sweep.start,
         "sweep_end": record.sweep.stop,

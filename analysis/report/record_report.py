@@ -106,7 +106,10 @@ def _session_lines(record: Record) -> list[str]:
         for key in ("specimen", "operator")
         if record_metadata.get(key)
     ]
-    return [*_start_lines(record_metadata), f"outcome {record.outcome}", *fact_lines]
+    part_lines = [] if record.part_text is None else [f"analysed: {record.part_text}"]
+    return [
+        *_start_lines(record_metadata), f"outcome {record.outcome}", *part_lines, *fact_lines,
+    ]  # fmt: skip
 
 
 def _start_lines(metadata: Mapping[str, str]) -> list[str]:
@@ -178,6 +181,7 @@ def _record_facts(record: Record) -> list[tuple[str, str]]:
     )
     return [
         ("outcome", record.outcome),
+        ("analysed", record.part_text or "the whole session"),
         (
             "samples",
             f"{sample_count} at {record.rate_hz:g} Hz, {sample_count / record.rate_hz:.6g} s",
