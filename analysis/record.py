@@ -6,18 +6,17 @@ incomplete sweep. This module interpolates such samples within limits, counts an
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.models import RECORD_BAND_HZ
 from analysis.record_checks import (
     MAX_GAP_S,
     MAX_TICKS,
     MAX_UNKNOWN_FRACTION,
     RecordError,
-    check_finite,
-    check_sensor,
     stated_axis_tilt_deg,
     stated_beam,
     stated_delay_s,
@@ -29,6 +28,12 @@ from analysis.record_checks import (
     stated_uniformity,
 )
 from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
+from analysis.record_signals import (
+    LONGEST_FULL_RATE_SAMPLES,
+    FullRateSignals,
+    Signals,
+    collector_of_signals,
+)
 from analysis.record_ticks import Gaps, TickGrid
 from rigd.session import Session, read_session, readable_texts
 
@@ -46,6 +51,7 @@ __all__ = [
     "MAX_SAMPLES",
     "MAX_UNKNOWN_FRACTION",
     "RECORD_FIELDS",
+    "FullRate",
     "Gaps",
     "Record",
     "RecordError",
@@ -56,8 +62,33 @@ __all__ = [
 MAX_SAMPLES = MAX_TICKS
 """Largest number of samples of a session that are read."""
 
+_TICK_FIELDS = ("t_ns", "tick", "status")
+"""Fields of the samples that are read before the signals of a file that may be long."""
+
+_MIN_SAMPLE_BYTES = 60
+"""Assumed minimum size of a sample in a file, in bytes after compression."""
+
 RECORD_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
 """Fields of the samples that an analysis needs."""
+
+
+@dataclass(frozen=True, slots=True)
+class FullRate:
+    """Samples of a record as its file contains them.
+
+    Attributes
+    ----------
+    rate_hz
+        Ticks per second.
+    samples
+        Number of ticks from the first to the last sample.
+    sweep
+        Range of ticks with the excitation, relative to the first.
+    """
+
+    rate_hz: float
+    samples: int
+    sweep: slice
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +150,9 @@ class Record:
         ``rest`` are relative to the angle held there.
     swept_hz
         Lowest and highest frequency of the sweep in a part of a session; None for the whole one.
+    decimated_from
+        Rate, samples and sweep of a long record before it was decimated while it was read; None if
+        all samples in the file are those of the record. `gaps` and `flags` count in the file.
     """
 
     path: Path
@@ -148,6 +182,12 @@ class Record:
     outcome: str
     part_s: tuple[float, float] | None = None
     swept_hz: tuple[float, float] | None = None
+    decimated_from: FullRate | None = None
+
+    @property
+    def full_rate(self) -> FullRate:
+        """Rate, number of samples and sweep of the record as it is in the file."""
+        return self.decimated_from or FullRate(self.rate_hz, len(self.time_s), self.sweep)
 
     @property
     def part_json(self) -> dict[str, float] | None:
@@ -177,7 +217,13 @@ class Record:
         return int(self.first_sweep.stop - self.first_sweep.start)
 
 
-def load_record(path: Path, part_s: PartOption | None = None) -> Record:
+def load_record(
+    path: Path,
+    part_s: PartOption | None = None,
+    *,
+    highest_hz: float = RECORD_BAND_HZ[1],
+    longest_samples: int = LONGEST_FULL_RATE_SAMPLES,
+) -> Record:
     """Read a session file and return its record on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
@@ -192,6 +238,11 @@ def load_record(path: Path, part_s: PartOption | None = None) -> Record:
     part_s
         Beginning and end of the part to be read, in seconds since the session's start; None for the
         session's beginning or end. By default, the whole session is read.
+    highest_hz
+        Highest frequency of the analysis. A long record is decimated to 2.5 times this rate while
+        it is read.
+    longest_samples
+        Maximum number of samples of a record that is not decimated.
 
     Raises
     ------
@@ -208,7 +259,31 @@ def load_record(path: Path, part_s: PartOption | None = None) -> Record:
     >>> print(record.sweep_samples, record.gaps.missing_ticks)
     20000 0
     """
-    return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES), part_s)
+    if not _may_be_longer(path, longest_samples):
+        return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES), part_s)
+    # The signals are read after the ticks of all samples: they may take too much memory.
+    session = read_session(path, fields=_TICK_FIELDS, max_samples=MAX_SAMPLES)
+    grid, covered_s = _grid_of(session, part_s)
+    rest_first, rest_end = session.segments.get("rest", (0, 0))
+    rest_angles_rad: list[NDArray[np.float64]] = []
+    collector = collector_of_signals(grid, highest_hz, longest_samples)
+
+    def add_samples(samples: NDArray[np.void]) -> None:
+        is_at_rest = (samples["tick"] >= rest_first) & (samples["tick"] < rest_end)
+        if is_at_rest.any():
+            rest_angles_rad.append(samples["angle_rad"][is_at_rest])
+        collector.add(samples)
+
+    read_session(path, fields=("t_ns", "tick"), max_samples=MAX_SAMPLES, on_samples=add_samples)
+    return _record(session, grid, collector.finish(), covered_s, _median_rad(rest_angles_rad))
+
+
+def _may_be_longer(path: Path, sample_count: int) -> bool:
+    """Return whether a file may contain more than a number of samples, by its size."""
+    try:
+        return path.stat().st_size > sample_count * _MIN_SAMPLE_BYTES
+    except OSError:  # reported when the file is opened
+        return False
 
 
 def record_of(session: Session, part_s: PartOption | None = None) -> Record:
@@ -228,31 +303,73 @@ def record_of(session: Session, part_s: PartOption | None = None) -> Record:
     RecordError
         The samples cannot be analysed.
     """
-    path, whole_session = session.path, session
+    grid, covered_s = _grid_of(session, part_s)
+    collector = FullRateSignals(grid)
+    collector.add(session.samples)
+    ticks = session.samples["tick"]
+    rest_first, rest_end = session.segments.get("rest", (0, 0))
+    is_at_rest = (ticks >= rest_first) & (ticks < rest_end)
+    rest_angle_rad = _median_rad([session.samples["angle_rad"][is_at_rest]])
+    return _record(session, grid, collector.finish(), covered_s, rest_angle_rad)
+
+
+def _median_rad(angles_rad: list[NDArray[np.float64]]) -> float | None:
+    """Return the median of blocks of angles; None if there is no angle."""
+    all_angles_rad = np.concatenate(angles_rad) if angles_rad else np.zeros(0)
+    return float(np.median(all_angles_rad)) if all_angles_rad.size else None
+
+
+def _grid_of(
+    session: Session, part_s: PartOption | None
+) -> tuple[TickGrid, tuple[float, float] | None]:
+    """Return the ticks of a session or of a part of it, and beginning and end of the part in s."""
     if len(session.samples) == 0:
-        raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
+        raise RecordError(
+            f"{session.path}: the session holds no samples, so there is nothing to analyse."
+        )
     rate_hz = stated_rate_hz(session)
-    covered_s = None
-    if part_s is not None:
-        session, covered_s = part_of_session(session, part_s, rate_hz)
-    grid = TickGrid.of(session, rate_hz)
-    samples = session.samples
-    ticks = samples["tick"]
-    for field_name in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
-        check_finite(path, field_name, samples[field_name], ticks)
-    check_sensor(path, samples["coupling_torque_nm"])
+    if part_s is None:
+        return TickGrid.of(session, rate_hz), None
+    part, covered_s = part_of_session(session, part_s, rate_hz)
+    return TickGrid.of(part, rate_hz), covered_s
+
+
+def _record(
+    session: Session,
+    grid: TickGrid,
+    signals: Signals,
+    covered_s: tuple[float, float] | None,
+    rest_angle_rad: float | None,
+) -> Record:
+    """Return the record of a session, or of the part of it to which `grid` belongs.
+
+    `rest_angle_rad` is the angle that is held in the session's segment ``rest``.
+    """
     metadata, unread_metadata = readable_texts(session.metadata, "keys of the metadata")
     outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
-    record = Record(
-        path=path,
-        time_s=(grid.first_tick + np.arange(grid.count)) / rate_hz,
-        reference_rad=_fill_grid(samples["angle_reference_rad"], grid.indices, grid.is_missing),
-        angle_rad=_fill_grid(samples["angle_rad"], grid.indices, grid.is_angle_unknown),
-        torque_nm=_fill_grid(samples["coupling_torque_nm"], grid.indices, grid.is_torque_unknown),
-        angle_known=~grid.is_angle_unknown,
-        torque_known=grid.is_torque_measured,
-        rate_hz=rate_hz,
-        beam=stated_beam(session, rate_hz, grid.count),
+    reference_rad, angle_rad, torque_nm = signals.values
+    ticks = grid.first_tick + signals.first_tick + signals.factor * np.arange(torque_nm.size)
+    beam = stated_beam(session, grid.rate_hz, grid.count)
+    swept_hz = None
+    if covered_s is not None:
+        check_part_length(session.path, covered_s, beam)
+        first_sweep = grid.there or grid.sweep
+        swept_hz = swept_frequencies_hz(
+            session, grid.first_tick + first_sweep.start, grid.first_tick + first_sweep.stop
+        )
+        if "rest" not in grid.session.segments and rest_angle_rad is not None:
+            reference_rad, angle_rad = reference_rad - rest_angle_rad, angle_rad - rest_angle_rad
+            rest_angle_rad = None
+    return Record(
+        path=session.path,
+        time_s=ticks / grid.rate_hz,
+        reference_rad=reference_rad,
+        angle_rad=angle_rad,
+        torque_nm=torque_nm,
+        angle_known=signals.angle_known,
+        torque_known=signals.torque_known,
+        rate_hz=grid.rate_hz / signals.factor,
+        beam=beam,
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
@@ -261,9 +378,9 @@ def record_of(session: Session, part_s: PartOption | None = None) -> Record:
         uniformity=stated_uniformity(session),
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
-        sweep=grid.sweep,
-        there=grid.there,
-        rest_angle_rad=_rest_angle(session),
+        sweep=signals.samples_in(grid.sweep),
+        there=None if grid.there is None else signals.samples_in(grid.there),
+        rest_angle_rad=rest_angle_rad,
         gaps=grid.gaps(),
         flags=grid.flag_counts(),
         warnings=(
@@ -275,51 +392,9 @@ def record_of(session: Session, part_s: PartOption | None = None) -> Record:
         ),
         metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
-    )
-    if covered_s is None:
-        return record
-    return _record_of_part(record, covered_s, whole_session, grid.first_tick)
-
-
-def _record_of_part(
-    record: Record, covered_s: tuple[float, float], session: Session, first_tick: int
-) -> Record:
-    """Return the record of a part with what only the whole session states.
-
-    `first_tick` is the number of the part's first tick.
-    """
-    check_part_length(record.path, covered_s, record.beam)
-    sweep = record.first_sweep
-    rest_angle_rad = _rest_angle(session) if record.rest_angle_rad is None else None
-    origin_rad = rest_angle_rad or 0.0
-    return replace(
-        record,
-        reference_rad=record.reference_rad - origin_rad,
-        angle_rad=record.angle_rad - origin_rad,
         part_s=covered_s,
-        swept_hz=swept_frequencies_hz(session, first_tick + sweep.start, first_tick + sweep.stop),
+        swept_hz=swept_hz,
+        decimated_from=None
+        if signals.factor == 1
+        else FullRate(grid.rate_hz, grid.count, grid.sweep),
     )
-
-
-def _rest_angle(session: Session) -> float | None:
-    """Return the median angle in rad over the segment ``rest``; None without this segment."""
-    ticks = session.samples["tick"]
-    first_tick, end_tick = session.segments.get("rest", (0, 0))
-    is_at_rest = (ticks >= first_tick) & (ticks < end_tick)
-    return float(np.median(session.samples["angle_rad"][is_at_rest])) if is_at_rest.any() else None
-
-
-def _fill_grid(
-    sample_values: NDArray[np.float64],
-    tick_indices: NDArray[np.int64],
-    is_unknown: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Return values on the whole grid, with linear interpolation of unknown ones."""
-    grid_values = np.zeros(len(is_unknown))
-    grid_values[tick_indices] = sample_values
-    if is_unknown.any() and not is_unknown.all():
-        known_indices = np.flatnonzero(~is_unknown)
-        grid_values[is_unknown] = np.interp(
-            np.flatnonzero(is_unknown), known_indices, grid_values[known_indices]
-        )
-    return grid_values

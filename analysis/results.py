@@ -358,9 +358,10 @@ def record_result(
     """
     from analysis.identify import MeasurementError
     from analysis.record import load_record
-    from analysis.suited import check_record_band, remarks, welch_analysis
+    from analysis.suited import check_record_band, highest_frequency_hz, remarks, welch_analysis
 
-    record = with_uniformity(load_record(path, routes.part_s), routes.uniformity)
+    record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
+    record = with_uniformity(record, routes.uniformity)
     record = _add_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
     if not routes.paper:

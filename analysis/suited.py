@@ -51,6 +51,17 @@ _COMPLETE_FRACTION: Final = 0.99
 end."""
 
 
+def highest_frequency_hz(requested_hz: Band | None = None) -> float:
+    """Return the highest frequency in Hz of the analyses with the requested or default band.
+
+    Parameters
+    ----------
+    requested_hz : tuple of float, optional
+        Requested band in Hz.
+    """
+    return (requested_hz or RECORD_BAND_HZ)[1]
+
+
 def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
     """Return the frequency band in Hz of the whole-record fits.
 
@@ -132,6 +143,14 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
     remark_sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
         remark_sentences = (*remark_sentences, _TWO_SWEEPS_REMARK)
+    if record.decimated_from is not None:
+        remark_sentences = (
+            *remark_sentences,
+            f"The record is long ({record.decimated_from.samples / record.full_rate.rate_hz:.0f} "
+            f"s): it was decimated from {record.full_rate.rate_hz:g} to {record.rate_hz:g} Hz "
+            "while it was read, which frequencies above "
+            f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz do not pass.",
+        )
     first_hz, last_hz = record_band_hz(record, requested_hz)
     if requested_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:
         return remark_sentences
