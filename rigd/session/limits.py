@@ -5,7 +5,7 @@ A reader's memory and time grow with the sizes and counts that a file states, so
 
 from typing import Final
 
-MAX_SAMPLES: Final = 2_400_000
+MAX_SAMPLES: Final = 7_200_000
 """Maximum number of samples of a record that is planned, recorded, imported, analysed, exported or
 replayed: 40 minutes at 1 kHz. The samples take 0.27 GB of memory. An analysis, which is limited to
 1 GB, takes 0.16 GB and 0.29 kB for each sample, which is 0.53 GB for 1.27 million samples."""
