@@ -30,12 +30,11 @@ from analysis.record_checks import (
 from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
 from analysis.record_signals import (
     LONGEST_FULL_RATE_SAMPLES,
-    FullRateSignals,
     Signals,
     collector_of_signals,
 )
 from analysis.record_ticks import Gaps, TickGrid
-from rigd.session import Session, read_session, readable_texts
+from rigd.session import Session, limits, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -260,9 +259,12 @@ def load_record(
     20000 0
     """
     if not _may_be_longer(path, longest_samples):
-        return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES), part_s)
+        session = read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES)
+        return record_of(session, part_s, highest_hz=highest_hz, longest_samples=longest_samples)
     # The signals are read after the ticks of all samples: they may take too much memory.
-    session = read_session(path, fields=_TICK_FIELDS, max_samples=MAX_SAMPLES)
+    session = read_session(
+        path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
     grid, covered_s = _grid_of(session, part_s)
     rest_first, rest_end = session.segments.get("rest", (0, 0))
     rest_angles_rad: list[NDArray[np.float64]] = []
@@ -274,7 +276,12 @@ def load_record(
             rest_angles_rad.append(samples["angle_rad"][is_at_rest])
         collector.add(samples)
 
-    read_session(path, fields=("t_ns", "tick"), max_samples=MAX_SAMPLES, on_samples=add_samples)
+    read_session(
+        path,
+        fields=("t_ns", "tick"),
+        max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+        on_samples=add_samples,
+    )
     return _record(session, grid, collector.finish(), covered_s, _median_rad(rest_angles_rad))
 
 
@@ -286,7 +293,13 @@ def _may_be_longer(path: Path, sample_count: int) -> bool:
         return False
 
 
-def record_of(session: Session, part_s: PartOption | None = None) -> Record:
+def record_of(
+    session: Session,
+    part_s: PartOption | None = None,
+    *,
+    highest_hz: float = RECORD_BAND_HZ[1],
+    longest_samples: int = LONGEST_FULL_RATE_SAMPLES,
+) -> Record:
     """Return the record of a session on a uniform time grid (see `load_record`).
 
     Parameters
@@ -295,6 +308,9 @@ def record_of(session: Session, part_s: PartOption | None = None) -> Record:
         Session from a file, or a running one so far. Its samples need the `RECORD_FIELDS`.
     part_s
         Part of the session, as for `load_record`.
+    highest_hz, longest_samples
+        Highest frequency of the analysis, and maximum number of samples that are not decimated, as
+        for `load_record`.
 
     Raises
     ------
@@ -304,7 +320,7 @@ def record_of(session: Session, part_s: PartOption | None = None) -> Record:
         The samples cannot be analysed.
     """
     grid, covered_s = _grid_of(session, part_s)
-    collector = FullRateSignals(grid)
+    collector = collector_of_signals(grid, highest_hz, longest_samples)
     collector.add(session.samples)
     ticks = session.samples["tick"]
     rest_first, rest_end = session.segments.get("rest", (0, 0))

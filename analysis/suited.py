@@ -125,9 +125,22 @@ def welch_settings(
     if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
         requested_hz = settings.band_hz
     first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record)
+    settings = _at_analysed_rate(settings, record)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
     return replace(settings, band_hz=(first_hz, last_hz))
+
+
+def _at_analysed_rate(settings: WelchSettings, record: Record) -> WelchSettings:
+    """Return settings whose requested lengths are in samples of a decimated record."""
+    ratio = record.rate_hz / record.full_rate.rate_hz
+    if ratio == 1:
+        return settings
+    segment_length, overlap, nfft = (
+        None if length is None else round(length * ratio)
+        for length in (settings.segment_length, settings.overlap, settings.nfft)
+    )
+    return replace(settings, segment_length=segment_length, overlap=overlap, nfft=nfft)
 
 
 def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]:
@@ -148,8 +161,8 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
             *remark_sentences,
             f"The record is long ({record.decimated_from.samples / record.full_rate.rate_hz:.0f} "
             f"s): it was decimated from {record.full_rate.rate_hz:g} to {record.rate_hz:g} Hz "
-            "while it was read, which frequencies above "
-            f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz do not pass.",
+            f"while it was read, which preserves frequencies up to "
+            f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz.",
         )
     first_hz, last_hz = record_band_hz(record, requested_hz)
     if requested_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:

@@ -250,6 +250,7 @@ class DragResponse:
             modal_forces[:, steps] = self._modal_forces(
                 _drag_force(self._point_speed(modal_speeds[:, steps]), DragLaw(1.0))
             )
+        del modal_speeds
         return self._torque_over_time(modal_forces)
 
     def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
@@ -534,7 +535,13 @@ class DragResponse:
 
         Its shape is (modes + 1, bins).
         """
-        return self._transform.forward(modal_forces, oversampling=_OVERSAMPLING)
+        # One row after another: the transforms at the higher rate take three times their result.
+        return np.array(
+            [
+                self._transform.forward(modal_force, oversampling=_OVERSAMPLING)
+                for modal_force in modal_forces
+            ]
+        )
 
     def _torque_transform(self, force_spectra: Complex) -> Complex:
         """Return the Laplace transform of the torque that modal forces and root moment cause.
