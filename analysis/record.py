@@ -30,7 +30,7 @@ from analysis.record_checks import (
 from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
 from analysis.record_signals import (
     LONGEST_FULL_RATE_SAMPLES,
-    Signals,
+    RecordSignals,
     collector_of_signals,
 )
 from analysis.record_ticks import Gaps, TickGrid
@@ -353,7 +353,7 @@ def _grid_of(
 def _record(
     session: Session,
     grid: TickGrid,
-    signals: Signals,
+    signals: RecordSignals,
     covered_s: tuple[float, float] | None,
     rest_angle_rad: float | None,
 ) -> Record:

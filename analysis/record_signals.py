@@ -1,4 +1,4 @@
-"""Signals of a record: at the full rate, or decimated block by block while the file is read.
+"""RecordSignals of a record: at the full rate, or decimated block by block while the file is read.
 
 A fit to a band of 50 Hz needs 125 samples per second, and the signals of a long record at their
 full rate would fill the memory. They therefore pass a linear-phase low-pass filter in blocks.
@@ -36,7 +36,7 @@ MAX_DECIMATED_SAMPLES: Final = 1_000_000
 """Maximum number of samples of a long record after decimation: two hours for a band of 50 Hz."""
 
 SIGNAL_FIELDS: Final = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
-"""Fields of a sample that are filtered, in the order of the rows of `Signals.values`."""
+"""Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
 
 _BLOCK_TICKS: Final = 1 << 16
 """Number of ticks after which a block is filtered."""
@@ -50,8 +50,8 @@ frequency (see `interpolate_gaps`)."""
 
 
 @dataclass(frozen=True, slots=True)
-class Signals:
-    """Signals of a record, with masks of their known values.
+class RecordSignals:
+    """RecordSignals of a record, with masks of their known values.
 
     Attributes
     ----------
@@ -87,7 +87,7 @@ class Signals:
 
 
 class FullRateSignals:
-    """Signals of a record at its full rate, with linear interpolation of unknown values.
+    """RecordSignals of a record at its full rate, with linear interpolation of unknown values.
 
     Parameters
     ----------
@@ -106,7 +106,7 @@ class FullRateSignals:
             check_finite(self.grid.session.path, field_name, samples[field_name], samples["tick"])
             self._values[row, ticks] = samples[field_name]
 
-    def finish(self) -> Signals:
+    def finish(self) -> RecordSignals:
         """Return the signals after the last sample was added.
 
         Raises
@@ -123,7 +123,7 @@ class FullRateSignals:
                 self._values[row, is_unknown] = np.interp(
                     np.flatnonzero(is_unknown), known_indices, self._values[row, known_indices]
                 )
-        return Signals(self._values, ~is_angle_unknown, grid.is_torque_measured)
+        return RecordSignals(self._values, ~is_angle_unknown, grid.is_torque_measured)
 
 
 def _inside(
@@ -252,7 +252,7 @@ class SignalDecimation:
         self._buffer[:, remaining.shape[1] :] = 0.0
         self._buffer_tick = next_tick
 
-    def finish(self) -> Signals:
+    def finish(self) -> RecordSignals:
         """Return the decimated signals after the last sample was added.
 
         Raises
@@ -266,7 +266,7 @@ class SignalDecimation:
         if self._done < self._results.shape[1]:
             raise RecordError(f"{path} was changed while it was read; analyse it again.")
         angle_known, torque_known = self._known_samples()
-        return Signals(
+        return RecordSignals(
             self._results, angle_known, torque_known, self._reach_ticks, self._decimation.factor
         )
 

@@ -33,10 +33,10 @@ _DECAY_EXPONENT = 7.0
 """Exponent of the transform's damping."""
 _LONGEST_AT_ONCE = 720_000
 """Maximum number of samples whose motion is computed at once. A longer record is divided into
-pieces, each with the motion before it that the beam still remembers, because an hour at 1 kHz would
+chunks, each with the motion before it that the beam still remembers, because an hour at 1 kHz would
 take 0.3 GB."""
 _MEMORY_EXPONENT = 12.0
-"""Decays that a piece of a record includes, as an exponent: exp(-12) is negligible."""
+"""Decays that a chunk of a record includes, as an exponent: exp(-12) is negligible."""
 _SLOWEST_MODES = 3
 """Number of modes among which that with the slowest decay is searched for."""
 _BLOCK_POINTS = 1 << 15
@@ -104,14 +104,14 @@ def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
     if angle_rad.size <= _LONGEST_AT_ONCE:
         return _tip_motion_from_rest(plant, angle_rad - angle_rad[0], rate_hz)
     lead_in = _memory_samples(plant, rate_hz)
-    piece_length = max(_LONGEST_AT_ONCE - lead_in, _LONGEST_AT_ONCE // 2)
+    chunk_length = max(_LONGEST_AT_ONCE - lead_in, _LONGEST_AT_ONCE // 2)
     largest = np.zeros(3)
-    for begin in range(0, angle_rad.size, piece_length):
+    for begin in range(0, angle_rad.size, chunk_length):
         first = max(begin - lead_in, 0)
-        piece_rad = angle_rad[first : begin + piece_length] - angle_rad[first]
+        chunk_rad = angle_rad[first : begin + chunk_length] - angle_rad[first]
         if first:  # no jump of the speed, which would let the beam ring
-            piece_rad[: lead_in // 4] *= 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, lead_in // 4))
-        motion = _tip_motion_from_rest(plant, piece_rad, rate_hz, begin - first)
+            chunk_rad[: lead_in // 4] *= 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, lead_in // 4))
+        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, begin - first)
         largest = np.maximum(largest, [motion.deflection_m, motion.slope_rad, motion.speed_m_s])
     return TipMotion(*largest.tolist())
 

@@ -146,14 +146,14 @@ class ClosedLoop:
         """
         response = LoopResponse(*np.empty((len(fields(LoopResponse)), reference_rad.size)))
         end = 0
-        for piece in self.simulate_in_pieces(reference_rad):
-            begin, end = end, end + piece.angle_rad.size
+        for chunk in self.simulate_in_chunks(reference_rad):
+            begin, end = end, end + chunk.angle_rad.size
             for channel in fields(LoopResponse):
-                getattr(response, channel.name)[begin:end] = getattr(piece, channel.name)
+                getattr(response, channel.name)[begin:end] = getattr(chunk, channel.name)
         return response
 
-    def simulate_in_pieces(self, reference_rad: Real) -> Iterator[LoopResponse]:
-        """Yield the response that `simulate` returns in consecutive pieces, which take less memory.
+    def simulate_in_chunks(self, reference_rad: Real) -> Iterator[LoopResponse]:
+        """Yield the response that `simulate` returns in consecutive chunks, which take less memory.
 
         Parameters
         ----------

@@ -584,21 +584,21 @@ def _peaks_and_angle(
 ) -> tuple[SessionPrediction, Real]:
     """Return the peak magnitudes of the simulated response to a reference, and its angle in rad.
 
-    Both arrays have the shape (n,). The response is computed in pieces: that of an hour would take
+    Both arrays have the shape (n,). The response is computed in chunks: that of an hour would take
     150 MB.
     """
     angle_rad = np.empty(reference_rad.size)
     peaks = np.zeros(5)
     end = 0
-    for piece in closed_loop.simulate_in_pieces(reference_rad):
-        begin, end = end, end + piece.angle_rad.size
-        angle_rad[begin:end] = piece.angle_rad
+    for chunk in closed_loop.simulate_in_chunks(reference_rad):
+        begin, end = end, end + chunk.angle_rad.size
+        angle_rad[begin:end] = chunk.angle_rad
         signals = (
-            piece.angle_rad,
-            piece.velocity_rad_s,
-            piece.torque_nm,
-            reference_rad[begin:end] - piece.angle_rad,
-            piece.coupling_torque_nm,
+            chunk.angle_rad,
+            chunk.velocity_rad_s,
+            chunk.torque_nm,
+            reference_rad[begin:end] - chunk.angle_rad,
+            chunk.coupling_torque_nm,
         )
         peaks = np.maximum(peaks, [_peak(signal) for signal in signals])
     angle, velocity, torque, tracking_error, coupling_torque = map(float, peaks)
