@@ -31,6 +31,7 @@ from analysis.record_part import check_part_length, part_of_session, swept_frequ
 from analysis.record_signals import (
     LONGEST_FULL_RATE_SAMPLES,
     RecordSignals,
+    TorqueExtreme,
     collector_of_signals,
 )
 from analysis.record_ticks import Gaps, TickGrid
@@ -152,6 +153,8 @@ class Record:
     decimated_from
         Rate, samples and sweep of a long record before it was decimated while it was read; None if
         all samples in the file are those of the record. `gaps` and `flags` count in the file.
+    torque_extremes
+        Largest and smallest torque in the file of a decimated record; empty for another.
     """
 
     path: Path
@@ -182,6 +185,7 @@ class Record:
     part_s: tuple[float, float] | None = None
     swept_hz: tuple[float, float] | None = None
     decimated_from: FullRate | None = None
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @property
     def full_rate(self) -> FullRate:
@@ -413,4 +417,5 @@ def _record(
         decimated_from=None
         if signals.factor == 1
         else FullRate(grid.rate_hz, grid.count, grid.sweep),
+        torque_extremes=signals.torque_extremes,
     )

@@ -50,6 +50,53 @@ frequency (see `interpolate_gaps`)."""
 
 
 @dataclass(frozen=True, slots=True)
+class TorqueExtreme:
+    """Largest or smallest measured torque, and how often it was measured.
+
+    Attributes
+    ----------
+    limit_nm : float
+        Torque.
+    values : int
+        Number of samples with exactly this torque.
+    repeated : int
+        Number of these samples that are next to another one.
+    """
+
+    limit_nm: float
+    values: int
+    repeated: int
+
+
+class _ExtremeCount:
+    """Count of the samples at the extreme of a torque that arrives in blocks; NaN is unknown."""
+
+    def __init__(self, sign: int) -> None:
+        self._sign = sign
+        self._limit_nm = -np.inf
+        self._values = self._repeated = 0
+        self._last_nm = np.full(2, np.nan)
+
+    def add(self, torque_nm: NDArray[np.float64]) -> None:
+        """Include the next values."""
+        signed_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
+        largest_nm = float(np.max(signed_nm[2:], initial=-np.inf, where=~np.isnan(signed_nm[2:])))
+        if largest_nm > self._limit_nm:
+            self._limit_nm, self._values, self._repeated = largest_nm, 0, 0
+        is_at_limit = signed_nm == self._limit_nm
+        follows_another = is_at_limit[2:] & is_at_limit[1:-1]
+        self._values += int(np.count_nonzero(is_at_limit[2:]))
+        # The first of a run of such values counts when the second arrives.
+        self._repeated += int(np.count_nonzero(follows_another))
+        self._repeated += int(np.count_nonzero(follows_another & ~is_at_limit[:-2]))
+        self._last_nm = signed_nm[-2:]
+
+    def result(self) -> TorqueExtreme:
+        """Return the extreme of all values."""
+        return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
+
+
+@dataclass(frozen=True, slots=True)
 class RecordSignals:
     """RecordSignals of a record, with masks of their known values.
 
@@ -63,6 +110,9 @@ class RecordSignals:
         Tick of the first sample, relative to the first tick of the record.
     factor : int
         Number of ticks from one sample to the next.
+    torque_extremes : tuple of TorqueExtreme
+        Largest and smallest measured torque before the signals were decimated; empty if they were
+        not.
     """
 
     values: NDArray[np.float64]
@@ -70,6 +120,7 @@ class RecordSignals:
     torque_known: NDArray[np.bool_]
     first_tick: int = 0
     factor: int = 1
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     def samples_in(self, ticks: slice) -> slice:
         """Return the range of the samples inside a range of ticks of the record.
@@ -157,6 +208,7 @@ class SignalDecimation:
     _end_tick: int = 0
     _done: int = 0
     _torque_range_nm: tuple[float, float] = (np.inf, -np.inf)
+    _extremes: tuple[_ExtremeCount, ...] = field(init=False)
 
     def __post_init__(self) -> None:
         grid = self.grid
@@ -168,6 +220,7 @@ class SignalDecimation:
         sample_count = (grid.count - 1) // factor + 1 - 2 * reach
         _check_length(grid, self.highest_hz, max(sample_count, 0))
         self._buffer = np.zeros((len(SIGNAL_FIELDS), _BLOCK_TICKS + 2 * self._margin_ticks))
+        self._extremes = (_ExtremeCount(1), _ExtremeCount(-1))
         self._results = np.empty((len(SIGNAL_FIELDS), sample_count))
 
     @property
@@ -221,6 +274,9 @@ class SignalDecimation:
             min(self._torque_range_nm[0], float(torque_nm.min())),
             max(self._torque_range_nm[1], float(torque_nm.max())),
         )
+        measured_nm = np.where(self._known[2][ticks], torque_nm, np.nan)
+        for extreme in self._extremes:
+            extreme.add(measured_nm)
         self._end_tick = end_tick
 
     def _filter_block(self, *, last: bool = False) -> None:
@@ -267,7 +323,12 @@ class SignalDecimation:
             raise RecordError(f"{path} was changed while it was read; analyse it again.")
         angle_known, torque_known = self._known_samples()
         return RecordSignals(
-            self._results, angle_known, torque_known, self._reach_ticks, self._decimation.factor
+            self._results,
+            angle_known,
+            torque_known,
+            self._reach_ticks,
+            self._decimation.factor,
+            tuple(extreme.result() for extreme in self._extremes),
         )
 
     def _known_samples(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:

@@ -23,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record import Record
+    from analysis.record_signals import TorqueExtreme
     from rigd.beam import Beam
 
 
@@ -189,6 +190,8 @@ class Measurement:
     is_single_sweep : bool
         Whether the motor passed each frequency once, in rising or falling order. An effect of time
         then cannot be distinguished from an effect of frequency.
+    torque_extremes : tuple of TorqueExtreme
+        Largest and smallest torque before a decimation of the record; empty without one.
     """
 
     name: str
@@ -209,6 +212,7 @@ class Measurement:
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
     is_single_sweep: bool = True
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -243,6 +247,7 @@ class Measurement:
             axis_tilt_deg=record.axis_tilt_deg,
             is_single_sweep=record.metadata.get("excitation", "chirp") == "chirp"
             and record.there is None,
+            torque_extremes=record.torque_extremes,
         )
 
     def check(self, highest_hz: float) -> None:

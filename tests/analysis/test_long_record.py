@@ -99,6 +99,24 @@ def test_a_short_gap_is_interpolated_and_a_long_one_reaches_as_far_as_the_filter
         assert 0 < error[short].max() < 0.01 * np.abs(expected).max()
 
 
+def test_clipping_is_found_in_all_samples(
+    paper_file, paper_signals, write_session, tmp_path, decimated
+):
+    most_nm = 0.9 * np.abs(paper_signals.torque_nm).max()
+    torque_nm = np.clip(paper_signals.torque_nm, -most_nm, None)
+    at_limit = torque_nm == -most_nm
+    path = write_session(tmp_path / "clipped.mcap", replace(paper_signals, torque_nm=torque_nm))
+    largest, smallest = load_record(path, longest_samples=LONGEST).torque_extremes
+    assert (smallest.limit_nm, smallest.values) == (-most_nm, np.count_nonzero(at_limit))
+    neighbours = np.roll(at_limit, 1) | np.roll(at_limit, -1)
+    assert smallest.repeated == np.count_nonzero(at_limit & neighbours) >= 4
+    assert (largest.limit_nm, largest.values) == (torque_nm.max(), 1)
+    assert decimated.torque_extremes[1].values == 1
+    assert load_record(paper_file).torque_extremes == ()
+    measurement = Measurement.of_record(load_record(path, longest_samples=LONGEST))
+    assert measurement.torque_extremes == (largest, smallest)
+
+
 def test_a_record_that_no_analysis_has_room_for_names_the_remedies(paper_file, monkeypatch):
     monkeypatch.setattr("analysis.record_signals.MAX_DECIMATED_SAMPLES", 16_000)
     with pytest.raises(RecordError, match=r"16\d\d\d samples.*--from, --to\) or lower --band"):
