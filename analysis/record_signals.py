@@ -12,7 +12,7 @@ whose filter window contains it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -22,8 +22,6 @@ from analysis.models import LARGEST_FRACTION_OF_RATE
 from analysis.record_checks import RecordError, check_finite, check_sensor
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
-
     from numpy.typing import NDArray
 
     from analysis.record_ticks import TickGrid
@@ -33,7 +31,8 @@ LONGEST_FULL_RATE_SAMPLES: Final = 720_000
 which take 0.5 GB of memory. The signals of a longer record are decimated while they are read."""
 
 MAX_DECIMATED_SAMPLES: Final = 1_000_000
-"""Maximum number of samples of a long record after decimation: two hours for a band of 50 Hz."""
+"""Maximum number of samples of a long record after decimation, with which an analysis takes 2 GB of
+memory. An hour has 450 000 for a band of 50 Hz."""
 
 SIGNAL_FIELDS: Final = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
 """Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
@@ -186,42 +185,37 @@ def _inside(
     return (samples, ticks) if is_inside.all() else (samples[is_inside], ticks[is_inside])
 
 
-@dataclass(slots=True)
 class SignalDecimation:
     """Decimation of the signals of a record that arrive in blocks.
 
-    Attributes
+    Parameters
     ----------
     grid : TickGrid
         Ticks of the record.
     highest_hz : float
         Highest frequency that is preserved.
+
+    Raises
+    ------
+    RecordError
+        The record has too many samples for the memory that an analysis may take.
     """
 
-    grid: TickGrid
-    highest_hz: float
-    _decimation: Decimation = field(init=False)
-    _known: Sequence[NDArray[np.bool_]] = field(init=False)
-    _buffer: NDArray[np.float64] = field(init=False)
-    _results: NDArray[np.float64] = field(init=False)
-    _buffer_tick: int = 0
-    _end_tick: int = 0
-    _done: int = 0
-    _torque_range_nm: tuple[float, float] = (np.inf, -np.inf)
-    _extremes: tuple[_ExtremeCount, ...] = field(init=False)
-
-    def __post_init__(self) -> None:
-        grid = self.grid
+    def __init__(self, grid: TickGrid, highest_hz: float) -> None:
+        self.grid, self.highest_hz = grid, highest_hz
         self._decimation = Decimation.to_band(
-            grid.rate_hz, self.highest_hz, 1 / LARGEST_FRACTION_OF_RATE
+            grid.rate_hz, highest_hz, 1 / LARGEST_FRACTION_OF_RATE
         )
-        self._known = (~grid.is_missing, ~grid.is_angle_unknown, grid.is_torque_measured)
         factor, reach = self._decimation.factor, self._decimation.reach
         sample_count = (grid.count - 1) // factor + 1 - 2 * reach
-        _check_length(grid, self.highest_hz, max(sample_count, 0))
-        self._buffer = np.zeros((len(SIGNAL_FIELDS), _BLOCK_TICKS + 2 * self._margin_ticks))
-        self._extremes = (_ExtremeCount(1), _ExtremeCount(-1))
+        _check_length(grid, highest_hz, max(sample_count, 0))
+        self._known = (~grid.is_missing, ~grid.is_angle_unknown, grid.is_torque_measured)
         self._results = np.empty((len(SIGNAL_FIELDS), sample_count))
+        self._done = 0  # number of results
+        self._buffer = np.zeros((len(SIGNAL_FIELDS), _BLOCK_TICKS + 2 * self._margin_ticks))
+        self._buffer_tick = self._end_tick = 0  # ticks of the buffer and after its last sample
+        self._torque_range_nm = (np.inf, -np.inf)
+        self._extremes = (_ExtremeCount(1), _ExtremeCount(-1))
 
     @property
     def factor(self) -> int:
