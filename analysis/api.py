@@ -18,18 +18,22 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
+    from analysis.record_part import PartOption
     from rigd.spectral import FrequencyResponse
 
 __all__ = ["campaign", "fit", "frf", "load", "select"]
 
 
-def load(path: Path | str) -> Record:
+def load(path: Path | str, part_s: PartOption | None = None) -> Record:
     """Read a session file and return its record on a uniform time grid.
 
     Parameters
     ----------
     path : Path or str
         Session file (``.mcap``, see ``docs/session_format.md``).
+    part_s : tuple of float or None, optional
+        Beginning and end of the part to be read, in seconds since the session's start; None for
+        the session's beginning or end. By default, the whole session is read.
 
     Returns
     -------
@@ -52,7 +56,7 @@ def load(path: Path | str) -> Record:
     """
     from analysis.record import load_record
 
-    return load_record(Path(path))
+    return load_record(Path(path), part_s)
 
 
 def frf(record: Record, settings: WelchSettings | None = None) -> FrequencyResponse:

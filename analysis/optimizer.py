@@ -348,19 +348,22 @@ def _update_second_part(
 _Value = TypeVar("_Value")
 """Type of the cached values."""
 
-_CACHED_POINTS: Final = 2
-"""Number of points whose values are cached: the last step of a descent may have been rejected."""
-
 
 class RecentValues(Generic[_Value]):
-    """Cache of a function's values at the last two points of a descent.
+    """Cache of a function's values at the last points of a descent.
 
     Covariances are evaluated at the last point of a descent, and the next descent begins there.
+
+    Parameters
+    ----------
+    points : int
+        Number of points; with two, the last step of a descent may have been rejected.
     """
 
-    __slots__ = ("_values",)
+    __slots__ = ("_points", "_values")
 
-    def __init__(self) -> None:
+    def __init__(self, points: int = 2) -> None:
+        self._points = points
         self._values: dict[bytes, _Value] = {}
 
     def at(
@@ -377,7 +380,7 @@ class RecentValues(Generic[_Value]):
         """
         key = x.tobytes()
         if key not in self._values:
-            if len(self._values) == _CACHED_POINTS:
+            if len(self._values) == self._points:
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]

@@ -11,17 +11,12 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from analysis.models import RECORD_BAND_HZ
 from analysis.record_checks import (
     MAX_GAP_S,
     MAX_TICKS,
     MAX_UNKNOWN_FRACTION,
     RecordError,
-    check_clock,
-    check_fillable,
-    check_finite,
-    check_sensor,
-    check_span,
-    longest_run,
     stated_axis_tilt_deg,
     stated_beam,
     stated_delay_s,
@@ -32,8 +27,15 @@ from analysis.record_checks import (
     stated_uncertainty,
     stated_uniformity,
 )
-from rigd.session import Session, read_session, readable_texts
-from rigd.session.layout import Status
+from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
+from analysis.record_signals import (
+    LONGEST_FULL_RATE_SAMPLES,
+    RecordSignals,
+    TorqueExtreme,
+    collector_of_signals,
+)
+from analysis.record_ticks import Gaps, TickGrid
+from rigd.session import Session, limits, read_session, readable_texts
 
 if TYPE_CHECKING:
     from collections.abc import Mapping
@@ -41,6 +43,7 @@ if TYPE_CHECKING:
 
     from numpy.typing import NDArray
 
+    from analysis.record_part import PartOption
     from rigd.beam import Beam
 
 __all__ = [
@@ -48,6 +51,7 @@ __all__ = [
     "MAX_SAMPLES",
     "MAX_UNKNOWN_FRACTION",
     "RECORD_FIELDS",
+    "FullRate",
     "Gaps",
     "Record",
     "RecordError",
@@ -58,54 +62,33 @@ __all__ = [
 MAX_SAMPLES = MAX_TICKS
 """Largest number of samples of a session that are read."""
 
+_TICK_FIELDS = ("t_ns", "tick", "status")
+"""Fields of the samples that are read before the signals of a file that may be long."""
+
+_MIN_SAMPLE_BYTES = 60
+"""Assumed minimum size of a sample in a file, in bytes after compression."""
+
 RECORD_FIELDS = ("t_ns", "tick", "angle_reference_rad", "angle_rad", "coupling_torque_nm", "status")
 """Fields of the samples that an analysis needs."""
 
-_REPORTED_FLAGS = (
-    (Status.TORQUE_SATURATED, "torque command saturated"),
-    (Status.WRENCH_SATURATED, "wrench saturated"),
-    (Status.ANGLE_STALE, "angle stale"),
-    (Status.WRENCH_STALE, "wrench stale"),
-    (Status.LIMIT_WARNING, "limit warning"),
-    (Status.TORQUE_OFF, "torque off"),
-    (Status.LATE, "late tick"),
-)
-"""Flags of a sample that are counted, with their meanings."""
-
-_UNKNOWN_SAMPLES_TEXT = (
-    "do not count in the whole-record fits; for the Welch fits they are interpolated."
-)
-"""End of the sentence on missing or stale samples."""
-
-_FLAG_CONSEQUENCES: tuple[tuple[str, str], ...] = (
-    ("wrench saturated", "The torque is clipped there and the estimate is wrong near it."),
-    ("torque command saturated", "The angle did not follow its reference there."),
-    ("torque off", "The motor was not driven there."),
-)
-"""Consequence for the analysis of each flag that causes a warning."""
-
 
 @dataclass(frozen=True, slots=True)
-class Gaps:
-    """Counts of the samples that were filled by linear interpolation.
+class FullRate:
+    """Samples of a record as its file contains them.
 
     Attributes
     ----------
-    missing_ticks
-        Ticks between the first and the last sample that have no sample.
-    longest_gap_ticks
-        Number of ticks in the longest gap.
-    sweep_missing_ticks
-        Missing ticks inside the sweep.
-    sweep_stale_angles, sweep_stale_torques
-        Recorded samples of the sweep whose angle or torque is flagged as held from an earlier tick.
+    rate_hz
+        Ticks per second.
+    samples
+        Number of ticks from the first to the last sample.
+    sweep
+        Range of ticks with the excitation, relative to the first.
     """
 
-    missing_ticks: int
-    longest_gap_ticks: int
-    sweep_missing_ticks: int
-    sweep_stale_angles: int
-    sweep_stale_torques: int
+    rate_hz: float
+    samples: int
+    sweep: slice
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,6 +144,17 @@ class Record:
         Metadata `session` of the file, as strings.
     outcome
         End of the session: ``complete``, ``stopped``, ``fault`` or ``unknown``.
+    part_s
+        Beginning and end of the part of the session that the record covers, in seconds since the
+        session's start; None for the whole session. The angles of a part without the segment
+        ``rest`` are relative to the angle held there.
+    swept_hz
+        Lowest and highest frequency of the sweep in a part of a session; None for the whole one.
+    decimated_from
+        Rate, samples and sweep of a long record before it was decimated while it was read; None if
+        all samples in the file are those of the record. `gaps` and `flags` count in the file.
+    torque_extremes
+        Largest and smallest torque in the file of a decimated record; empty for another.
     """
 
     path: Path
@@ -188,6 +182,27 @@ class Record:
     warnings: tuple[str, ...]
     metadata: Mapping[str, str]
     outcome: str
+    part_s: tuple[float, float] | None = None
+    swept_hz: tuple[float, float] | None = None
+    decimated_from: FullRate | None = None
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
+
+    @property
+    def full_rate(self) -> FullRate:
+        """Rate, number of samples and sweep of the record as it is in the file."""
+        return self.decimated_from or FullRate(self.rate_hz, len(self.time_s), self.sweep)
+
+    @property
+    def part_json(self) -> dict[str, float] | None:
+        """Part of the session as a JSON value; None for the whole session."""
+        return None if self.part_s is None else {"from_s": self.part_s[0], "to_s": self.part_s[1]}
+
+    @property
+    def part_text(self) -> str | None:
+        """Part of the session in words, such as "10 to 60 s of the session"; None for the whole."""
+        if self.part_s is None:
+            return None
+        return f"{self.part_s[0]:g} to {self.part_s[1]:g} s of the session"
 
     @property
     def sweep_samples(self) -> int:
@@ -205,7 +220,13 @@ class Record:
         return int(self.first_sweep.stop - self.first_sweep.start)
 
 
-def load_record(path: Path) -> Record:
+def load_record(
+    path: Path,
+    part_s: PartOption | None = None,
+    *,
+    highest_hz: float = RECORD_BAND_HZ[1],
+    longest_samples: int = LONGEST_FULL_RATE_SAMPLES,
+) -> Record:
     """Read a session file and return its record on a uniform time grid.
 
     Missing ticks, and values flagged as stale, are replaced by linear interpolation between their
@@ -217,6 +238,14 @@ def load_record(path: Path) -> Record:
     ----------
     path
         Session file (docs/session_format.md).
+    part_s
+        Beginning and end of the part to be read, in seconds since the session's start; None for the
+        session's beginning or end. By default, the whole session is read.
+    highest_hz
+        Highest frequency of the analysis. A long record is decimated to 2.5 times this rate while
+        it is read.
+    longest_samples
+        Maximum number of samples of a record that is not decimated.
 
     Raises
     ------
@@ -233,16 +262,59 @@ def load_record(path: Path) -> Record:
     >>> print(record.sweep_samples, record.gaps.missing_ticks)
     20000 0
     """
-    return record_of(read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES))
+    if not _may_be_longer(path, longest_samples):
+        session = read_session(path, fields=RECORD_FIELDS, max_samples=MAX_SAMPLES)
+        return record_of(session, part_s, highest_hz=highest_hz, longest_samples=longest_samples)
+    # The signals are read after the ticks of all samples: they may take too much memory.
+    session = read_session(
+        path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
+    )
+    grid, covered_s = _grid_of(session, part_s)
+    rest_first, rest_end = session.segments.get("rest", (0, 0))
+    rest_angles_rad: list[NDArray[np.float64]] = []
+    collector = collector_of_signals(grid, highest_hz, longest_samples)
+
+    def add_samples(samples: NDArray[np.void]) -> None:
+        is_at_rest = (samples["tick"] >= rest_first) & (samples["tick"] < rest_end)
+        if is_at_rest.any():
+            rest_angles_rad.append(samples["angle_rad"][is_at_rest])
+        collector.add(samples)
+
+    read_session(
+        path,
+        fields=("t_ns", "tick"),
+        max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
+        on_samples=add_samples,
+    )
+    return _record(session, grid, collector.finish(), covered_s, _median_rad(rest_angles_rad))
 
 
-def record_of(session: Session) -> Record:
+def _may_be_longer(path: Path, sample_count: int) -> bool:
+    """Return whether a file may contain more than a number of samples, by its size."""
+    try:
+        return path.stat().st_size > sample_count * _MIN_SAMPLE_BYTES
+    except OSError:  # reported when the file is opened
+        return False
+
+
+def record_of(
+    session: Session,
+    part_s: PartOption | None = None,
+    *,
+    highest_hz: float = RECORD_BAND_HZ[1],
+    longest_samples: int = LONGEST_FULL_RATE_SAMPLES,
+) -> Record:
     """Return the record of a session on a uniform time grid (see `load_record`).
 
     Parameters
     ----------
     session
         Session from a file, or a running one so far. Its samples need the `RECORD_FIELDS`.
+    part_s
+        Part of the session, as for `load_record`.
+    highest_hz, longest_samples
+        Highest frequency of the analysis, and maximum number of samples that are not decimated, as
+        for `load_record`.
 
     Raises
     ------
@@ -251,59 +323,73 @@ def record_of(session: Session) -> Record:
     RecordError
         The samples cannot be analysed.
     """
-    path, samples = session.path, session.samples
-    if len(samples) == 0:
-        raise RecordError(f"{path}: the session holds no samples, so there is nothing to analyse.")
+    grid, covered_s = _grid_of(session, part_s)
+    collector = collector_of_signals(grid, highest_hz, longest_samples)
+    collector.add(session.samples)
+    ticks = session.samples["tick"]
+    rest_first, rest_end = session.segments.get("rest", (0, 0))
+    is_at_rest = (ticks >= rest_first) & (ticks < rest_end)
+    rest_angle_rad = _median_rad([session.samples["angle_rad"][is_at_rest]])
+    return _record(session, grid, collector.finish(), covered_s, rest_angle_rad)
+
+
+def _median_rad(angles_rad: list[NDArray[np.float64]]) -> float | None:
+    """Return the median of blocks of angles; None if there is no angle."""
+    all_angles_rad = np.concatenate(angles_rad) if angles_rad else np.zeros(0)
+    return float(np.median(all_angles_rad)) if all_angles_rad.size else None
+
+
+def _grid_of(
+    session: Session, part_s: PartOption | None
+) -> tuple[TickGrid, tuple[float, float] | None]:
+    """Return the ticks of a session or of a part of it, and beginning and end of the part in s."""
+    if len(session.samples) == 0:
+        raise RecordError(
+            f"{session.path}: the session holds no samples, so there is nothing to analyse."
+        )
     rate_hz = stated_rate_hz(session)
-    ticks = samples["tick"].astype(np.int64)
-    check_span(path, ticks)
-    check_clock(path, ticks, samples["t_ns"], rate_hz)
-    for field_name in ("angle_reference_rad", "angle_rad", "coupling_torque_nm"):
-        check_finite(path, field_name, samples[field_name], ticks)
-    check_sensor(path, samples["coupling_torque_nm"])
+    if part_s is None:
+        return TickGrid.of(session, rate_hz), None
+    part, covered_s = part_of_session(session, part_s, rate_hz)
+    return TickGrid.of(part, rate_hz), covered_s
 
-    first_tick = int(ticks[0])
-    tick_indices = ticks - first_tick
-    tick_count = int(tick_indices[-1]) + 1
-    sweep, unrecorded_ticks = _sweep_range(session, first_tick, tick_count)
-    status_bits = np.zeros(
-        tick_count, dtype=np.uint32
-    )  # bits of `Status`; 0 where a tick is missing
-    status_bits[tick_indices] = samples["status"]
-    is_missing = np.ones(tick_count, dtype=bool)
-    is_missing[tick_indices] = False
-    is_angle_stale = (status_bits & Status.ANGLE_STALE) != 0
-    is_torque_stale = (status_bits & Status.WRENCH_STALE) != 0
-    for channel_name, is_unknown in (
-        ("angle", is_missing | is_angle_stale),
-        ("torque", is_missing | is_torque_stale),
-    ):
-        check_fillable(path, channel_name, is_unknown[sweep], first_tick + sweep.start, rate_hz)
 
-    gaps = Gaps(
-        missing_ticks=int(is_missing.sum()),
-        longest_gap_ticks=longest_run(is_missing)[0],
-        sweep_missing_ticks=int(is_missing[sweep].sum()),
-        sweep_stale_angles=int(is_angle_stale[sweep].sum()),
-        sweep_stale_torques=int(is_torque_stale[sweep].sum()),
-    )
-    flag_counts = _flag_counts(status_bits[sweep])
+def _record(
+    session: Session,
+    grid: TickGrid,
+    signals: RecordSignals,
+    covered_s: tuple[float, float] | None,
+    rest_angle_rad: float | None,
+) -> Record:
+    """Return the record of a session, or of the part of it to which `grid` belongs.
+
+    `rest_angle_rad` is the angle that is held in the session's segment ``rest``.
+    """
     metadata, unread_metadata = readable_texts(session.metadata, "keys of the metadata")
     outcome, unread_outcome = readable_texts(session.outcome or {}, "keys of the outcome")
+    reference_rad, angle_rad, torque_nm = signals.values
+    ticks = grid.first_tick + signals.first_tick + signals.factor * np.arange(torque_nm.size)
+    beam = stated_beam(session, grid.rate_hz, grid.count)
+    swept_hz = None
+    if covered_s is not None:
+        check_part_length(session.path, covered_s, beam)
+        first_sweep = grid.there or grid.sweep
+        swept_hz = swept_frequencies_hz(
+            session, grid.first_tick + first_sweep.start, grid.first_tick + first_sweep.stop
+        )
+        if "rest" not in grid.session.segments and rest_angle_rad is not None:
+            reference_rad, angle_rad = reference_rad - rest_angle_rad, angle_rad - rest_angle_rad
+            rest_angle_rad = None
     return Record(
-        path=path,
-        time_s=(first_tick + np.arange(tick_count)) / rate_hz,
-        reference_rad=_fill_grid(samples["angle_reference_rad"], tick_indices, is_missing),
-        angle_rad=_fill_grid(samples["angle_rad"], tick_indices, is_missing | is_angle_stale),
-        torque_nm=_fill_grid(
-            samples["coupling_torque_nm"], tick_indices, is_missing | is_torque_stale
-        ),
-        angle_known=~(is_missing | is_angle_stale),
-        torque_known=~(
-            is_missing | is_torque_stale | ((status_bits & Status.WRENCH_SATURATED) != 0)
-        ),
-        rate_hz=rate_hz,
-        beam=stated_beam(session, rate_hz, tick_count),
+        path=session.path,
+        time_s=ticks / grid.rate_hz,
+        reference_rad=reference_rad,
+        angle_rad=angle_rad,
+        torque_nm=torque_nm,
+        angle_known=signals.angle_known,
+        torque_known=signals.torque_known,
+        rate_hz=grid.rate_hz / signals.factor,
+        beam=beam,
         angle_delay_s=stated_delay_s(session, "angle_delay_s"),
         torque_delay_s=stated_delay_s(session, "torque_delay_s"),
         tool_inertia_kg_m2=stated_tool_inertia_kg_m2(session),
@@ -312,13 +398,13 @@ def record_of(session: Session) -> Record:
         uniformity=stated_uniformity(session),
         tip_mass_kg=stated_tip_mass_kg(session),
         axis_tilt_deg=stated_axis_tilt_deg(session),
-        sweep=sweep,
-        there=_first_sweep_range(session, first_tick, sweep),
-        rest_angle_rad=_rest_angle(session, ticks),
-        gaps=gaps,
-        flags=flag_counts,
+        sweep=signals.samples_in(grid.sweep),
+        there=None if grid.there is None else signals.samples_in(grid.there),
+        rest_angle_rad=rest_angle_rad,
+        gaps=grid.gaps(),
+        flags=grid.flag_counts(),
         warnings=(
-            *_describe_faults(gaps, flag_counts, unrecorded_ticks, outcome, rate_hz, sweep),
+            *grid.fault_sentences(outcome),
             *(
                 f"Of the file: {fault_sentence}."
                 for fault_sentence in (*unread_metadata, *unread_outcome)
@@ -326,118 +412,10 @@ def record_of(session: Session) -> Record:
         ),
         metadata=metadata,
         outcome=outcome.get("outcome", "unknown"),
+        part_s=covered_s,
+        swept_hz=swept_hz,
+        decimated_from=None
+        if signals.factor == 1
+        else FullRate(grid.rate_hz, grid.count, grid.sweep),
+        torque_extremes=signals.torque_extremes,
     )
-
-
-def _sweep_range(session: Session, first_tick: int, tick_count: int) -> tuple[slice, int]:
-    """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
-    if "sweep" not in session.segments:
-        return slice(0, tick_count), 0
-    first_sweep_tick, end_sweep_tick = session.segments["sweep"]
-    first_index = max(first_sweep_tick - first_tick, 0)
-    end_index = min(end_sweep_tick - first_tick, tick_count)
-    if end_index <= first_index:
-        raise RecordError(
-            f"{session.path}: segment 'sweep' covers ticks {first_sweep_tick} to "
-            f"{end_sweep_tick - 1}, but the record "
-            f"holds ticks {first_tick} to {first_tick + tick_count - 1}, so nothing of the sweep "
-            "was recorded."
-        )
-    return slice(first_index, end_index), (end_sweep_tick - first_sweep_tick) - (
-        end_index - first_index
-    )
-
-
-def _first_sweep_range(session: Session, first_tick: int, sweep: slice) -> slice | None:
-    """Return the range of the first of two sweeps; None if there is only one sweep."""
-    segment_first_tick, segment_end_tick = session.segments.get("there", (0, 0))
-    first_index, end_index = (
-        max(segment_first_tick - first_tick, sweep.start),
-        min(segment_end_tick - first_tick, sweep.stop),
-    )
-    return slice(first_index, end_index) if end_index > first_index else None
-
-
-def _rest_angle(session: Session, ticks: NDArray[np.int64]) -> float | None:
-    """Return the median angle in rad over the segment ``rest``; None without this segment."""
-    first_tick, end_tick = session.segments.get("rest", (0, 0))
-    is_at_rest = (ticks >= first_tick) & (ticks < end_tick)
-    return float(np.median(session.samples["angle_rad"][is_at_rest])) if is_at_rest.any() else None
-
-
-def _flag_counts(status_bits: NDArray[np.uint32]) -> dict[str, int]:
-    """Return the number of samples with each flag that occurs."""
-    counts = {
-        meaning: int(np.count_nonzero(status_bits & status_flag))
-        for status_flag, meaning in _REPORTED_FLAGS
-    }
-    return {meaning: sample_count for meaning, sample_count in counts.items() if sample_count}
-
-
-def _fill_grid(
-    sample_values: NDArray[np.float64],
-    tick_indices: NDArray[np.int64],
-    is_unknown: NDArray[np.bool_],
-) -> NDArray[np.float64]:
-    """Return values on the whole grid, with linear interpolation of unknown ones."""
-    grid_values = np.zeros(len(is_unknown))
-    grid_values[tick_indices] = sample_values
-    if is_unknown.any() and not is_unknown.all():
-        known_indices = np.flatnonzero(~is_unknown)
-        grid_values[is_unknown] = np.interp(
-            np.flatnonzero(is_unknown), known_indices, grid_values[known_indices]
-        )
-    return grid_values
-
-
-def _describe_faults(
-    gaps: Gaps,
-    flag_counts: Mapping[str, int],
-    unrecorded_ticks: int,
-    outcome: Mapping[str, str],
-    rate_hz: float,
-    sweep: slice,
-) -> tuple[str, ...]:
-    """Return sentences on an incomplete session, missing samples and flags."""
-    sentences = []
-    outcome_text = outcome.get("outcome", "unknown")
-    if outcome_text in ("stopped", "fault"):
-        stop_reason = outcome.get("reason")
-        sentences.append(
-            f"The session's outcome is '{outcome_text}', not 'complete'"
-            + (f": {stop_reason}" if stop_reason else ".")
-        )
-    elif "recovered_from" in outcome:
-        sentences.append(
-            f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
-        )
-    if outcome.get("recovered_protected") == "false":
-        sentences.append(
-            "The file was recovered from one whose metadata no checksum covered: compare rate, "
-            "beam and segments with what is known of the session."
-        )
-    if unrecorded_ticks:
-        recorded_s = (sweep.stop - sweep.start) / rate_hz
-        sentences.append(
-            f"The sweep was cut short: {recorded_s:.6g} s of it were recorded, "
-            f"{unrecorded_ticks / rate_hz:.6g} s were not."
-        )
-    if gaps.sweep_missing_ticks:
-        sentences.append(
-            f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
-            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
-        )
-    for channel_name, sample_count in (
-        ("angle", gaps.sweep_stale_angles),
-        ("torque", gaps.sweep_stale_torques),
-    ):
-        if sample_count:
-            sentences.append(
-                f"{sample_count} stale values of the {channel_name} {_UNKNOWN_SAMPLES_TEXT}"
-            )
-    for flag_name, flag_consequence in _FLAG_CONSEQUENCES:
-        if flag_name in flag_counts:
-            sentences.append(
-                f"{flag_counts[flag_name]} samples of the sweep: {flag_name}. {flag_consequence}"
-            )
-    return tuple(sentences)

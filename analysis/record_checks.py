@@ -337,8 +337,8 @@ def check_span(path: Path, ticks: NDArray[np.int64]) -> None:
     if tick_span > MAX_TICKS:
         raise RecordError(
             f"{path}: the record spans {tick_span} ticks, and no more than {MAX_TICKS} fit into "
-            "the memory that an analysis may take; record shorter sessions, which can be analysed "
-            "together."
+            "the memory that an analysis may take; analyse a part of it (--from, --to), or record "
+            "shorter sessions, which can be analysed together."
         )
 
 

@@ -21,6 +21,7 @@ if TYPE_CHECKING:
     from analysis.models import WelchSettings
     from analysis.paper import WelchAnalysis
     from analysis.record import Record
+    from analysis.record_part import PartOption
     from analysis.structures import AddedStructure
     from rigd.beam import Plant
     from rigd.estimates import Estimate
@@ -59,6 +60,8 @@ class Routes:
         value in the file.
     structures : tuple of AddedStructure
         Damping structures of installed packages that are fitted to the whole record as well.
+    part_s : tuple of float or None, optional
+        Part of the session that is analysed, as for `load_record`; None selects the whole session.
     """
 
     settings: WelchSettings
@@ -69,6 +72,7 @@ class Routes:
     figures: tuple[FigureFormat, ...] = DEFAULT_FORMATS
     uniformity: float | None = None
     structures: tuple[AddedStructure, ...] = ()
+    part_s: PartOption | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,15 +137,19 @@ class WholeRecord:
     def verdict(self) -> Verdict:
         """Verdict on the record, in sentences for the operator.
 
-        The second sentence states the validity of the estimates.
+        The second sentence states the validity of the estimates. If the record is a part of the
+        session, a sentence before them states it.
         """
         verdict = self.selection.verdict
         first_sentence, other_sentences = verdict.sentences[:1], verdict.sentences[1:]
         added_sentences = (structure_fit.sentence for structure_fit in self.added)
+        part_text = self.record.part_text
+        part_sentences = () if part_text is None else (f"All results are of {part_text}.",)
         return replace(
             verdict,
             sentences=(
-                *first_sentence, self.validity.sentence, *other_sentences, *added_sentences,
+                *part_sentences, *first_sentence, self.validity.sentence, *other_sentences,
+                *added_sentences,
             ),
         )  # fmt: skip
 
@@ -190,6 +198,7 @@ class WholeRecord:
         )
         return {
             **json_content,
+            "part": self.record.part_json,
             "scale_uncertainty": {
                 parameter_name: relative_std
                 for parameter_name, relative_std in self.record.uncertainty.items()
@@ -271,8 +280,9 @@ class RecordResult:
 
     @property
     def name(self) -> str:
-        """Name of the session file, for titles."""
-        return self.record.path.name
+        """Name of the session file, and the analysed part of the session, for titles."""
+        part_text = self.record.part_text
+        return f"{self.record.path.name}{'' if part_text is None else f', {part_text}'}"
 
     @property
     def unsupported(self) -> frozenset[str]:
@@ -348,9 +358,10 @@ def record_result(
     """
     from analysis.identify import MeasurementError
     from analysis.record import load_record
-    from analysis.suited import check_record_band, remarks, welch_analysis
+    from analysis.suited import check_record_band, highest_frequency_hz, remarks, welch_analysis
 
-    record = with_uniformity(load_record(path), routes.uniformity)
+    record = load_record(path, routes.part_s, highest_hz=highest_frequency_hz(routes.band_hz))
+    record = with_uniformity(record, routes.uniformity)
     record = _add_warnings(record, remarks(record, routes.band_hz))
     on_step("read")
     if not routes.paper:

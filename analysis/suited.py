@@ -51,10 +51,22 @@ _COMPLETE_FRACTION: Final = 0.99
 end."""
 
 
+def highest_frequency_hz(requested_hz: Band | None = None) -> float:
+    """Return the highest frequency in Hz of the analyses with the requested or default band.
+
+    Parameters
+    ----------
+    requested_hz : tuple of float, optional
+        Requested band in Hz.
+    """
+    return (requested_hz or RECORD_BAND_HZ)[1]
+
+
 def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
     """Return the frequency band in Hz of the whole-record fits.
 
-    It is the requested band, or else the default band limited by the record's sampling rate.
+    It is the requested band, or else the default band limited by the record's sampling rate and by
+    the frequencies of a part of a sweep.
 
     Parameters
     ----------
@@ -63,7 +75,7 @@ def record_band_hz(record: Record, requested_hz: Band | None = None) -> Band:
     requested_hz : tuple of float, optional
         Requested band in Hz; used unchanged.
     """
-    return requested_hz or _limit_band(RECORD_BAND_HZ, record.rate_hz)
+    return requested_hz or _limit_band(RECORD_BAND_HZ, record)
 
 
 def check_record_band(record: Record, requested_hz: Band | None) -> None:
@@ -112,10 +124,23 @@ def welch_settings(
     """
     if requested_hz is None and settings.band_hz != PAPER_BAND_HZ:
         requested_hz = settings.band_hz
-    first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record.rate_hz)
+    first_hz, last_hz = requested_hz or _limit_band(PAPER_BAND_HZ, record)
+    settings = _at_analysed_rate(settings, record)
     if first_hz == 0.0:
         first_hz = record.rate_hz / settings.segmentation(record.rate_hz).nfft
     return replace(settings, band_hz=(first_hz, last_hz))
+
+
+def _at_analysed_rate(settings: WelchSettings, record: Record) -> WelchSettings:
+    """Return settings whose requested lengths are in samples of a decimated record."""
+    ratio = record.rate_hz / record.full_rate.rate_hz
+    if ratio == 1:
+        return settings
+    segment_length, overlap, nfft = (
+        None if length is None else round(length * ratio)
+        for length in (settings.segment_length, settings.overlap, settings.nfft)
+    )
+    return replace(settings, segment_length=segment_length, overlap=overlap, nfft=nfft)
 
 
 def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]:
@@ -131,9 +156,23 @@ def remarks(record: Record, requested_hz: Band | None = None) -> tuple[str, ...]
     remark_sentences = (_TOUCH_REMARK,) if record.metadata.get("excitation") == "touch" else ()
     if record.there is not None:
         remark_sentences = (*remark_sentences, _TWO_SWEEPS_REMARK)
-    _, last_hz = record_band_hz(record, requested_hz)
-    if requested_hz is not None or last_hz == RECORD_BAND_HZ[1]:
+    if record.decimated_from is not None:
+        remark_sentences = (
+            *remark_sentences,
+            f"The record is long ({record.decimated_from.samples / record.full_rate.rate_hz:.0f} "
+            f"s): it was decimated from {record.full_rate.rate_hz:g} to {record.rate_hz:g} Hz "
+            f"while it was read, which preserves frequencies up to "
+            f"{LARGEST_FRACTION_OF_RATE * record.rate_hz:g} Hz.",
+        )
+    first_hz, last_hz = record_band_hz(record, requested_hz)
+    if requested_hz is not None or (first_hz, last_hz) == RECORD_BAND_HZ:
         return remark_sentences
+    if record.swept_hz is not None:
+        return (
+            *remark_sentences,
+            f"Fits use {first_hz:.4g} to {last_hz:.4g} Hz, which the part of the sweep covers: "
+            "beyond there is noise alone.",
+        )
     return (
         *remark_sentences,
         f"Fits end at {last_hz:g} Hz, {LARGEST_FRACTION_OF_RATE:g} of the record's rate of "
@@ -211,12 +250,14 @@ def welch_exclusion_reason(record: Record, requested_hz: Band | None = None) -> 
         is_long_enough = record.sweep_samples >= paper_segmentation.segment_length
         method_options = "--method welch" if is_long_enough else "--method welch --frf fft"
         return f"{exclusion} ({method_options} makes them nevertheless)"
+    if record.part_s is not None:
+        return None  # the default band is that of the part
     planned_s = _metadata_number(record, "duration_s")
     swept_s = record.first_sweep_samples / record.rate_hz
     if requested_hz is not None or planned_s is None or swept_s >= _COMPLETE_FRACTION * planned_s:
         return None
     reached_hz = _reached_frequency_hz(record, swept_s / planned_s)
-    first_hz, last_hz = _limit_band(PAPER_BAND_HZ, record.rate_hz)
+    first_hz, last_hz = _limit_band(PAPER_BAND_HZ, record)
     if reached_hz is None or not first_hz < reached_hz < last_hz:
         return None
     return (
@@ -244,8 +285,16 @@ def _metadata_number(record: Record, key: str) -> float | None:
         return None
 
 
-def _limit_band(band_hz: Band, rate_hz: float) -> Band:
-    """Return a band limited by a sampling rate; the whole band if nothing would remain."""
+def _limit_band(band_hz: Band, record: Record) -> Band:
+    """Return a band limited by a record's rate and, for a part of a sweep, its frequencies.
+
+    The whole band is returned if nothing would remain.
+    """
     first_hz, last_hz = band_hz
-    limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * rate_hz)
+    limit_hz = min(last_hz, LARGEST_FRACTION_OF_RATE * record.rate_hz)
+    if record.swept_hz is not None:
+        lowest_hz, highest_hz = record.swept_hz
+        limit_hz = min(limit_hz, highest_hz)
+        if lowest_hz > PAPER_BAND_HZ[0]:  # else the part contains the beginning of the sweep
+            first_hz = max(first_hz, lowest_hz)
     return (first_hz, limit_hz) if first_hz < limit_hz else band_hz

@@ -176,12 +176,15 @@ def analyse_session(path: Path, session_task: SessionTask) -> SessionAnalysis | 
         Settings of the analysis.
     """
     from analysis.record import load_record
-    from analysis.suited import remarks, welch_analysis
+    from analysis.suited import highest_frequency_hz, remarks, welch_analysis
 
     session_errors = session_error_types()
     experiment = None
     try:
-        record = with_uniformity(load_record(path), session_task.uniformity)
+        record = with_uniformity(
+            load_record(path, highest_hz=highest_frequency_hz(session_task.band_hz)),
+            session_task.uniformity,
+        )
         experiment = Experiment.from_record(record)
         unfinished_reason = experiment.unfinished_sweep_reason(record.outcome)
         if unfinished_reason:

@@ -139,10 +139,10 @@ def left_out_errors(
     """
     from analysis.identify import Comparison
     from analysis.record import load_record
-    from analysis.suited import record_band_hz
+    from analysis.suited import highest_frequency_hz, record_band_hz
 
     try:
-        record = load_record(path)
+        record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
         band_hz = record_band_hz(record, band_hz)
         comparison = Comparison.of(Measurement.of_record(record), band_hz)
     except session_error_types() as why:

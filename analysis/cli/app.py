@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gc
 import logging
+import math
 import os
 import signal
 import sys
@@ -246,6 +247,24 @@ def analyze(
             "(rigd plugins lists them).",
         ),
     ] = "",
+    from_s: Annotated[
+        float | None,
+        typer.Option(
+            "--from",
+            metavar="S",
+            help="Analyse a part of the session that begins at this time since its start (s).  "
+            "[default: its start]",
+        ),
+    ] = None,
+    to_s: Annotated[
+        float | None,
+        typer.Option(
+            "--to",
+            metavar="S",
+            help="Analyse a part of the session that ends at this time since its start (s).  "
+            "[default: its end]",
+        ),
+    ] = None,
     band: Band = None,
     frf: Estimator = "h1",
     segment: Segment = None,
@@ -365,6 +384,7 @@ def analyze(
             f"{'add --each' if is_campaign else 'take --method all'}, or leave it out.",
             param_hint="--structure",
         )
+    _check_part(from_s, to_s, is_campaign=is_campaign)
     settings = welch_settings(types, weights, frf, segment, overlap, nfft)
     run_routes = Routes(
         settings,
@@ -375,6 +395,7 @@ def analyze(
         figures=_figure_formats(figures),
         uniformity=None if uniformity is None else _relative_uniformity(uniformity),
         structures=_added_structures(structure),
+        part_s=None if from_s is None and to_s is None else (from_s, to_s),
     )
     output_options = Outputs(report, json, overwrite, verbose)
     try:
@@ -427,6 +448,29 @@ def _check_campaign_options(option_names: Sequence[str], files: Sequence[Path]) 
     else:
         usage_reason = "only for campaigns, so not with --each; omit one of the two."
     raise typer.BadParameter(usage_reason, param_hint=" and ".join(option_names))
+
+
+def _check_part(from_s: float | None, to_s: float | None, *, is_campaign: bool) -> None:
+    """Raise a usage error if --from and --to select no part, or if they are given to a campaign."""
+    option_values = {"--from": from_s, "--to": to_s}
+    given_values = {name: value for name, value in option_values.items() if value is not None}
+    if not given_values:
+        return
+    if is_campaign:
+        raise typer.BadParameter(
+            "a campaign compares whole sessions; add --each, or leave it out.",
+            param_hint=" and ".join(given_values),
+        )
+    for option_name, time_s in given_values.items():
+        if not 0.0 <= time_s < math.inf:
+            raise typer.BadParameter(
+                f"{time_s:g} s must be a time since the session's start, 0 or more.",
+                param_hint=option_name,
+            )
+    if from_s is not None and to_s is not None and not from_s < to_s:
+        raise typer.BadParameter(
+            f"{from_s:g} s must be less than --to {to_s:g} s.", param_hint="--from"
+        )
 
 
 def _check_record_method(context: typer.Context, *, is_campaign: bool) -> None:

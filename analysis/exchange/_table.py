@@ -11,7 +11,7 @@ import rigd
 from analysis.exchange._source import ExchangeError
 from analysis.paper import estimate
 from analysis.record import load_record
-from analysis.suited import welch_settings
+from analysis.suited import highest_frequency_hz, welch_settings
 from rigd.session import read_session
 from rigd.session.layout import SAMPLE_FIELDS
 from rigd.units import unit_of
@@ -92,7 +92,7 @@ def record_table(path: Path) -> ExportTable:
     ExchangeError
         If the session has no samples or no sampling rate.
     """
-    session = read_session(path)
+    session = read_session(path, fields=("t_ns", *_COLUMN_TITLES))
     rate_hz = session.number("rate_hz")
     if len(session.samples) == 0 or not rate_hz > 0.0:
         raise ExchangeError(
@@ -108,7 +108,7 @@ def record_table(path: Path) -> ExportTable:
                 field_name,
                 _COLUMN_TITLES[field_name],
                 _ascii_unit(field_name),
-                np.ascontiguousarray(session_samples[field_name]),
+                session_samples[field_name],  # a view: copies would take as much memory again
             )
             for field_name in SAMPLE_FIELDS
             if field_name in _COLUMN_TITLES
@@ -131,7 +131,7 @@ def frf_table(
     analysis.paper.FrequencyResponseError
         If the session cannot be read or analysed.
     """
-    record = load_record(path)
+    record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
     settings = welch_settings(record, settings, band_hz)
     response, _ = estimate(record, settings)
     export_columns = [

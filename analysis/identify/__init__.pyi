@@ -13,7 +13,6 @@ from ._candidate import Candidate as Candidate
 from ._comparison import Comparison as Comparison
 from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError
-from ._data import fast_length as fast_length
 from ._estimates import DampingSize as DampingSize
 from ._estimates import ModeEstimate as ModeEstimate
 from ._finding import Finding as Finding

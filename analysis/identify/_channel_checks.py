@@ -14,6 +14,7 @@ import numpy as np
 
 from analysis.identify._finding import Finding
 from analysis.record_checks import longest_run
+from analysis.record_signals import TorqueExtreme
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
@@ -38,27 +39,38 @@ _MAX_STANDSTILL_MOTION: Final = 0.02
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
-    torque_nm, known_mask = measurement.torque_nm, measurement.torque_known
-    clipped = []
-    for torque_limit_nm in (torque_nm[known_mask].max(), torque_nm[known_mask].min()):
-        is_at_limit = known_mask & (torque_nm == torque_limit_nm)
-        is_repeated = is_at_limit & (np.roll(is_at_limit, 1) | np.roll(is_at_limit, -1))
-        if torque_limit_nm != 0 and np.count_nonzero(is_repeated) >= _MIN_CLIPPED_VALUES:
-            clipped.append((float(torque_limit_nm), int(np.count_nonzero(is_at_limit))))
+    clipped = [
+        extreme
+        for extreme in measurement.torque_extremes or _torque_extremes(measurement)
+        if extreme.limit_nm != 0 and extreme.repeated >= _MIN_CLIPPED_VALUES
+    ]
     if not clipped:
         return
-    limits_text = " and ".join(f"{torque_limit_nm:+.3g} N·m" for torque_limit_nm, _ in clipped)
-    clipped_tick_count = sum(tick_count for _, tick_count in clipped)
+    limits_text = " and ".join(f"{extreme.limit_nm:+.3g} N·m" for extreme in clipped)
+    clipped_tick_count = sum(extreme.values for extreme in clipped)
     yield Finding(
         kind="clipping",
         sentence=(
             f"The torque is clipped at {limits_text}: {clipped_tick_count} values lie exactly "
             "there and none beyond, and no flag says so."
         ),
-        value=max(abs(torque_limit_nm) for torque_limit_nm, _ in clipped),
+        value=max(abs(extreme.limit_nm) for extreme in clipped),
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
+
+
+def _torque_extremes(measurement: Measurement) -> Iterator[TorqueExtreme]:
+    """Yield the largest and the smallest measured torque, with the number of samples at it."""
+    torque_nm, known_mask = measurement.torque_nm, measurement.torque_known
+    for torque_limit_nm in (torque_nm[known_mask].max(), torque_nm[known_mask].min()):
+        is_at_limit = known_mask & (torque_nm == torque_limit_nm)
+        is_repeated = is_at_limit & (np.roll(is_at_limit, 1) | np.roll(is_at_limit, -1))
+        yield TorqueExtreme(
+            float(torque_limit_nm),
+            int(np.count_nonzero(is_at_limit)),
+            int(np.count_nonzero(is_repeated)),
+        )
 
 
 def standstill_findings(measurement: Measurement) -> Iterator[Finding]:

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import Decimation, MeasurementError, fast_length_below
+from analysis.decimation import Decimation, fast_length_below
+from analysis.identify._data import MeasurementError
 from analysis.identify._instrument import reference_coherent_part
 from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse

@@ -3,24 +3,17 @@
 A missing angle is interpolated, since the convolution with the response needs an angle at every
 tick. A missing torque is not compared. After a longer gap of the angle the beam may ring because
 the motor moved during the gap. This ringing is estimated like the free decay at the beginning of a
-record. Decimation is by a linear-phase FIR filter (Kaiser window), so that the whole band is
-retained and neither channel is delayed relative to the other.
-
-References
-----------
-N. Wiener, Extrapolation, Interpolation, and Smoothing of Stationary Time Series (1949).
-J. F. Kaiser, Nonrecursive digital filter design using the I0-sinh window function, Proc. IEEE Int.
-Symp. Circuits and Systems (1974) 20-23.
+record. Both channels are decimated to the band (`analysis.decimation`).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import lru_cache
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.decimation import MAX_GAP_PERIODS, interpolate_gaps, runs_of_true
 from analysis.record_checks import MAX_GAP_S, longest_run, unknown_fraction_message
 from rigd.beam import Damping, Plant
 
@@ -30,6 +23,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record import Record
+    from analysis.record_signals import TorqueExtreme
     from rigd.beam import Beam
 
 
@@ -38,9 +32,6 @@ if TYPE_CHECKING:
 _START_TOLERANCE_S: Final = 1e-7
 """Tolerance in seconds for rounding: a sample by this much before an impact already belongs to its
 decay."""
-
-MAX_ANGLE_GAP_PERIODS: Final = 0.4
-"""Longest gap of the angle that is interpolated, in periods of the band's highest frequency."""
 
 MAX_LONG_GAPS: Final = 8
 """Maximum number of gaps of the angle that are too long to interpolate. Each adds an unknown
@@ -199,6 +190,8 @@ class Measurement:
     is_single_sweep : bool
         Whether the motor passed each frequency once, in rising or falling order. An effect of time
         then cannot be distinguished from an effect of frequency.
+    torque_extremes : tuple of TorqueExtreme
+        Largest and smallest torque before a decimation of the record; empty without one.
     """
 
     name: str
@@ -219,6 +212,7 @@ class Measurement:
     tip_mass_kg: float | None = None
     axis_tilt_deg: float | None = None
     is_single_sweep: bool = True
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @classmethod
     def of_record(cls, record: Record) -> Measurement:
@@ -253,6 +247,7 @@ class Measurement:
             axis_tilt_deg=record.axis_tilt_deg,
             is_single_sweep=record.metadata.get("excitation", "chirp") == "chirp"
             and record.there is None,
+            torque_extremes=record.torque_extremes,
         )
 
     def check(self, highest_hz: float) -> None:
@@ -303,7 +298,7 @@ class Measurement:
         if long_gap_count > MAX_LONG_GAPS:
             raise MeasurementError(
                 f"{self.name}: the angle is missing or flagged {long_gap_count} times for longer "
-                f"than the {1e3 * MAX_ANGLE_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
+                f"than the {1e3 * MAX_GAP_PERIODS / highest_hz:.3g} ms that a band up to "
                 f"{highest_hz:g} Hz interpolates, more often than the {MAX_LONG_GAPS} times that "
                 "an analysis tolerates; record the session again or lower --band."
             )
@@ -330,14 +325,14 @@ class Measurement:
             First tick of each gap, and the first tick after it at which the filters of the torque
             channel have settled.
         """
-        longest_ticks = MAX_ANGLE_GAP_PERIODS / highest_hz * self.rate_hz
+        longest_ticks = MAX_GAP_PERIODS / highest_hz * self.rate_hz
         settling_s = abs(self.delay_s) + _FILTER_SETTLING_TIME_CONSTANTS * (
             self.filter_time_constant_s + self.second_order_filter_time_constant_s
         )
         settling_ticks = int(np.ceil(settling_s * self.rate_hz))
         return tuple(
             (int(gap_start), min(int(gap_end) + settling_ticks, len(self.angle_rad)))
-            for gap_start, gap_end in zip(*_runs_of_true(~self.angle_known), strict=True)
+            for gap_start, gap_end in zip(*runs_of_true(~self.angle_known), strict=True)
             if gap_end - gap_start > longest_ticks
         )
 
@@ -383,203 +378,3 @@ class Measurement:
         )
         rest_angle_rad = filled_angle_rad[0] if self.rest_angle_rad is None else self.rest_angle_rad
         return filled_angle_rad - rest_angle_rad
-
-
-# Interpolation of gaps
-
-_NEIGHBOUR_REACH_PERIODS: Final = 2.0
-"""Duration to either side of a gap from which values are used to interpolate the gap, in periods of
-the highest frequency."""
-
-_BANDWIDTH_MARGIN: Final = 1.2
-"""Bandwidth of the signal that the interpolation of gaps assumes, over its highest frequency."""
-
-_RELATIVE_NOISE_POWER: Final = 1e-6
-"""Power of white noise that the interpolation of gaps assumes, relative to the power of the signal.
-"""
-
-
-def interpolate_gaps(
-    signal_values: NDArray[np.float64], known_mask: NDArray[np.bool_], cycles_per_sample: float
-) -> NDArray[np.float64]:
-    """Estimate the unknown values of a band-limited signal from their known neighbours.
-
-    This is the best linear estimate for a signal with a flat spectrum up to its highest frequency
-    and a little white noise (N. Wiener; here over two periods to either side). In a gap of a
-    quarter of a period its error is less than 1e-3 of the signal; that of a straight line would be
-    a third.
-
-    Parameters
-    ----------
-    signal_values : ndarray, shape (n,)
-        Signal; unknown values are ignored.
-    known_mask : ndarray of bool, shape (n,)
-        Whether each value is known.
-    cycles_per_sample : float
-        Highest frequency, in cycles per sample.
-
-    Returns
-    -------
-    ndarray, shape (n,)
-        The given values where known, the estimates elsewhere.
-    """
-    filled_values = np.where(known_mask, signal_values, 0.0)
-    reach_samples = int(np.ceil(_NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
-    for gap_start, gap_end in zip(*_runs_of_true(~known_mask), strict=True):
-        first_neighbour = max(gap_start - reach_samples, 0)
-        neighbours = first_neighbour + np.flatnonzero(
-            known_mask[first_neighbour : gap_end + reach_samples]
-        )
-        if neighbours.size == 0:
-            continue
-        weights = _interpolation_weights(
-            tuple(neighbours - gap_start),
-            int(gap_end - gap_start),
-            _BANDWIDTH_MARGIN * cycles_per_sample,
-        )
-        mean_value = float(signal_values[neighbours].mean())
-        filled_values[gap_start:gap_end] = mean_value + weights @ (
-            signal_values[neighbours] - mean_value
-        )
-    return filled_values
-
-
-@lru_cache(maxsize=64)
-def _interpolation_weights(
-    neighbour_offsets: tuple[int, ...], gap_length: int, cycles_per_sample: float
-) -> NDArray[np.float64]:
-    """Return the weights by which known values around a gap estimate the values in it.
-
-    The shape is (gap length, neighbours). `cycles_per_sample` is the bandwidth of the signal.
-
-    `neighbour_offsets` are the indices of the known values relative to the start of the gap.
-    """
-    offsets = np.array(neighbour_offsets)
-    neighbour_covariance = np.sinc(2 * cycles_per_sample * np.subtract.outer(offsets, offsets))
-    neighbour_covariance += _RELATIVE_NOISE_POWER * np.eye(offsets.size)
-    gap_covariance = np.sinc(
-        2 * cycles_per_sample * np.subtract.outer(np.arange(gap_length), offsets)
-    )
-    weights: NDArray[np.float64] = np.linalg.solve(neighbour_covariance, gap_covariance.T).T
-    return weights
-
-
-def _runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """Return the start index of each run of True in a mask, and the index after its end."""
-    run_edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
-    return np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
-
-
-# Decimation
-
-_STOP_BAND_ATTENUATION_DB: Final = 100.0
-"""Attenuation of the decimation filter in its stop band, in decibels."""
-
-_MIN_RATE_OVER_BAND: Final = 2.4
-"""Minimum decimated sampling rate relative to the highest frequency: at lower rates the decimation
-filter becomes long."""
-
-
-@dataclass(frozen=True, slots=True)
-class Decimation:
-    """Reduction of the sampling rate: centred linear-phase low-pass filter, then downsampling.
-
-    It does not use `scipy.signal` (`kaiserord`, `firwin` and `oaconvolve`), whose import takes 0.64
-    s of processor time: a tenth of the analysis of a session of 76 s.
-
-    Attributes
-    ----------
-    factor : int
-        One sample in `factor` is retained.
-    kernel : ndarray, shape (2 reach factor + 1,)
-        Impulse response of the filter: it passes `highest_hz`, and attenuates by 100 dB from half
-        the new rate on.
-    reach : int
-        Half length of the filter, in samples of the new rate.
-    rate_hz : float
-        Sampling rate after decimation.
-    """
-
-    factor: int
-    kernel: NDArray[np.float64]
-    reach: int
-    rate_hz: float
-
-    @classmethod
-    def to_band(cls, rate_hz: float, highest_hz: float) -> Decimation:
-        """Return the decimation to the lowest rate that preserves the band from 0 to `highest_hz`.
-
-        Parameters
-        ----------
-        rate_hz : float
-            Rate of the record.
-        highest_hz : float
-            Highest frequency that is preserved, at most 0.4 `rate_hz`.
-        """
-        factor = max(int(rate_hz / (_MIN_RATE_OVER_BAND * highest_hz)), 1)
-        new_rate_hz = rate_hz / factor
-        stop_hz = new_rate_hz / 2
-        # Kaiser's formulas for the length of the filter and the shape of its window.
-        transition_width = 2 * np.pi * (stop_hz - highest_hz) / rate_hz
-        half_length = (_STOP_BAND_ATTENUATION_DB - 7.95) / (2 * 2.285 * transition_width)
-        reach_samples = int(np.ceil(half_length / factor))
-        kernel_ticks = np.arange(-reach_samples * factor, reach_samples * factor + 1)
-        relative_cutoff = (stop_hz + highest_hz) / rate_hz  # twice the middle of the transition
-        kernel = relative_cutoff * np.sinc(relative_cutoff * kernel_ticks)
-        kernel *= np.kaiser(kernel_ticks.size, 0.1102 * (_STOP_BAND_ATTENUATION_DB - 8.7))
-        return cls(factor, kernel / kernel.sum(), reach_samples, new_rate_hz)
-
-    def apply(self, signal_values: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Low-pass filter a signal and downsample it.
-
-        Parameters
-        ----------
-        signal_values : ndarray, shape (n,)
-            Signal at the original rate, assumed to be 0 before and after.
-
-        Returns
-        -------
-        ndarray, shape (m,)
-            Filtered samples. Sample `reach` has the time of the first value.
-        """
-        filtered_length = signal_values.size + self.kernel.size - 1
-        padded_length = fast_length(filtered_length)
-        spectrum = np.fft.rfft(signal_values, padded_length) * np.fft.rfft(
-            self.kernel, padded_length
-        )
-        return np.fft.irfft(spectrum, padded_length)[: filtered_length : self.factor].copy()
-
-    def samples_inside_record(self, tick_count: int) -> slice:
-        """Return the slice of decimated samples whose filter window lies within the record.
-
-        `tick_count` is the number of ticks of the record.
-        """
-        return slice(2 * self.reach, (tick_count - 1) // self.factor + 1)
-
-
-def fast_length(at_least: int) -> int:
-    """Return the least number not below `at_least` (1 or more) with prime factors up to 11.
-
-    Fourier transforms of such a length are fast. Transforms of real values are a fifth faster with
-    factors up to 5 (``real=True``), which makes no fit faster. The grid of the Laplace variable
-    depends on the length (`TorquePredictor`), and with it the last digits of every estimate.
-
-    Examples
-    --------
-    >>> from analysis.identify import fast_length
-    >>> fast_length(1013)
-    1024
-    """
-    from scipy.fft import next_fast_len
-
-    return int(next_fast_len(at_least))
-
-
-def fast_length_below(at_most: int) -> int:
-    """Return the largest number not above `at_most` (1 or more) with prime factors up to 11.
-
-    Fourier transforms of such a length are fast.
-    """
-    from scipy.fft import prev_fast_len
-
-    return int(prev_fast_len(at_most))

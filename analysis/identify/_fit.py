@@ -333,7 +333,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
             linearisation.poles,
             projected,
             residual_variance,
-            linearisation.columns * noise.weight,
+            objective.unknown_torques(linearisation) * noise.weight,
             hum_spectra,
         ),
         cost=projected.cost,

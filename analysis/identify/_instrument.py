@@ -27,7 +27,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.identify._data import fast_length
+from analysis.decimation import fast_length
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray

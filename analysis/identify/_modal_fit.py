@@ -495,8 +495,8 @@ class _ModalSearch:
             return None
         x, numbers = search.x, search.numbers
         problem = search.problem()
-        solution = problem.solution_at(x)
-        joint_covariance = problem.covariance(solution)
+        solution, basis = problem.solve_at(x)
+        joint_covariance = problem.covariance(basis)
         constants, covariance = problem.constants(solution, x, joint_covariance)
         residual_spectrum = solution.residual.view(np.complex128)
         used_bins = search.noise.counts
@@ -515,7 +515,7 @@ class _ModalSearch:
             ),
             input_relation=search.residual_dependence_on_angle(solution),
             ringing=problem.ringing(solution, joint_covariance),
-            span=np.concatenate([solution.span, _orthonormal_rows(solution.jacobian)[0]]),
+            span=np.concatenate([basis.span, _orthonormal_rows(solution.jacobian)[0]]),
             ln_damping_by_torque=problem.ln_damping_by_torque(solution, x),
             effect_sizes=tuple(
                 solution.linear_parameters[
@@ -541,6 +541,10 @@ def _scaled_gram(
     return unit_rows, gram, row_lengths
 
 
+_COLUMNS_AT_ONCE: Final = 1 << 16
+"""Number of columns of the rows that are made orthonormal at once; more need copies of all rows."""
+
+
 def _orthonormal_rows(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return orthonormal rows with the same span as given rows.
 
@@ -548,25 +552,37 @@ def _orthonormal_rows(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], N
     """
     unit_rows, gram, row_lengths = _scaled_gram(rows, 1e-13)
     triangular_factor = np.linalg.cholesky(gram)
-    return np.linalg.solve(triangular_factor, unit_rows), triangular_factor * row_lengths[:, None]
+    for first_column in range(0, unit_rows.shape[1], _COLUMNS_AT_ONCE):
+        columns = slice(first_column, first_column + _COLUMNS_AT_ONCE)
+        unit_rows[:, columns] = np.linalg.solve(triangular_factor, unit_rows[:, columns])
+    return unit_rows, triangular_factor * row_lengths[:, None]
 
 
 @dataclass(frozen=True, slots=True)
 class _LinearSolution:
     """Best linear parameters of the modal model for one set of frequencies and damping.
 
-    The whitened `residual` and its derivatives are included. `columns` are the whitened spectra
-    that the linear parameters multiply, `span` is an orthonormal basis of these, and `jacobian` the
-    part of `full_jacobian` outside that span. Real and imaginary parts are interleaved, so that
-    rows have 2 K values.
+    `jacobian` are the derivatives of the whitened `residual` outside the span of the spectra that
+    the linear parameters multiply. Real and imaginary parts are interleaved, so that rows have 2 K
+    values.
     """
 
     residual: NDArray[np.float64]
     linear_parameters: NDArray[np.float64]
+    jacobian: NDArray[np.float64]
+
+
+@dataclass(frozen=True, slots=True)
+class _LinearBasis:
+    """Spectra from which a `_LinearSolution` was computed; too large to be stored with it.
+
+    `columns` are the whitened spectra that the linear parameters multiply, `span` is an orthonormal
+    basis of these, and `full_jacobian` are the derivatives of the residual.
+    """
+
     columns: NDArray[np.float64]
     span: NDArray[np.float64]
     full_jacobian: NDArray[np.float64]
-    jacobian: NDArray[np.float64]
 
 
 def _relative_pole(eta: float) -> complex:
@@ -611,10 +627,18 @@ class _ModalProblem:
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(spectra * self._weight).view(np.float64)
 
-    def _predicted_spectra(self, responses: NDArray[np.complex128]) -> NDArray[np.float64]:
+    def _predicted_spectra(
+        self, responses: Sequence[NDArray[np.complex128]] | NDArray[np.complex128]
+    ) -> NDArray[np.float64]:
         """Return the whitened torque spectra of transfer functions from the angle, (n, 2 K)."""
         comparison = self._comparison
-        return self._whiten(comparison.spectrum(comparison.prediction.in_time(responses)))
+        # One row after another: the transforms take many times the memory of their spectra.
+        predicted_spectra = np.empty((len(responses), 2 * self._weight.size))
+        for predicted_spectrum, response in zip(predicted_spectra, responses, strict=True):
+            predicted_spectrum[:] = self._whiten(
+                comparison.spectrum(comparison.prediction.in_time(response))
+            )
+        return predicted_spectra
 
     def _poles(self, x: NDArray[np.float64]) -> list[Pole]:
         """Return the poles of the modes, with their derivatives by frequencies and damping.
@@ -672,29 +696,30 @@ class _ModalProblem:
 
         The solutions at the last two points are cached.
         """
-        return self._recent.at(x, self._solve_at)
+        return self._recent.at(x, lambda point: self.solve_at(point)[0])
 
-    def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
+    def solve_at(self, x: NDArray[np.float64]) -> tuple[_LinearSolution, _LinearBasis]:
         """Return the best linear parameters at a point `x`, computed without the cache."""
         mode_points = x.reshape(-1, 2)
-        response_rows: list[NDArray[np.complex128]] = []
-        derivative_rows: list[NDArray[np.complex128]] = []
-        for log_omega, eta in mode_points:
+        numerator_count = 2 * len(mode_points)
+        spectra = np.empty((3 * numerator_count, 2 * self._weight.size))
+        for k, (log_omega, eta) in enumerate(mode_points):
             omega_rad_s = math.exp(log_omega)
             q = self._s / omega_rad_s
             inverse_denominator = 1 / (1 + eta * q + q * q)
             numerators = (q * q * inverse_denominator, q**3 * inverse_denominator)
-            response_rows += numerators
+            spectra[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
+            derivative_rows: list[NDArray[np.complex128]] = []
             # Derivatives by ln omega and eta of either numerator over the denominator
             for numerator_power, row in zip((2, 3), numerators, strict=True):
                 derivative_rows.append(
                     row * ((eta * q + 2 * q * q) * inverse_denominator - numerator_power)
                 )
                 derivative_rows.append(-row * q * inverse_denominator)
-        numerator_count = len(response_rows)
-        spectra = self._predicted_spectra(
-            np.array(response_rows + derivative_rows).reshape(-1, self._s.size)
-        )
+            derivative_start = numerator_count + 4 * k
+            spectra[derivative_start : derivative_start + 4] = self._predicted_spectra(
+                derivative_rows
+            )
         poles = self._poles(x)
         nuisance_spectra = self._whiten(self._nuisance_spectra(poles))
         drag_spectrum, *drag_jacobian = self._whiten(self._drag_change(poles))
@@ -716,8 +741,9 @@ class _ModalProblem:
             jacobian[2 * k] += a * mode_derivatives[0] + b * mode_derivatives[2]
             jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
         projected_jacobian = jacobian - (jacobian @ span.T) @ span
-        return _LinearSolution(
-            residual, linear_parameters, linear_spectra, span, jacobian, projected_jacobian
+        return (
+            _LinearSolution(residual, linear_parameters, projected_jacobian),
+            _LinearBasis(linear_spectra, span, jacobian),
         )
 
     def model(self, x: NDArray[np.float64]) -> ModalModel:
@@ -752,10 +778,10 @@ class _ModalProblem:
         drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
         return drag_change + modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
-    def covariance(self, solution: _LinearSolution) -> NDArray[np.float64]:
+    def covariance(self, basis: _LinearBasis) -> NDArray[np.float64]:
         """Return the joint covariance of frequencies, damping and the linear parameters."""
         _, gram, row_lengths = _scaled_gram(
-            np.concatenate([solution.full_jacobian, solution.columns]), 1e-14
+            np.concatenate([basis.full_jacobian, basis.columns]), 1e-14
         )
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
         return covariance

@@ -31,14 +31,11 @@ class Linearisation:
         Derivatives of the residual by the unknowns.
     poles : tuple of Pole
         Poles of the beam, differentiated by the unknowns.
-    columns : ndarray of complex, shape (m, K)
-        Spectra of torques with unknown amplitude: free decays, other disturbances and effects.
     """
 
     residual: NDArray[np.complex128]
     jacobian: NDArray[np.complex128]
     poles: tuple[Pole, ...]
-    columns: NDArray[np.complex128]
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +49,8 @@ class Projected:
     jacobian : ndarray of complex, shape (k, K)
         Derivatives of the residual by the unknowns.
     amplitudes : ndarray, shape (m,)
-        Best amplitudes of `Linearisation.columns`; those of free decays are in N·m at the first
-        compared sample.
+        Best amplitudes of the torques that are projected out; those of free decays are in N·m at
+        the first compared sample.
     amplitude_gram : ndarray, shape (m, m)
         Inverse covariance of the amplitudes.
     """
@@ -80,6 +77,10 @@ class Projected:
 
 _MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
+
+_MOST_BINS_OF_TWO_POINTS: Final = 65_536
+"""Maximum number of bins with which the results at two points are cached, and not at one: the
+results of all structures of a record of 30 minutes take 0.3 GB."""
 
 _UNKNOWNS_TOLERANCE: Final = 1e-6
 """Change of the unknowns below which the filling of unknown torques has converged."""
@@ -113,12 +114,13 @@ class Objective:
         self.comparison = comparison
         self.unknowns = unknowns
         self.columns = no_columns if effect_spectra is None else effect_spectra
-        self._recent: RecentValues[Linearisation] = RecentValues()
+        is_large = comparison.frequency_hz.size > _MOST_BINS_OF_TWO_POINTS
+        self._recent: RecentValues[Linearisation] = RecentValues(1 if is_large else 2)
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return the torque residual and its derivatives for the unknowns `x`.
 
-        The results at the last two points are cached.
+        The results at the last points are cached.
         """
         return self._recent.at(x, self._linearise)
 
@@ -144,12 +146,14 @@ class Objective:
             )
             residual += drag_change
             jacobian += drag_derivatives
-        return Linearisation(
-            residual=residual,
-            jacobian=jacobian,
-            poles=poles,
-            columns=np.concatenate([comparison.nuisance_spectra(poles), self.columns]),
-        )
+        return Linearisation(residual=residual, jacobian=jacobian, poles=poles)
+
+    def unknown_torques(self, linearisation: Linearisation) -> NDArray[np.complex128]:
+        """Return the spectra of torques with unknown amplitude at one point, shape (m, K).
+
+        They are free decays, other disturbances and effects.
+        """
+        return np.concatenate([self.comparison.nuisance_spectra(linearisation.poles), self.columns])
 
     def project(
         self, linearisation: Linearisation, weight: NDArray[np.float64] | float
@@ -169,7 +173,7 @@ class Objective:
             Weight of `NoiseSpectrum`; with 1 nothing is whitened.
         """
         residual, jacobian = linearisation.residual * weight, linearisation.jacobian * weight
-        unit_columns = _as_real_rows(linearisation.columns * weight)
+        unit_columns = _as_real_rows(self.unknown_torques(linearisation) * weight)
         column_lengths = np.sqrt(np.einsum("ij,ij->i", unit_columns, unit_columns))
         column_lengths[column_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
         unit_columns /= column_lengths[:, None]

@@ -171,7 +171,7 @@ class Refit:
         """Return the fitted factors of the added torque spectra, (c,), and their covariance."""
         linearisation = self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, self.noise.weight)
-        whitened_spectra = linearisation.columns * self.noise.weight
+        whitened_spectra = self.objective.unknown_torques(linearisation) * self.noise.weight
         # The Jacobian before the projection is needed: after it the columns are orthogonal to the
         # Jacobian, so their amplitudes would seem independent of the unknowns.
         derivatives = np.concatenate([linearisation.jacobian * self.noise.weight, whitened_spectra])
@@ -201,7 +201,7 @@ class Refit:
         """
         noise_weight, linearisation = self.noise.weight, self.objective.linearise(self.x)
         projected_objective = self.objective.project(linearisation, noise_weight)
-        explaining_spectra = linearisation.columns * noise_weight
+        explaining_spectra = self.objective.unknown_torques(linearisation) * noise_weight
         if beam_free:
             explaining_spectra = np.concatenate([projected_objective.jacobian, explaining_spectra])
         return unexplained_part(

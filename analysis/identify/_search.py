@@ -326,7 +326,8 @@ class Descent:
         at, noise = self.objective.linearise(self.x), self.noise()
         torque_amplitudes = self.objective.project(at, noise.weight).amplitudes
         decay_count = count_decay_spectra(at.poles) * (1 + len(comparison.later_decays))
-        decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ at.columns[:decay_count])
+        decay_spectra = self.objective.unknown_torques(at)[:decay_count]
+        decaying_nm = comparison.in_time(torque_amplitudes[:decay_count] @ decay_spectra)
         return find_hum_near_modes(comparison, self.plant, at.poles, noise, decaying_nm)
 
     def remove_hum(self, tolerance: float) -> Descent:

@@ -97,6 +97,10 @@ _DIVERGED_SPEED_RATIO: Final = 10.0
 _STEPS_PER_CHUNK: Final = 4096
 """Number of time steps whose matrices are computed together."""
 
+_LONGEST_UNDIVIDED_STEPS: Final = 300_000
+"""Maximum number of time steps for which the forces at all points are computed at once: those of a
+record that is analysed at its full rate. Chunks would change the last digits."""
+
 _QUADRATURE_POINTS: Final = 12
 """Number of Gauss-Legendre points for the integral over one time step."""
 
@@ -237,9 +241,17 @@ class DragResponse:
 
         C_D d is drag coefficient times diameter.
         """
-        return self._torque_over_time(
-            self._modal_forces(_drag_force(self._linear_speed(), DragLaw(1.0)))
-        )
+        modal_speeds = self._oversampled_modal_speeds()
+        step_count = modal_speeds.shape[1]
+        chunk_length = step_count if step_count <= _LONGEST_UNDIVIDED_STEPS else _STEPS_PER_CHUNK
+        modal_forces = np.empty((DRAG_MODES + 1, step_count))
+        for first_step in range(0, step_count, chunk_length):
+            steps = slice(first_step, first_step + chunk_length)
+            modal_forces[:, steps] = self._modal_forces(
+                _drag_force(self._point_speed(modal_speeds[:, steps]), DragLaw(1.0))
+            )
+        del modal_speeds
+        return self._torque_over_time(modal_forces)
 
     def torque(self, law: DragLaw, mode_numbers: Sequence[int] = ()) -> DragTorque:
         """Return the torque by air drag in N·m, and its derivatives by poles, damping and law.
@@ -348,11 +360,25 @@ class DragResponse:
 
     def _linear_speed(self) -> Real:
         """Return the speeds of the beam points without drag in m/s, shape (3 m, points)."""
-        point_speed_m_s = np.outer(self._oversampled_values(self._speed_transform), self._grid.x_m)
-        for mode_shape, modal_speed in zip(
-            self._grid.shapes, self._modal_speed_by_angle, strict=True
-        ):
-            point_speed_m_s += np.outer(self._oversampled_values(modal_speed), mode_shape)
+        return self._point_speed(self._oversampled_modal_speeds())
+
+    def _oversampled_modal_speeds(self) -> Real:
+        """Return the speeds of rotation and of each mode without drag, shape (1 + modes, 3 m)."""
+        return np.array(
+            [
+                self._oversampled_values(speed_transform)
+                for speed_transform in (self._speed_transform, *self._modal_speed_by_angle)
+            ]
+        )
+
+    def _point_speed(self, modal_speeds: Real) -> Real:
+        """Return the speeds of the beam points in m/s, shape (n, points).
+
+        `modal_speeds`, shape (1 + modes, n), are the speeds of rotation and of each mode.
+        """
+        point_speed_m_s: Real = np.outer(modal_speeds[0], self._grid.x_m)
+        for mode_shape, modal_speed in zip(self._grid.shapes, modal_speeds[1:], strict=True):
+            point_speed_m_s += np.outer(modal_speed, mode_shape)
         return point_speed_m_s
 
     def _add_drag_to_speeds(self, speed_m_s: Real, law: DragLaw) -> None:
@@ -509,7 +535,13 @@ class DragResponse:
 
         Its shape is (modes + 1, bins).
         """
-        return self._transform.forward(modal_forces, oversampling=_OVERSAMPLING)
+        # One row after another: the transforms at the higher rate take three times their result.
+        return np.array(
+            [
+                self._transform.forward(modal_force, oversampling=_OVERSAMPLING)
+                for modal_force in modal_forces
+            ]
+        )
 
     def _torque_transform(self, force_spectra: Complex) -> Complex:
         """Return the Laplace transform of the torque that modal forces and root moment cause.

@@ -203,7 +203,7 @@ def estimate_warnings(
             f"show the first mode, at {first_mode_hz:.3g} Hz; take longer segments, or record "
             "longer."
         )
-    excited_hz = _excited_band_hz(record.metadata)
+    excited_hz = record.swept_hz or _excited_band_hz(record.metadata)
     first_hz, last_hz = settings.band_hz
     if excited_hz is not None and (excited_hz[0] > first_hz or excited_hz[1] < last_hz):
         sentences.append(

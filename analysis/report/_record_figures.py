@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter
 
-from analysis.identify import fast_length
+from analysis.decimation import fast_length
 from analysis.report import _style as style
 from analysis.report._shown_model import ShownModel
 from analysis.report._uniformity import UNIFORMITY, uniformity_description, uniformity_figure

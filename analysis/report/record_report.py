@@ -106,7 +106,10 @@ def _session_lines(record: Record) -> list[str]:
         for key in ("specimen", "operator")
         if record_metadata.get(key)
     ]
-    return [*_start_lines(record_metadata), f"outcome {record.outcome}", *fact_lines]
+    part_lines = [] if record.part_text is None else [f"analysed: {record.part_text}"]
+    return [
+        *_start_lines(record_metadata), f"outcome {record.outcome}", *part_lines, *fact_lines,
+    ]  # fmt: skip
 
 
 def _start_lines(metadata: Mapping[str, str]) -> list[str]:
@@ -172,17 +175,22 @@ def _file_facts(path: Path) -> list[tuple[str, str]]:
 def _record_facts(record: Record) -> list[tuple[str, str]]:
     """Return (name, text) of a record's outcome, samples, beam, latencies and gaps."""
     stated_beam, sample_gaps = record.beam, record.gaps
-    sample_count = len(record.time_s)
+    full_rate = record.full_rate
+    decimation_text = (
+        "" if record.decimated_from is None else f", analysed at {record.rate_hz:g} Hz"
+    )
     flag_counts_text = ", ".join(
         f"{flag_count} × {flag_meaning}" for flag_meaning, flag_count in record.flags.items()
     )
     return [
         ("outcome", record.outcome),
+        ("analysed", record.part_text or "the whole session"),
         (
             "samples",
-            f"{sample_count} at {record.rate_hz:g} Hz, {sample_count / record.rate_hz:.6g} s",
+            f"{full_rate.samples} at {full_rate.rate_hz:g} Hz, "
+            f"{full_rate.samples / full_rate.rate_hz:.6g} s{decimation_text}",
         ),
-        ("sweep", f"samples {record.sweep.start} to {record.sweep.stop - 1}"),
+        ("sweep", f"samples {full_rate.sweep.start} to {full_rate.sweep.stop - 1}"),
         ("beam length", f"{stated_beam.length_m:g} m"),
         ("beam density", f"{stated_beam.density_kg_per_m:g} kg/m"),
         ("bending stiffness", f"{stated_beam.bending_stiffness_n_m2:g} N·m²"),

@@ -31,6 +31,14 @@ _EXTENSION_FACTOR = 1.125
 """Length of the extended record relative to the record."""
 _DECAY_EXPONENT = 7.0
 """Exponent of the transform's damping."""
+_LONGEST_AT_ONCE = 720_000
+"""Maximum number of samples whose motion is computed at once. A longer record is divided into
+chunks, each with the motion before it that the beam still remembers, because an hour at 1 kHz would
+take 0.3 GB."""
+_MEMORY_EXPONENT = 12.0
+"""Decays that a chunk of a record includes, as an exponent: exp(-12) is negligible."""
+_SLOWEST_MODES = 3
+"""Number of modes among which that with the slowest decay is searched for."""
 _BLOCK_POINTS = 1 << 15
 """Number of frequencies evaluated at once: those of an hour at 1 kHz would take a gigabyte."""
 
@@ -93,13 +101,41 @@ def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
     >>> print(f"{1e3 * motion.deflection_m:.1f} mm, {motion.slope_rad:.4f} rad")
     14.2 mm, 0.0201 rad
     """
+    if angle_rad.size <= _LONGEST_AT_ONCE:
+        return _tip_motion_from_rest(plant, angle_rad - angle_rad[0], rate_hz)
+    lead_in = _memory_samples(plant, rate_hz)
+    chunk_length = max(_LONGEST_AT_ONCE - lead_in, _LONGEST_AT_ONCE // 2)
+    largest = np.zeros(3)
+    for begin in range(0, angle_rad.size, chunk_length):
+        first = max(begin - lead_in, 0)
+        chunk_rad = angle_rad[first : begin + chunk_length] - angle_rad[first]
+        if first:  # no jump of the speed, which would let the beam ring
+            chunk_rad[: lead_in // 4] *= 0.5 - 0.5 * np.cos(np.linspace(0, np.pi, lead_in // 4))
+        motion = _tip_motion_from_rest(plant, chunk_rad, rate_hz, begin - first)
+        largest = np.maximum(largest, [motion.deflection_m, motion.slope_rad, motion.speed_m_s])
+    return TipMotion(*largest.tolist())
+
+
+def _memory_samples(plant: Plant, rate_hz: float) -> int:
+    """Return the number of samples after which a free decay of the beam is negligible."""
+    decay_rates_per_s = [-pole.at_rad_s.real for pole in plant.mode_poles(_SLOWEST_MODES)]
+    slowest_per_s = min([rate for rate in decay_rates_per_s if rate > 0], default=0.0)
+    longest_s = _LONGEST_AT_ONCE / 2 / rate_hz
+    memory_s = _MEMORY_EXPONENT / slowest_per_s if slowest_per_s else longest_s
+    return int(min(memory_s, longest_s) * rate_hz)
+
+
+def _tip_motion_from_rest(
+    plant: Plant, angle_rad: Real, rate_hz: float, first_sample: int = 0
+) -> TipMotion:
+    """Return the tip's largest motion from a sample on, for an angle that begins at rest at 0."""
     n = angle_rad.size
     transform = CausalTransform(
         fast_transform_length(int(np.ceil(_EXTENSION_FACTOR * n))), rate_hz, _DECAY_EXPONENT
     )
     s = transform.s
     # The angle stays at its final value: a jump back would ring at the last samples.
-    deflection_spectrum = transform.forward(angle_rad - angle_rad[0], hold=True)
+    deflection_spectrum = transform.forward(angle_rad, hold=True)
     tip_slope, tip_speed = np.empty((2, s.size), dtype=np.complex128)
     # Block by block and without copies: these arrays have the record's length.
     for block_start in range(0, s.size, _BLOCK_POINTS):
@@ -118,7 +154,7 @@ def tip_motion(plant: Plant, angle_rad: Real, rate_hz: float) -> TipMotion:
         )
 
     def largest(spectrum: Complex) -> float:
-        motion = transform.inverse(spectrum, n)
+        motion = transform.inverse(spectrum, slice(first_sample, n))
         return float(max(motion.max(), -motion.min()))  # NaN stays NaN
 
     return TipMotion(

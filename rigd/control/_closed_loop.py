@@ -7,7 +7,8 @@ noise are left out. A sensor that is read at the instant when a new torque takes
 effect of the old torque.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
+from dataclasses import dataclass, fields, replace
 from functools import lru_cache
 from math import exp, pi
 
@@ -143,18 +144,38 @@ class ClosedLoop:
         ControlDesignError
             If the loop is unstable and the response overflows.
         """
-        n = reference_rad.size
-        block_count = -(-n // _BLOCK_TICKS)
-        padded_reference = np.zeros((block_count, _BLOCK_TICKS))
-        padded_reference.ravel()[:n] = reference_rad
-        output_rows = np.empty((_OUTPUT_ROWS, block_count * _BLOCK_TICKS))
+        response = LoopResponse(*np.empty((len(fields(LoopResponse)), reference_rad.size)))
+        end = 0
+        for chunk in self.simulate_in_chunks(reference_rad):
+            begin, end = end, end + chunk.angle_rad.size
+            for channel in fields(LoopResponse):
+                getattr(response, channel.name)[begin:end] = getattr(chunk, channel.name)
+        return response
+
+    def simulate_in_chunks(self, reference_rad: Real) -> Iterator[LoopResponse]:
+        """Yield the response that `simulate` returns in consecutive chunks, which take less memory.
+
+        Parameters
+        ----------
+        reference_rad
+            Reference angle at each tick relative to the angle at rest, shape (n,).
+
+        Raises
+        ------
+        ControlDesignError
+            If the loop is unstable and the response overflows.
+        """
         free_response, forced_response, state_step, reference_drive = self._block_matrices()
         block_state = np.zeros(self.b.size)
-        for block_begin in range(0, block_count, _BLOCKS_AT_ONCE):
-            block_references = padded_reference[block_begin : block_begin + _BLOCKS_AT_ONCE]
+        ticks_at_once = _BLOCKS_AT_ONCE * _BLOCK_TICKS
+        for begin in range(0, reference_rad.size, ticks_at_once):
+            references = reference_rad[begin : begin + ticks_at_once]
+            block_count = -(-references.size // _BLOCK_TICKS)
+            block_references = np.zeros((block_count, _BLOCK_TICKS))
+            block_references.ravel()[: references.size] = references
             reference_effects = block_references @ reference_drive
             block_states = np.empty_like(reference_effects)
-            for block_index in range(len(block_references)):
+            for block_index in range(block_count):
                 block_states[block_index] = block_state
                 block_state = state_step @ block_state
                 block_state += reference_effects[block_index]
@@ -163,23 +184,19 @@ class ClosedLoop:
                     f"The closed loop is unstable and grows at {self.growth_per_s:.3g} /s: its "
                     "response cannot be computed."
                 )
+            output_rows = np.empty((_OUTPUT_ROWS, block_count, _BLOCK_TICKS))
             for row in range(_OUTPUT_ROWS):
-                out = output_rows[row].reshape(block_count, _BLOCK_TICKS)[
-                    block_begin : block_begin + len(block_references)
-                ]
-                np.matmul(block_references, forced_response[row], out=out)
-                out += block_states @ free_response[row]
-        del padded_reference
-        angle_rad, velocity_rad_s, torque_nm, friction_speed_rad_s, coupling_torque_nm = (
-            output_rows[:, :n]
-        )
-        settings = self.model.settings
-        # Without a copy: an hour of record takes 30 MB a channel.
-        friction_speed_rad_s /= settings.friction_velocity_rad_s
-        np.tanh(friction_speed_rad_s, out=friction_speed_rad_s)
-        friction_speed_rad_s *= settings.friction_compensation_nm
-        torque_nm += friction_speed_rad_s
-        return LoopResponse(angle_rad, velocity_rad_s, torque_nm, coupling_torque_nm)
+                np.matmul(block_references, forced_response[row], out=output_rows[row])
+                output_rows[row] += block_states @ free_response[row]
+            angle_rad, velocity_rad_s, torque_nm, friction_speed_rad_s, coupling_torque_nm = (
+                output_rows.reshape(_OUTPUT_ROWS, -1)[:, : references.size]
+            )
+            settings = self.model.settings
+            friction_speed_rad_s /= settings.friction_velocity_rad_s
+            np.tanh(friction_speed_rad_s, out=friction_speed_rad_s)
+            friction_speed_rad_s *= settings.friction_compensation_nm
+            torque_nm += friction_speed_rad_s
+            yield LoopResponse(angle_rad, velocity_rad_s, torque_nm, coupling_torque_nm)
 
     def response(self, frequency_hz: Real) -> Complex:
         """Return the complex frequency response from reference to angle at given frequencies.

@@ -15,7 +15,7 @@ from rigd.beam import Beam, Plant
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import PaperCheckResult, check_on_paper
-from rigd.control import ClosedLoop, ControlDesignError, LoopResponse, stable_loop
+from rigd.control import ClosedLoop, ControlDesignError, stable_loop
 from rigd.control.damper import design_damper
 from rigd.engine.messages import Ending
 from rigd.errors import UserError
@@ -147,10 +147,8 @@ class RigPreview:
         ControlDesignError
             If the loop is unstable and the predicted response overflows.
         """
-        loop_response = self._closed_loop.simulate(reference_rad)
-        fixed_peaks, clippable_peaks = _limited_peaks(
-            self._profile, _peaks(reference_rad, loop_response)
-        )
+        predicted_peaks, _ = _peaks_and_angle(self._closed_loop, reference_rad)
+        fixed_peaks, clippable_peaks = _limited_peaks(self._profile, predicted_peaks)
         return _largest_fraction(fixed_peaks + clippable_peaks)
 
     def move_plant(self, path: str | Path, use: Use) -> MovePlant:
@@ -402,9 +400,8 @@ def largest_amplitude(
     def largest_fraction_at(amplitude_rad: float) -> float:
         amplitude_scale = amplitude_rad / stated_amplitude_rad
         reference_rad = excitation.reference_rad * amplitude_scale
-        fixed_peaks, clippable_peaks = _limited_peaks(
-            profile, _peaks(reference_rad, closed_loop.simulate(reference_rad))
-        )
+        predicted_peaks, _ = _peaks_and_angle(closed_loop, reference_rad)
+        fixed_peaks, clippable_peaks = _limited_peaks(profile, predicted_peaks)
         if tip_slope is not None:
             fixed_peaks += (replace(tip_slope, value=tip_slope.value * amplitude_scale),)
         return _largest_fraction(fixed_peaks if force else fixed_peaks + clippable_peaks)
@@ -571,10 +568,7 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
     ControlDesignError
         If the loop is unstable and the predicted response overflows.
     """
-    loop_response = closed_loop.simulate(excitation.reference_rad)
-    predicted_peaks = _peaks(excitation.reference_rad, loop_response)
-    angle_rad = loop_response.angle_rad.copy()
-    del loop_response  # an hour of response takes 150 MB, and the tip motion needs as much again
+    predicted_peaks, angle_rad = _peaks_and_angle(closed_loop, excitation.reference_rad)
     loop_model = closed_loop.model
     if loop_model.plant is not None:
         tip = tip_motion(loop_model.plant, angle_rad, loop_model.rate_hz)
@@ -585,15 +579,31 @@ def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPredictio
     return replace(predicted_peaks, peak_angle_rad=_peak(start_rad + angle_rad))
 
 
-def _peaks(reference_rad: Real, loop_response: LoopResponse) -> SessionPrediction:
-    """Return the peak magnitudes of a simulated response to a reference angle (n,)."""
-    return SessionPrediction(
-        peak_angle_rad=_peak(loop_response.angle_rad),
-        peak_velocity_rad_s=_peak(loop_response.velocity_rad_s),
-        peak_torque_nm=_peak(loop_response.torque_nm),
-        peak_tracking_error_rad=_peak(reference_rad - loop_response.angle_rad),
-        peak_coupling_torque_nm=_peak(loop_response.coupling_torque_nm),
-    )
+def _peaks_and_angle(
+    closed_loop: ClosedLoop, reference_rad: Real
+) -> tuple[SessionPrediction, Real]:
+    """Return the peak magnitudes of the simulated response to a reference, and its angle in rad.
+
+    Both arrays have the shape (n,). The response is computed in chunks: that of an hour would take
+    150 MB.
+    """
+    angle_rad = np.empty(reference_rad.size)
+    peaks = np.zeros(5)
+    end = 0
+    for chunk in closed_loop.simulate_in_chunks(reference_rad):
+        begin, end = end, end + chunk.angle_rad.size
+        angle_rad[begin:end] = chunk.angle_rad
+        signals = (
+            chunk.angle_rad,
+            chunk.velocity_rad_s,
+            chunk.torque_nm,
+            reference_rad[begin:end] - chunk.angle_rad,
+            chunk.coupling_torque_nm,
+        )
+        peaks = np.maximum(peaks, [_peak(signal) for signal in signals])
+    angle, velocity, torque, tracking_error, coupling_torque = map(float, peaks)
+    predicted = SessionPrediction(angle, velocity, torque, tracking_error, coupling_torque)
+    return predicted, angle_rad
 
 
 def predicted_metadata(

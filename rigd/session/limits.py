@@ -5,13 +5,13 @@ A reader's memory and time grow with the sizes and counts that a file states, so
 
 from typing import Final
 
-MAX_SAMPLES: Final = 2_400_000
+MAX_SAMPLES: Final = 4_000_000
 """Maximum number of samples of a record that is planned, recorded, imported, analysed, exported or
-replayed: 40 minutes at 1 kHz. The samples take 0.27 GB of memory. An analysis, which is limited to
-1 GB, takes 0.16 GB and 0.29 kB for each sample, which is 0.53 GB for 1.27 million samples."""
+replayed: an hour at 1 kHz, with rest and ring-down. The samples take 0.45 GB of memory. An
+analysis, which decimates a long record while it is read, takes up to 1 GB."""
 MAX_SAMPLES_WITHOUT_SIGNALS: Final = 7_200_000
-"""Maximum number of samples if only times, ticks and flags are read: two hours at 1 kHz, the
-longest recording of an earlier version."""
+"""Maximum number of samples if only times, ticks and flags are read, or a part of the signals: two
+hours at 1 kHz, the longest recording of an earlier version."""
 
 MAX_FILE_BYTES: Final = 2 << 30
 """Maximum length of a session file in bytes."""

@@ -272,3 +272,61 @@ def test_what_was_recorded_is_kept_whatever_is_missing(
     np.testing.assert_allclose(record.angle_rad, line, atol=1e-12)
     np.testing.assert_allclose(record.torque_nm, -line, atol=1e-12)
     assert record.gaps.missing_ticks == len(missing)
+
+
+# Parts of a session
+
+
+def test_a_part_has_the_samples_segments_and_counts_of_its_time(
+    tmp_path, write_session, make_signals
+):
+    signals = make_signals(sweep_s=16.0, rest_s=0.5, ring_down_s=0.5)
+    present = np.ones(17_000, bool)
+    present[[1000, 9000]] = False
+    path = write_session(
+        tmp_path / "a.mcap", signals.part(present), ticks=np.flatnonzero(present),
+        metadata={"start_hz": "0", "stop_hz": "32"},
+    )  # fmt: skip
+    whole = load_record(path)
+    assert (whole.part_s, whole.part_json, whole.swept_hz) == (None, None, None)
+    part = load_record(path, (4.5, 12.5))
+    assert part.part_json == {"from_s": 4.5, "to_s": 12.5}
+    assert (part.time_s[0], part.time_s.size) == (4.5, 8000)
+    np.testing.assert_array_equal(part.torque_nm, whole.torque_nm[4500:12_500])
+    # Angles count from the angle that was held before the sweep, which the part does not show.
+    np.testing.assert_allclose(
+        part.angle_rad, whole.angle_rad[4500:12_500] - whole.rest_angle_rad, atol=1e-15
+    )
+    assert part.rest_angle_rad is None
+    assert (part.sweep, part.sweep_samples) == (slice(0, 8000), 8000)
+    assert part.swept_hz == pytest.approx((8.0, 24.0), abs=0.01)
+    assert part.gaps.missing_ticks == 1
+    assert not any("cut short" in each for each in part.warnings)
+
+
+def test_a_part_with_the_rest_begins_from_it(tmp_path, write_session, short_signals):
+    path = write_session(tmp_path / "a.mcap", short_signals)
+    whole, part = load_record(path), load_record(path, (None, 4.4))
+    assert part.part_s == (0.0, 4.4)
+    assert part.rest_angle_rad == whole.rest_angle_rad
+    np.testing.assert_array_equal(part.angle_rad, whole.angle_rad[:4400])
+    assert part.sweep == slice(500, 4400)
+
+
+@pytest.mark.parametrize(
+    ("part_s", "words"),
+    [
+        ((1.0, 5.5), ("beyond the record", "0 to 5 s")),
+        ((4.6, None), ("nothing of the sweep", "0.5 to 4.5 s")),
+        ((1.0, 1.5), ("too short", "10 periods of the first mode")),
+        ((4.0, 2.0), ("is empty", "--from must be less than --to")),
+        ((6.0, None), ("beyond the record", "0 to 5 s")),
+    ],
+)
+def test_a_part_that_cannot_be_analysed_is_refused(
+    tmp_path, write_session, short_signals, part_s, words
+):
+    path = write_session(tmp_path / "a.mcap", short_signals)
+    with pytest.raises(RecordError) as refusal:
+        load_record(path, part_s)
+    assert all(word in str(refusal.value) for word in (str(path), *words))

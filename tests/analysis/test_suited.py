@@ -55,6 +55,21 @@ def test_the_band_ends_at_four_tenths_of_the_rate(record_of, every, last_hz):
     assert Comparison.of(measurement, record_band_hz(record)).frequency_hz[-1] <= last_hz
 
 
+def test_the_band_of_a_part_is_what_it_sweeps(record_of):
+    record = record_of()
+    for swept_hz, record_hz, welch_hz in (
+        ((0.3, 30.0), (0.0, 30.0), (0.5875, 30.0)),  # from the beginning of the sweep
+        ((8.0, 60.0), (8.0, 50.0), (8.0, 50.0)),
+    ):
+        part = replace(record, part_s=(0.0, 4.0), swept_hz=swept_hz)
+        assert record_band_hz(part) == record_hz
+        assert welch_settings(part, WelchSettings()).band_hz == welch_hz
+        assert record_band_hz(part, (2.0, 30.0)) == (2.0, 30.0)
+        (remark,) = remarks(part)
+        assert f"{record_hz[0]:g} to {record_hz[1]:g} Hz" in remark
+        assert welch_exclusion_reason(part) is None
+
+
 def test_a_band_asked_for_is_of_all_fits(record_of):
     record = record_of()
     assert record_band_hz(record, (2.0, 30.0)) == (2.0, 30.0)

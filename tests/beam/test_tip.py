@@ -98,3 +98,17 @@ def test_a_tip_mass_and_a_clamp_are_in_the_motion_of_the_tip():
     soft = tip_motion(Plant(BEAM, VI, root_compliance_rad_per_nm=0.5), angle_rad, 1000.0)
     assert soft.slope_rad == pytest.approx(bare.slope_rad, rel=0.3)
     assert soft.speed_m_s == pytest.approx(bare.speed_m_s, rel=0.1)
+
+
+def test_the_motion_in_a_long_record_is_that_of_its_largest_part():
+    """The sweep passes mode 1 late in the record, whose chunks are computed one by one."""
+    t = np.arange(60_000) / 1000.0
+    sweep_rad = 0.02 * np.sin(2 * np.pi * (1.0 + 0.02 * t) * t)
+    sweep_rad[:5000] *= np.sin(0.5 * np.pi * t[:5000] / 5) ** 2
+    long_rad = np.zeros(1_500_000)
+    long_rad[700_000:760_000] = sweep_rad  # across the first two chunks
+    long_rad[760_000:] = sweep_rad[-1]
+    plant = Plant(BEAM, VI)
+    alone, within = tip_motion(plant, sweep_rad, 1000.0), tip_motion(plant, long_rad, 1000.0)
+    for quantity in ("deflection_m", "slope_rad", "speed_m_s"):
+        assert getattr(within, quantity) == pytest.approx(getattr(alone, quantity), rel=1e-3)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from analysis.identify._data import Decimation, fast_length, fast_length_below, interpolate_gaps
+from analysis.decimation import Decimation, fast_length, fast_length_below, interpolate_gaps
 from analysis.identify.noise import (
     estimate_noise,
     noise_power_with_peaks,

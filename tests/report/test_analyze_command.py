@@ -87,6 +87,45 @@ def test_one_session_from_end_to_end(session, tmp_path):
     assert len([m for m in content["modes"] if m["estimator"] == "record"]) == 3
 
 
+@pytest.mark.fit
+def test_the_numbers_of_a_part_state_it(session, tmp_path, analyze_here, without_drawing):
+    with without_drawing():
+        result = analyze_here(
+            session.name, "--to", "60", "--json", "fits.json", "--report", "out",
+            "--types", "VI", "--weights", "omega", "--figures", "png",
+        )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    part = {"from_s": 0.0, "to_s": 60.0}
+    content = json.loads((tmp_path / "fits.json").read_text())
+    (headline,), (file,), (of_record,) = content["headlines"], content["files"], content["records"]
+    assert (headline["part"], file["part"]) == (part, part)
+    assert of_record["verdict"][0] == "All results are of 0 to 60 s of the session."
+    assert result.stdout.startswith(of_record["verdict"][0])
+    assert "0 to 60 s of the session" in (tmp_path / "out" / "report.html").read_text()
+    # The sweep is at 24.6 Hz then, and no fit uses what lies beyond.
+    assert any("24.6" in warning for warning in file["warnings"])
+    assert [round(mode["frequency_hz"]["value"], 2) for mode in headline["modes"][:2]] == [
+        2.57,
+        16.01,
+    ]
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (("--from", "3", "--to", "2"), ("--from", "must be less than --to 2 s")),
+        (("--from", "-1"), ("--from", "0 or more")),
+        (("--to", "nan"), ("--to", "0 or more")),
+        (("--to", "9", "other.mcap"), ("--to", "add --each")),
+    ],
+)
+def test_times_that_select_no_part_are_wrong_use(tmp_path, analyze_here, options, words):
+    result = analyze_here("session.mcap", *options)
+    assert result.returncode == 2
+    assert all(word in result.stderr for word in words), result.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
 @pytest.mark.process
 def test_json_on_standard_output_is_alone_there(session, tmp_path):
     named = session.rename(tmp_path / "ζ.mcap")

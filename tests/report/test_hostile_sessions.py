@@ -121,7 +121,7 @@ def in_turn(count):
         ),
         further(
             lambda: repeated(message(1), 8_000_000, 8),
-            "more than the 2400000 messages of /rig/s",
+            "more than the 4000000 messages of /rig/s",
             1,
         ),
         further(lambda: in_turn(2_000_000), "made of so many small parts", 10),

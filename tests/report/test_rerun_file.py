@@ -10,7 +10,7 @@ from rerun_files import batches
 from typer.testing import CliRunner
 
 from analysis.cli.app import app
-from analysis.identify import fast_length
+from analysis.decimation import fast_length
 from analysis.models import WelchSettings
 from analysis.paper import analyse
 from analysis.record import load_record

@@ -1,0 +1,384 @@
+"""RecordSignals of a record: at the full rate, or decimated block by block while the file is read.
+
+A fit to a band of 50 Hz needs 125 samples per second, and the signals of a long record at their
+full rate would fill the memory. They therefore pass a linear-phase low-pass filter in blocks.
+Each block overlaps its neighbours by the length of the filter, so that the result does not depend
+on where a block ends. Reference, angle and torque pass the same filter, which leaves the response
+from angle to torque unchanged.
+
+Values in short gaps are interpolated before the filter. A longer gap makes those samples unknown
+whose filter window contains it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.decimation import MAX_GAP_PERIODS, Decimation, interpolate_gaps, runs_of_true
+from analysis.models import LARGEST_FRACTION_OF_RATE
+from analysis.record_checks import RecordError, check_finite, check_sensor
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.record_ticks import TickGrid
+
+LONGEST_FULL_RATE_SAMPLES: Final = 720_000
+"""Maximum number of samples of a record that is analysed at its full rate: 12 minutes at 1 kHz,
+which take 0.5 GB of memory. The signals of a longer record are decimated while they are read."""
+
+MAX_DECIMATED_SAMPLES: Final = 1_000_000
+"""Maximum number of samples of a long record after decimation, with which an analysis takes 2 GB of
+memory. An hour has 450 000 for a band of 50 Hz."""
+
+SIGNAL_FIELDS: Final = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
+"""Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
+
+_BLOCK_TICKS: Final = 1 << 16
+"""Number of ticks after which a block is filtered."""
+
+_LONGEST_FILLED_S: Final = 1.0
+"""Longest gap in seconds whose interpolation does not depend on where a block begins."""
+
+_NEIGHBOUR_REACH_PERIODS: Final = 2.0
+"""Duration on either side of a gap that its interpolation uses, in periods of the highest
+frequency (see `interpolate_gaps`)."""
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueExtreme:
+    """Largest or smallest measured torque, and how often it was measured.
+
+    Attributes
+    ----------
+    limit_nm : float
+        Torque.
+    values : int
+        Number of samples with exactly this torque.
+    repeated : int
+        Number of these samples that are next to another one.
+    """
+
+    limit_nm: float
+    values: int
+    repeated: int
+
+
+class _ExtremeCount:
+    """Count of the samples at the extreme of a torque that arrives in blocks; NaN is unknown."""
+
+    def __init__(self, sign: int) -> None:
+        self._sign = sign
+        self._limit_nm = -np.inf
+        self._values = self._repeated = 0
+        self._last_nm = np.full(2, np.nan)
+
+    def add(self, torque_nm: NDArray[np.float64]) -> None:
+        """Include the next values."""
+        signed_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
+        largest_nm = float(np.max(signed_nm[2:], initial=-np.inf, where=~np.isnan(signed_nm[2:])))
+        if largest_nm > self._limit_nm:
+            self._limit_nm, self._values, self._repeated = largest_nm, 0, 0
+        is_at_limit = signed_nm == self._limit_nm
+        follows_another = is_at_limit[2:] & is_at_limit[1:-1]
+        self._values += int(np.count_nonzero(is_at_limit[2:]))
+        # The first of a run of such values counts when the second arrives.
+        self._repeated += int(np.count_nonzero(follows_another))
+        self._repeated += int(np.count_nonzero(follows_another & ~is_at_limit[:-2]))
+        self._last_nm = signed_nm[-2:]
+
+    def result(self) -> TorqueExtreme:
+        """Return the extreme of all values."""
+        return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSignals:
+    """RecordSignals of a record, with masks of their known values.
+
+    Attributes
+    ----------
+    values : ndarray, shape (3, n)
+        Reference and measured angle in rad, and coupling torque in N·m.
+    angle_known, torque_known : ndarray of bool, shape (n,)
+        Whether angle and torque were measured at all ticks on which a sample depends.
+    first_tick : int
+        Tick of the first sample, relative to the first tick of the record.
+    factor : int
+        Number of ticks from one sample to the next.
+    torque_extremes : tuple of TorqueExtreme
+        Largest and smallest measured torque before the signals were decimated; empty if they were
+        not.
+    """
+
+    values: NDArray[np.float64]
+    angle_known: NDArray[np.bool_]
+    torque_known: NDArray[np.bool_]
+    first_tick: int = 0
+    factor: int = 1
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
+
+    def samples_in(self, ticks: slice) -> slice:
+        """Return the range of the samples inside a range of ticks of the record.
+
+        Parameters
+        ----------
+        ticks : slice
+            First tick, and the tick after the last, relative to the first tick of the record.
+        """
+        start, stop = (
+            min(max(-((self.first_tick - tick) // self.factor), 0), self.values.shape[1])
+            for tick in (ticks.start, ticks.stop)
+        )
+        return slice(start, stop)
+
+
+class FullRateSignals:
+    """RecordSignals of a record at its full rate, with linear interpolation of unknown values.
+
+    Parameters
+    ----------
+    grid : TickGrid
+        Ticks of the record.
+    """
+
+    def __init__(self, grid: TickGrid) -> None:
+        self.grid = grid
+        self._values = np.zeros((len(SIGNAL_FIELDS), grid.count))
+
+    def add(self, samples: NDArray[np.void]) -> None:
+        """Include samples of the record, as for `SignalDecimation`."""
+        samples, ticks = _inside(self.grid, samples)
+        for row, field_name in enumerate(SIGNAL_FIELDS):
+            check_finite(self.grid.session.path, field_name, samples[field_name], samples["tick"])
+            self._values[row, ticks] = samples[field_name]
+
+    def finish(self) -> RecordSignals:
+        """Return the signals after the last sample was added.
+
+        Raises
+        ------
+        RecordError
+            The torque is constant.
+        """
+        grid, is_missing = self.grid, self.grid.is_missing
+        check_sensor(grid.session.path, self._values[2, ~is_missing])
+        is_angle_unknown = grid.is_angle_unknown
+        for row, is_unknown in enumerate((is_missing, is_angle_unknown, grid.is_torque_unknown)):
+            if is_unknown.any() and not is_unknown.all():
+                known_indices = np.flatnonzero(~is_unknown)
+                self._values[row, is_unknown] = np.interp(
+                    np.flatnonzero(is_unknown), known_indices, self._values[row, known_indices]
+                )
+        return RecordSignals(self._values, ~is_angle_unknown, grid.is_torque_measured)
+
+
+def _inside(
+    grid: TickGrid, samples: NDArray[np.void]
+) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return the samples on a grid, and their ticks relative to its first."""
+    ticks = samples["tick"].astype(np.int64) - grid.first_tick
+    is_inside = (ticks >= 0) & (ticks < grid.count)
+    return (samples, ticks) if is_inside.all() else (samples[is_inside], ticks[is_inside])
+
+
+class SignalDecimation:
+    """Decimation of the signals of a record that arrive in blocks.
+
+    Parameters
+    ----------
+    grid : TickGrid
+        Ticks of the record.
+    highest_hz : float
+        Highest frequency that is preserved.
+
+    Raises
+    ------
+    RecordError
+        The record has too many samples for the memory that an analysis may take.
+    """
+
+    def __init__(self, grid: TickGrid, highest_hz: float) -> None:
+        self.grid, self.highest_hz = grid, highest_hz
+        self._decimation = Decimation.to_band(
+            grid.rate_hz, highest_hz, 1 / LARGEST_FRACTION_OF_RATE
+        )
+        factor, reach = self._decimation.factor, self._decimation.reach
+        sample_count = (grid.count - 1) // factor + 1 - 2 * reach
+        _check_length(grid, highest_hz, max(sample_count, 0))
+        self._known = (~grid.is_missing, ~grid.is_angle_unknown, grid.is_torque_measured)
+        self._results = np.empty((len(SIGNAL_FIELDS), sample_count))
+        self._done = 0  # number of results
+        self._buffer = np.zeros((len(SIGNAL_FIELDS), _BLOCK_TICKS + 2 * self._margin_ticks))
+        self._buffer_tick = self._end_tick = 0  # ticks of the buffer and after its last sample
+        self._torque_range_nm = (np.inf, -np.inf)
+        self._extremes = (_ExtremeCount(1), _ExtremeCount(-1))
+
+    @property
+    def factor(self) -> int:
+        """Number of ticks from one decimated sample to the next."""
+        return self._decimation.factor
+
+    @property
+    def _reach_ticks(self) -> int:
+        """Half length of the filter in ticks."""
+        return self._decimation.reach * self._decimation.factor
+
+    @property
+    def _margin_ticks(self) -> int:
+        """Number of ticks before and after a sample that its value may depend on."""
+        rate_hz = self.grid.rate_hz
+        interpolation_s = _NEIGHBOUR_REACH_PERIODS / self.highest_hz + _LONGEST_FILLED_S
+        return self._reach_ticks + int(np.ceil(interpolation_s * rate_hz)) + self._decimation.factor
+
+    def add(self, samples: NDArray[np.void]) -> None:
+        """Include the next samples of the record.
+
+        Parameters
+        ----------
+        samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
+            Samples in the order of their ticks; others than those of the grid are ignored.
+
+        Raises
+        ------
+        RecordError
+            Values are not finite.
+        """
+        samples, ticks = _inside(self.grid, samples)
+        for start in range(0, len(samples), _BLOCK_TICKS // 4):
+            block = slice(start, start + _BLOCK_TICKS // 4)
+            self._add_block(samples[block], ticks[block])
+
+    def _add_block(self, samples: NDArray[np.void], ticks: NDArray[np.int64]) -> None:
+        """Include samples with the given ticks, at most a quarter of a block."""
+        end_tick = int(ticks[-1]) + 1
+        if end_tick - self._buffer_tick > self._buffer.shape[1]:
+            self._filter_block()
+        missing_columns = end_tick - self._buffer_tick - self._buffer.shape[1]
+        if missing_columns > 0:  # after a long gap
+            self._buffer = np.pad(self._buffer, ((0, 0), (0, missing_columns)))
+        for row, field_name in enumerate(SIGNAL_FIELDS):
+            check_finite(self.grid.session.path, field_name, samples[field_name], samples["tick"])
+            self._buffer[row, ticks - self._buffer_tick] = samples[field_name]
+        torque_nm = samples[SIGNAL_FIELDS[2]]
+        self._torque_range_nm = (
+            min(self._torque_range_nm[0], float(torque_nm.min())),
+            max(self._torque_range_nm[1], float(torque_nm.max())),
+        )
+        measured_nm = np.where(self._known[2][ticks], torque_nm, np.nan)
+        for extreme in self._extremes:
+            extreme.add(measured_nm)
+        self._end_tick = end_tick
+
+    def _filter_block(self, *, last: bool = False) -> None:
+        """Filter the ticks in the buffer, and retain those on which later samples depend."""
+        factor, reach_ticks = self._decimation.factor, self._reach_ticks
+        end_tick = self._end_tick
+        usable_end = end_tick if last else end_tick - (self._margin_ticks - reach_ticks)
+        # Sample i is at the tick (i + reach) factor; its window ends `reach_ticks` later.
+        end_sample = min((usable_end - 1 - 2 * reach_ticks) // factor + 1, self._results.shape[1])
+        if end_sample <= self._done:
+            return
+        ticks = slice(self._buffer_tick, end_tick)
+        # The output for the tick (i + reach) factor has the index i + 2 reach, counted from tick 0.
+        first_output = self._done + 2 * self._decimation.reach - self._buffer_tick // factor
+        for row, known_mask in enumerate(self._known):
+            filled_values = interpolate_gaps(
+                self._buffer[row, : end_tick - self._buffer_tick],
+                known_mask[ticks],
+                self.highest_hz / self.grid.rate_hz,
+            )
+            self._results[row, self._done : end_sample] = self._decimation.apply(filled_values)[
+                first_output : first_output + end_sample - self._done
+            ]
+        self._done = end_sample
+        next_tick = max((self._done + self._decimation.reach) * factor - self._margin_ticks, 0)
+        next_tick -= next_tick % factor
+        remaining = self._buffer[:, next_tick - self._buffer_tick : end_tick - self._buffer_tick]
+        self._buffer[:, : remaining.shape[1]] = remaining.copy()
+        self._buffer[:, remaining.shape[1] :] = 0.0
+        self._buffer_tick = next_tick
+
+    def finish(self) -> RecordSignals:
+        """Return the decimated signals after the last sample was added.
+
+        Raises
+        ------
+        RecordError
+            The torque is constant, or the file has fewer samples than before.
+        """
+        path = self.grid.session.path
+        check_sensor(path, np.array(self._torque_range_nm))
+        self._filter_block(last=True)
+        if self._done < self._results.shape[1]:
+            raise RecordError(f"{path} was changed while it was read; analyse it again.")
+        angle_known, torque_known = self._known_samples()
+        return RecordSignals(
+            self._results,
+            angle_known,
+            torque_known,
+            self._reach_ticks,
+            self._decimation.factor,
+            tuple(extreme.result() for extreme in self._extremes),
+        )
+
+    def _known_samples(self) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+        """Return whether angle and torque of each decimated sample are known."""
+        factor, reach_ticks = self._decimation.factor, self._reach_ticks
+        angle_known, torque_known = np.ones((2, self._results.shape[1]), dtype=bool)
+        longest_ticks = MAX_GAP_PERIODS / self.highest_hz * self.grid.rate_hz
+        for is_angle, known_mask in ((True, self._known[1]), (False, self._known[2])):
+            for gap_start, gap_end in zip(*runs_of_true(~known_mask), strict=True):
+                if gap_end - gap_start <= longest_ticks:
+                    continue
+                # A wrong angle near the gap moves the beam: no torque is compared there.
+                first_sample = max(-((2 * reach_ticks - gap_start) // factor), 0)
+                torque_known[first_sample : (gap_end - 1) // factor + 1] = False
+                if is_angle:  # two samples or more count as a gap that is too long
+                    first_sample = gap_start // factor - reach_ticks // factor
+                    gap_samples = max((gap_end - gap_start) // factor, 2)
+                    angle_known[max(first_sample, 0) : max(first_sample + gap_samples, 0)] = False
+        return angle_known, torque_known
+
+
+def collector_of_signals(
+    grid: TickGrid, highest_hz: float, longest_samples: int
+) -> FullRateSignals | SignalDecimation:
+    """Return the collector for the signals of a record: decimated if the record is long.
+
+    Parameters
+    ----------
+    grid : TickGrid
+        Ticks of the record.
+    highest_hz : float
+        Highest frequency of the analysis.
+    longest_samples : int
+        Maximum number of samples at the full rate.
+
+    Raises
+    ------
+    RecordError
+        The record has too many samples for the memory that an analysis may take.
+    """
+    if grid.count <= longest_samples:
+        return FullRateSignals(grid)
+    decimation = SignalDecimation(grid, highest_hz)
+    return decimation if decimation.factor > 1 else FullRateSignals(grid)
+
+
+def _check_length(grid: TickGrid, highest_hz: float, sample_count: int) -> None:
+    """Raise if a record has too many samples for the memory that an analysis may take.
+
+    `sample_count` is the number of samples that the highest frequency of the analysis needs.
+    """
+    if sample_count <= MAX_DECIMATED_SAMPLES:
+        return
+    raise RecordError(
+        f"{grid.session.path}: {grid.count / grid.rate_hz:g} s with frequencies up to "
+        f"{highest_hz:g} Hz take {sample_count} samples, and no more than {MAX_DECIMATED_SAMPLES} "
+        "fit into the memory that an analysis may take. Analyse a part of the session (--from, "
+        "--to) or lower --band."
+    )

@@ -1,0 +1,282 @@
+"""Grid of a session's ticks: missing and stale samples, flags, and ranges of the sweep.
+
+It needs no signals, so that a long record can be checked before its signals are read.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from analysis.record_checks import (
+    RecordError,
+    check_clock,
+    check_fillable,
+    check_span,
+    longest_run,
+)
+from rigd.session.layout import Status
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+    from numpy.typing import NDArray
+
+    from rigd.session import Session
+
+_REPORTED_FLAGS = (
+    (Status.TORQUE_SATURATED, "torque command saturated"),
+    (Status.WRENCH_SATURATED, "wrench saturated"),
+    (Status.ANGLE_STALE, "angle stale"),
+    (Status.WRENCH_STALE, "wrench stale"),
+    (Status.LIMIT_WARNING, "limit warning"),
+    (Status.TORQUE_OFF, "torque off"),
+    (Status.LATE, "late tick"),
+)
+"""Flags of a sample that are counted, with their meanings."""
+
+_UNKNOWN_SAMPLES_TEXT = (
+    "do not count in the whole-record fits; for the Welch fits they are interpolated."
+)
+"""End of the sentence on missing or stale samples."""
+
+_FLAG_CONSEQUENCES: tuple[tuple[str, str], ...] = (
+    ("wrench saturated", "The torque is clipped there and the estimate is wrong near it."),
+    ("torque command saturated", "The angle did not follow its reference there."),
+    ("torque off", "The motor was not driven there."),
+)
+"""Consequence for the analysis of each flag that causes a warning."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Counts of the samples that were filled by linear interpolation.
+
+    Attributes
+    ----------
+    missing_ticks
+        Ticks between the first and the last sample that have no sample.
+    longest_gap_ticks
+        Number of ticks in the longest gap.
+    sweep_missing_ticks
+        Missing ticks inside the sweep.
+    sweep_stale_angles, sweep_stale_torques
+        Recorded samples of the sweep whose angle or torque is flagged as held from an earlier tick.
+    """
+
+    missing_ticks: int
+    longest_gap_ticks: int
+    sweep_missing_ticks: int
+    sweep_stale_angles: int
+    sweep_stale_torques: int
+
+
+@dataclass(frozen=True, slots=True)
+class TickGrid:
+    """All ticks from the first to the last sample of a session or of a part of it.
+
+    Attributes
+    ----------
+    session : Session
+        Session or part with the samples.
+    rate_hz : float
+        Ticks per second.
+    first_tick : int
+        Number of the first tick.
+    indices : ndarray of int, shape (n,)
+        Index of each sample in the grid.
+    count : int
+        Number of ticks.
+    status_bits : ndarray of uint32, shape (count,)
+        Bits of `Status`; 0 where a tick is missing.
+    is_missing : ndarray of bool, shape (count,)
+        Whether a tick has no sample.
+    sweep : slice
+        Ticks with the excitation.
+    unrecorded_ticks : int
+        Number of ticks of the sweep before the first and after the last sample.
+    """
+
+    session: Session
+    rate_hz: float
+    first_tick: int
+    indices: NDArray[np.int64]
+    count: int
+    status_bits: NDArray[np.uint32]
+    is_missing: NDArray[np.bool_]
+    sweep: slice
+    unrecorded_ticks: int
+
+    @classmethod
+    def of(cls, session: Session, rate_hz: float) -> TickGrid:
+        """Return the grid of a session, after checks of its ticks, times and gaps.
+
+        Parameters
+        ----------
+        session : Session
+            Session or part; its samples need tick, time and status.
+        rate_hz : float
+            Sampling rate.
+
+        Raises
+        ------
+        RecordError
+            The ticks or the time stamps cannot be used, or too many samples are missing.
+        """
+        path, samples = session.path, session.samples
+        ticks = samples["tick"].astype(np.int64)
+        check_span(path, ticks)
+        check_clock(path, ticks, samples["t_ns"], rate_hz)
+        first_tick = int(ticks[0])
+        tick_indices = ticks - first_tick
+        tick_count = int(tick_indices[-1]) + 1
+        sweep, unrecorded_ticks = _sweep_range(session, first_tick, tick_count)
+        status_bits = np.zeros(tick_count, dtype=np.uint32)
+        status_bits[tick_indices] = samples["status"]
+        is_missing = np.ones(tick_count, dtype=bool)
+        is_missing[tick_indices] = False
+        grid = cls(
+            session, rate_hz, first_tick, tick_indices, tick_count, status_bits, is_missing, sweep,
+            unrecorded_ticks,
+        )  # fmt: skip
+        for channel_name, is_unknown in (
+            ("angle", grid.is_angle_unknown),
+            ("torque", grid.is_torque_unknown),
+        ):
+            check_fillable(path, channel_name, is_unknown[sweep], first_tick + sweep.start, rate_hz)
+        return grid
+
+    @property
+    def is_angle_unknown(self) -> NDArray[np.bool_]:
+        """Whether the angle of each tick is missing or stale, shape (count,)."""
+        return self.is_missing | self._has(Status.ANGLE_STALE)
+
+    @property
+    def is_torque_unknown(self) -> NDArray[np.bool_]:
+        """Whether the torque of each tick is missing or stale, shape (count,)."""
+        return self.is_missing | self._has(Status.WRENCH_STALE)
+
+    @property
+    def is_torque_measured(self) -> NDArray[np.bool_]:
+        """Whether the torque was measured at its tick and within the range, shape (count,)."""
+        return ~(self.is_torque_unknown | self._has(Status.WRENCH_SATURATED))
+
+    def _has(self, flag: Status) -> NDArray[np.bool_]:
+        """Return whether each tick has a flag, shape (count,)."""
+        has_flag: NDArray[np.bool_] = (self.status_bits & flag) != 0
+        return has_flag
+
+    @property
+    def there(self) -> slice | None:
+        """Ticks of the first of two sweeps; None if there is only one sweep."""
+        segment_first_tick, segment_end_tick = self.session.segments.get("there", (0, 0))
+        first_index, end_index = (
+            max(segment_first_tick - self.first_tick, self.sweep.start),
+            min(segment_end_tick - self.first_tick, self.sweep.stop),
+        )
+        return slice(first_index, end_index) if end_index > first_index else None
+
+    def gaps(self) -> Gaps:
+        """Return the counts of missing and stale samples."""
+        return Gaps(
+            missing_ticks=int(self.is_missing.sum()),
+            longest_gap_ticks=longest_run(self.is_missing)[0],
+            sweep_missing_ticks=int(self.is_missing[self.sweep].sum()),
+            sweep_stale_angles=int(self._has(Status.ANGLE_STALE)[self.sweep].sum()),
+            sweep_stale_torques=int(self._has(Status.WRENCH_STALE)[self.sweep].sum()),
+        )
+
+    def flag_counts(self) -> dict[str, int]:
+        """Return the number of samples of the sweep with each flag that occurs there."""
+        counts = {
+            meaning: int(np.count_nonzero(self.status_bits[self.sweep] & status_flag))
+            for status_flag, meaning in _REPORTED_FLAGS
+        }
+        return {meaning: sample_count for meaning, sample_count in counts.items() if sample_count}
+
+    def fault_sentences(self, outcome: Mapping[str, str]) -> tuple[str, ...]:
+        """Return sentences on an incomplete session, missing samples and flags.
+
+        Parameters
+        ----------
+        outcome : mapping of str to str
+            End of the session as the file states it.
+        """
+        return _describe_faults(
+            self.gaps(), self.flag_counts(), self.unrecorded_ticks, outcome, self.rate_hz,
+            self.sweep,
+        )  # fmt: skip
+
+
+def _sweep_range(session: Session, first_tick: int, tick_count: int) -> tuple[slice, int]:
+    """Return the range of the sweep's samples, and the number of ticks not recorded at its ends."""
+    if "sweep" not in session.segments:
+        return slice(0, tick_count), 0
+    first_sweep_tick, end_sweep_tick = session.segments["sweep"]
+    first_index = max(first_sweep_tick - first_tick, 0)
+    end_index = min(end_sweep_tick - first_tick, tick_count)
+    if end_index <= first_index:
+        raise RecordError(
+            f"{session.path}: segment 'sweep' covers ticks {first_sweep_tick} to "
+            f"{end_sweep_tick - 1}, but the record "
+            f"holds ticks {first_tick} to {first_tick + tick_count - 1}, so nothing of the sweep "
+            "was recorded."
+        )
+    return slice(first_index, end_index), (end_sweep_tick - first_sweep_tick) - (
+        end_index - first_index
+    )
+
+
+def _describe_faults(
+    gaps: Gaps,
+    flag_counts: Mapping[str, int],
+    unrecorded_ticks: int,
+    outcome: Mapping[str, str],
+    rate_hz: float,
+    sweep: slice,
+) -> tuple[str, ...]:
+    """Return sentences on an incomplete session, missing samples and flags."""
+    sentences = []
+    outcome_text = outcome.get("outcome", "unknown")
+    if outcome_text in ("stopped", "fault"):
+        stop_reason = outcome.get("reason")
+        sentences.append(
+            f"The session's outcome is '{outcome_text}', not 'complete'"
+            + (f": {stop_reason}" if stop_reason else ".")
+        )
+    elif "recovered_from" in outcome:
+        sentences.append(
+            f"The file was recovered from {outcome['recovered_from']}, without loss of samples."
+        )
+    if outcome.get("recovered_protected") == "false":
+        sentences.append(
+            "The file was recovered from one whose metadata no checksum covered: compare rate, "
+            "beam and segments with what is known of the session."
+        )
+    if unrecorded_ticks:
+        recorded_s = (sweep.stop - sweep.start) / rate_hz
+        sentences.append(
+            f"The sweep was cut short: {recorded_s:.6g} s of it were recorded, "
+            f"{unrecorded_ticks / rate_hz:.6g} s were not."
+        )
+    if gaps.sweep_missing_ticks:
+        sentences.append(
+            f"{gaps.sweep_missing_ticks} missing ticks in the sweep (longest gap of the record "
+            f"{gaps.longest_gap_ticks} ticks) {_UNKNOWN_SAMPLES_TEXT}"
+        )
+    for channel_name, sample_count in (
+        ("angle", gaps.sweep_stale_angles),
+        ("torque", gaps.sweep_stale_torques),
+    ):
+        if sample_count:
+            sentences.append(
+                f"{sample_count} stale values of the {channel_name} {_UNKNOWN_SAMPLES_TEXT}"
+            )
+    for flag_name, flag_consequence in _FLAG_CONSEQUENCES:
+        if flag_name in flag_counts:
+            sentences.append(
+                f"{flag_counts[flag_name]} samples of the sweep: {flag_name}. {flag_consequence}"
+            )
+    return tuple(sentences)
