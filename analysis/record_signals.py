@@ -1,4 +1,4 @@
-"""RecordSignals of a record: at the full rate, or decimated block by block while the file is read.
+"""Signals of a record: at the full rate, or decimated block by block while the file is read.
 
 A fit to a band of 50 Hz needs 125 samples per second, and the signals of a long record at their
 full rate would fill the memory. They therefore pass a linear-phase low-pass filter in blocks.
@@ -97,7 +97,7 @@ class _ExtremeCount:
 
 @dataclass(frozen=True, slots=True)
 class RecordSignals:
-    """RecordSignals of a record, with masks of their known values.
+    """Signals of a record, with masks of their known values.
 
     Attributes
     ----------
@@ -137,7 +137,7 @@ class RecordSignals:
 
 
 class FullRateSignals:
-    """RecordSignals of a record at its full rate, with linear interpolation of unknown values.
+    """Signals of a record at its full rate, with linear interpolation of unknown values.
 
     Parameters
     ----------
