@@ -212,7 +212,7 @@ def test_the_verdict_names_the_structure_and_comes_first(done, truth):
     alpha = shared["parameters"]["alpha"]
     assert alpha["interval_95"] == list(verdict.alpha.interval)
     assert alpha["flag"] is None
-    assert {*each[0], *shared} - {*shared} == {"scale_uncertainty", "combined"}
+    assert {*each[0], *shared} - {*shared} == {"scale_uncertainty", "combined", "part"}
     assert (shared["uniformity_percent"], shared["basis"]) == (0.1, "geometry")
     exact = shared["exact_geometry"]
     assert exact["condition"] == "if the beam is uniform to 1e-5"
