@@ -288,6 +288,8 @@ def intervals(result: dict[str, Any]) -> Iterator[tuple[str, float, float, float
             true = truth.get(f"{name} {mode['mode']}")
             if mode["shown"] and true is not None and not told["flag"] and told["interval_95"]:
                 yield f"{name} {mode['mode']}", true, told["value"], *told["interval_95"]
+    if rig.uneven_percent:
+        return  # the damping of such a rig acts on the motion relative to the hub, and has no order
     values = {"zeta": rig.zeta, "alpha": rig.alpha, "gamma": rig.gamma, "lambda": rig.lambda_}
     there = {"zeta": rig.zeta, "alpha": rig.zeta, "gamma": rig.gamma, "lambda": rig.gamma}
     for name, told in result["parameters"].items():
