@@ -249,9 +249,34 @@ def plugin_errors(
     except (Exception, SystemExit) as error:  # SystemExit is no Exception
         if plugin is None:
             raise
-        raise plugin.error(
-            f"its code failed ({error_text(error)}); report that to the package's author."
-        ) from error
+        raise _failure_of(plugin, error) from error
+
+
+def error_of_package(error: Exception, plugin: Plugin) -> PluginError | None:
+    """Return the error that names a package, or None if its code did not raise the exception.
+
+    Parameters
+    ----------
+    error
+        Unexpected exception.
+    plugin
+        Part of an installed package.
+    """
+    package_module = plugin.reference.partition(":")[0].partition(".")[0]
+    call = error.__traceback__
+    while call is not None:
+        module = str(call.tb_frame.f_globals.get("__name__"))
+        if module.partition(".")[0] == package_module:
+            return _failure_of(plugin, error)
+        call = call.tb_next
+    return None
+
+
+def _failure_of(plugin: Plugin, error: BaseException) -> PluginError:
+    """Return the error for an unexpected exception of a package's code."""
+    return plugin.error(
+        f"its code failed ({error_text(error)}); report that to the package's author."
+    )
 
 
 def error_text(error: BaseException) -> str:

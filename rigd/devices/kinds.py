@@ -7,10 +7,12 @@ names a `rigd.devices.declaration.DeviceKind`.
 from typing import Final
 
 from rigd.devices._shipped import SHIPPED
+from rigd.devices.contracts import DeviceError
 from rigd.devices.declaration import DeviceKind
 from rigd.devices.parameters import DeviceSelection
 from rigd.plugins import (
     Plugin,
+    error_of_package,
     find_plugin,
     installed_plugins,
     load_declaration,
@@ -61,6 +63,30 @@ def load_kind(plugin: Plugin) -> DeviceKind:
 def find_owner(name: str) -> Plugin | None:
     """Return the package that adds a kind of device, or None for a shipped or unknown kind."""
     return None if name in SHIPPED else find_plugin(DEVICE_GROUP, name)
+
+
+def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
+    """Return why a device failed, for the operator, if an exception is that of a device.
+
+    Parameters
+    ----------
+    error
+        Exception in the control process.
+    selection
+        Drive and sensor of the profile.
+
+    Raises
+    ------
+    Exception
+        The given one, if it is neither an error of a device nor raised by a package's device.
+    """
+    if isinstance(error, DeviceError | OSError):
+        return str(error)
+    for name in (selection.drive, selection.sensor):
+        owner = find_owner(name)
+        if owner is not None and (package_error := error_of_package(error, owner)) is not None:
+            return str(package_error)
+    raise error
 
 
 def selected_kinds(selection: DeviceSelection) -> tuple[DeviceKind, ...]:

@@ -15,6 +15,7 @@ import numpy as np
 from rigd.control.contracts import ControllerError
 from rigd.control.damper import VibrationDamper
 from rigd.devices.contracts import DeviceError
+from rigd.devices.kinds import failure_of_device
 from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
@@ -536,10 +537,11 @@ class SessionSequence:
         except ControllerError as error:
             self._cycle.torque_off()
             return SessionEnd("fault", str(error))
-        except (DeviceError, OSError) as error:
+        except Exception as error:
+            device_failure = failure_of_device(error, self._profile.rig.devices)
             self._cycle.mark_readings_stale()
             # A drive whose host stalled switches itself off by its own watchdog.
-            violation_text = f"{error} {self._cycle.watch.after_missed}".strip()
+            violation_text = f"{device_failure} {self._cycle.watch.after_missed}".strip()
             return SessionEnd("fault", violation_text, device_failed=True)
         if violation is None:
             return None

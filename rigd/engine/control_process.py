@@ -14,6 +14,7 @@ from rigd.control.contracts import ControllerError
 from rigd.control.kinds import make_controller
 from rigd.devices import open_devices
 from rigd.devices.contracts import DeviceError, Devices, StatedDrive
+from rigd.devices.kinds import failure_of_device
 from rigd.engine._control_names import CONNECTING_NAME, IDLE_NAME, SESSION_NAME
 from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
@@ -111,7 +112,7 @@ def run_control(
     realtime_results
         Real-time settings that were granted, for the file.
     """
-    failure_text = ""
+    end_text = ""
     name_this_process(CONNECTING_NAME)
     try:
         # The drive last: an operational drive expects a SYNC every period.
@@ -133,14 +134,16 @@ def run_control(
             )
         )
         server.serve()
-    except (DeviceError, OSError, PluginError) as error:
-        failure_text = str(error)
+    except PluginError as error:
+        end_text = str(error)
+    except Exception as error:
+        end_text = failure_of_device(error, profile.rig.devices)
     finally:
         devices.drive.disable()
         channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(Ended(f"{failure_text} {devices.drive.off_doubt}".strip()))
+    parent.send(Ended(f"{end_text} {devices.drive.off_doubt}".strip()))
 
 
 class _ControlServer:
@@ -340,8 +343,9 @@ class _ControlServer:
             session_outcome, end_reason, device_failed = end.outcome, end.reason, end.device_failed
         except ControllerError as error:  # of its reset
             session_outcome, end_reason = "fault", str(error)
-        except (DeviceError, OSError) as error:
-            session_outcome, end_reason, device_failed = "fault", str(error), True
+        except Exception as error:
+            session_outcome, device_failed = "fault", True
+            end_reason = failure_of_device(error, self._profile.rig.devices)
         finally:
             devices.drive.disable()
             cycle.torque_off()

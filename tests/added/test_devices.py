@@ -1,6 +1,7 @@
 """A drive and a sensor in one file outside: each part of rigd takes them without a change."""
 
 import json
+import re
 import sys
 
 import pytest
@@ -113,6 +114,30 @@ def test_a_failed_row_of_theirs_refuses_a_session(packages, tmp_path):
     code, _, errors = rigd_with(packages, "run", "hold", "--profile", path, "--fast")
     assert code != 0
     assert "device_settings" in errors
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("statement", "reason"),
+    [
+        ("sensor.connect = lambda: {}[1]", "KeyError: 1"),
+        ("gains, gain = [gain] * 2000, None", "IndexError: pop from empty list"),  # in a tick
+    ],
+)
+def test_an_error_of_their_code_ends_the_session_and_names_the_package(
+    packages, tmp_path, statement, reason
+):
+    module = packages / "lab_devices.py"
+    code = module.read_text().replace("    measure = ", f"    {statement}\n    measure = ")
+    module.write_text(code.replace("(gain * each", "((gain or gains.pop()) * each"))
+    code, output, errors = rigd_with(
+        packages, "run", "hold", "--profile", write_rig(tmp_path), "--fast", "--output",
+        tmp_path / "out",
+    )  # fmt: skip
+    told = " ".join(f"{output} {errors}".split())
+    assert code == 1
+    assert "Traceback" not in told
+    assert re.search(rf"Package lab-devices 1\.2, .*: its code failed \({reason}\)", told)
 
 
 WRONG = {  # code of a package, its entry points, and the reason that is stated
