@@ -109,7 +109,7 @@ def test_the_new_driver_reads_an_instrument_as_its_page_says(tmp_path):
         answers = threading.Thread(target=answer_twice, daemon=True)
         answers.start()
         package = made(tmp_path / "own", "mysensor")
-        status, output, errors = rigd_with(package, program=("-P", "-c", code))
+        status, output, errors = rigd_with(package, program=("-P", "-c", code), cold=True)
         answers.join(10.0)
     assert (status, errors) == (0, "")
     assert output.startswith("(1.0, 2.0, 3.0, 4.0, 5.0, 6.0) False LineHealth(")
