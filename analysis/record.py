@@ -27,7 +27,6 @@ from analysis.record_checks import (
     stated_uncertainty,
     stated_uniformity,
 )
-from analysis.record_part import check_part_length, part_of_session, swept_frequencies_hz
 from analysis.record_signals import (
     LONGEST_FULL_RATE_SAMPLES,
     RecordSignals,
@@ -350,6 +349,8 @@ def _grid_of(
     rate_hz = stated_rate_hz(session)
     if part_s is None:
         return TickGrid.of(session, rate_hz), None
+    from analysis.record_part import part_of_session
+
     part, covered_s = part_of_session(session, part_s, rate_hz)
     return TickGrid.of(part, rate_hz), covered_s
 
@@ -372,6 +373,8 @@ def _record(
     beam = stated_beam(session, grid.rate_hz, grid.count)
     swept_hz = None
     if covered_s is not None:
+        from analysis.record_part import check_part_length, swept_frequencies_hz
+
         check_part_length(session.path, covered_s, beam)
         first_sweep = grid.there or grid.sweep
         swept_hz = swept_frequencies_hz(

@@ -217,7 +217,7 @@ class ExcitationPlanner:
         self._max_ticks = writer.ticks + writer.room
         scan_tick, scan_rad = search.scan
         self._intervals = [_PlannedInterval("scan", scan_rad, scan_tick, scan_tick)]
-        self._segment_count = self._repeated_scans = 0
+        self._segment_count = self._repeated_scans = self._shown_tick = 0
         self._excites_unseen_modes = self._has_full_fit = False
         self._unreachable_count = self._doubtful_count = 0
         self._tightening = 1.0
@@ -255,9 +255,11 @@ class ExcitationPlanner:
         self._forecast.add(time_s, max(flagged_estimate.ratio for flagged_estimate in estimates))
         doubt_text = document["doubt"] or ""
         # A doubt from the structure with most parameters is first checked with all structures.
-        yield self._report_message(
-            document, estimates, time_s, without_table_row=bool(doubt_text) and not self.may_be_last
-        )
+        is_shown = document["tick"] == self._shown_tick
+        hides_row = is_shown or (bool(doubt_text) and not self.may_be_last)
+        yield self._report_message(document, estimates, time_s, without_table_row=hides_row)
+        if not hides_row:
+            self._shown_tick = document["tick"]
         if self.may_be_last and all(
             flagged_estimate.ratio <= 1.0 for flagged_estimate in estimates
         ):

@@ -23,6 +23,7 @@ RECORD = SimpleNamespace(
     reference_rad=np.linspace(0.1, 0.2, 300),
     metadata={"excitation": "chirp"},
     uniformity=2e-3,
+    torque_extremes=(),
     tip_mass_kg=None,
     axis_tilt_deg=None,
     there=None,

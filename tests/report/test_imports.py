@@ -40,7 +40,8 @@ def test_text_json_figures_and_rrd_need_no_pages(names):
     assert not modules.intersection(PAGES)
 
 
-MOST = 30
+MOST = 32  # two of them hold what reading a long record in blocks shares with a short one
+ESTIMATORS = ("analysis.identify", "analysis.paper", "analysis.decimation")
 ANALYZE = """
 import sys
 from pathlib import Path
@@ -65,7 +66,7 @@ def test_the_way_from_file_to_page_is_short(write_session, make_signals, tmp_pat
     modules = modules_after(ANALYZE, str(path), str(tmp_path / "report"))
     assert (tmp_path / "report" / "report.html").exists()
     ours = {name for name in modules if name.partition(".")[0] == "analysis"}
-    estimators = {name for name in ours if name.split(".")[1:2] in (["identify"], ["paper"])}
+    estimators = {name for name in ours if name.startswith(ESTIMATORS)}
     assert {"analysis.results", "analysis.report.record_report"} <= ours
     assert len(ours - estimators) <= MOST
     assert not [name for name in ours if "campaign" in name]
