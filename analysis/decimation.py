@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 MAX_GAP_PERIODS: Final = 0.4
 """Longest gap that is interpolated, in periods of the band's highest frequency."""
 
-_NEIGHBOUR_REACH_PERIODS: Final = 2.0
+NEIGHBOUR_REACH_PERIODS: Final = 2.0
 """Duration to either side of a gap from which values are used to interpolate the gap, in periods of
 the highest frequency."""
 
@@ -63,7 +63,7 @@ def interpolate_gaps(
         The given values where known, the estimates elsewhere.
     """
     filled_values = np.where(known_mask, signal_values, 0.0)
-    reach_samples = int(np.ceil(_NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
+    reach_samples = int(np.ceil(NEIGHBOUR_REACH_PERIODS / cycles_per_sample))
     for gap_start, gap_end in zip(*runs_of_true(~known_mask), strict=True):
         first_neighbour = max(gap_start - reach_samples, 0)
         neighbours = first_neighbour + np.flatnonzero(

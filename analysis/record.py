@@ -269,14 +269,11 @@ def load_record(
         path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
     grid, covered_s = _grid_of(session, part_s)
-    rest_first, rest_end = session.segments.get("rest", (0, 0))
     rest_angles_rad: list[NDArray[np.float64]] = []
     collector = collector_of_signals(grid, highest_hz, longest_samples)
 
     def add_samples(samples: NDArray[np.void]) -> None:
-        is_at_rest = (samples["tick"] >= rest_first) & (samples["tick"] < rest_end)
-        if is_at_rest.any():
-            rest_angles_rad.append(samples["angle_rad"][is_at_rest])
+        rest_angles_rad.append(_rest_angles_rad(session, samples))
         collector.add(samples)
 
     read_session(
@@ -325,11 +322,16 @@ def record_of(
     grid, covered_s = _grid_of(session, part_s)
     collector = collector_of_signals(grid, highest_hz, longest_samples)
     collector.add(session.samples)
-    ticks = session.samples["tick"]
-    rest_first, rest_end = session.segments.get("rest", (0, 0))
-    is_at_rest = (ticks >= rest_first) & (ticks < rest_end)
-    rest_angle_rad = _median_rad([session.samples["angle_rad"][is_at_rest]])
+    rest_angle_rad = _median_rad([_rest_angles_rad(session, session.samples)])
     return _record(session, grid, collector.finish(), covered_s, rest_angle_rad)
+
+
+def _rest_angles_rad(session: Session, samples: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the angles of those samples of a session that are in its segment ``rest``."""
+    first_tick, end_tick = session.segments.get("rest", (0, 0))
+    is_at_rest = (samples["tick"] >= first_tick) & (samples["tick"] < end_tick)
+    rest_angles_rad: NDArray[np.float64] = samples["angle_rad"][is_at_rest]
+    return rest_angles_rad
 
 
 def _median_rad(angles_rad: list[NDArray[np.float64]]) -> float | None:

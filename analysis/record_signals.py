@@ -17,7 +17,13 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from analysis.decimation import MAX_GAP_PERIODS, Decimation, interpolate_gaps, runs_of_true
+from analysis.decimation import (
+    MAX_GAP_PERIODS,
+    NEIGHBOUR_REACH_PERIODS,
+    Decimation,
+    interpolate_gaps,
+    runs_of_true,
+)
 from analysis.models import LARGEST_FRACTION_OF_RATE
 from analysis.record_checks import RecordError, check_finite, check_sensor
 
@@ -42,10 +48,6 @@ _BLOCK_TICKS: Final = 1 << 16
 
 _LONGEST_FILLED_S: Final = 1.0
 """Longest gap in seconds whose interpolation does not depend on where a block begins."""
-
-_NEIGHBOUR_REACH_PERIODS: Final = 2.0
-"""Duration on either side of a gap that its interpolation uses, in periods of the highest
-frequency (see `interpolate_gaps`)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +95,14 @@ class _ExtremeCount:
     def result(self) -> TorqueExtreme:
         """Return the extreme of all values."""
         return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
+
+
+def torque_extremes(torque_nm: NDArray[np.float64]) -> tuple[TorqueExtreme, ...]:
+    """Return the largest and the smallest value of a torque in N·m; NaN is unknown."""
+    counts = (_ExtremeCount(1), _ExtremeCount(-1))
+    for count in counts:
+        count.add(torque_nm)
+    return tuple(count.result() for count in counts)
 
 
 @dataclass(frozen=True, slots=True)
@@ -231,7 +241,7 @@ class SignalDecimation:
     def _margin_ticks(self) -> int:
         """Number of ticks before and after a sample that its value may depend on."""
         rate_hz = self.grid.rate_hz
-        interpolation_s = _NEIGHBOUR_REACH_PERIODS / self.highest_hz + _LONGEST_FILLED_S
+        interpolation_s = NEIGHBOUR_REACH_PERIODS / self.highest_hz + _LONGEST_FILLED_S
         return self._reach_ticks + int(np.ceil(interpolation_s * rate_hz)) + self._decimation.factor
 
     def add(self, samples: NDArray[np.void]) -> None:

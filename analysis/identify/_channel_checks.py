@@ -14,7 +14,7 @@ import numpy as np
 
 from analysis.identify._finding import Finding
 from analysis.record_checks import longest_run
-from analysis.record_signals import TorqueExtreme
+from analysis.record_signals import torque_extremes
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:
@@ -39,9 +39,10 @@ _MAX_STANDSTILL_MOTION: Final = 0.02
 
 def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
     """Yield a finding if the torque is clipped: several values lie exactly at its extremes."""
+    known_nm = np.where(measurement.torque_known, measurement.torque_nm, np.nan)
     clipped = [
         extreme
-        for extreme in measurement.torque_extremes or _torque_extremes(measurement)
+        for extreme in measurement.torque_extremes or torque_extremes(known_nm)
         if extreme.limit_nm != 0 and extreme.repeated >= _MIN_CLIPPED_VALUES
     ]
     if not clipped:
@@ -58,19 +59,6 @@ def clipping_findings(measurement: Measurement) -> Iterator[Finding]:
         unit="N·m",
         remedy="Use a larger range of the sensor, or a smaller amplitude; flag clipped values.",
     )
-
-
-def _torque_extremes(measurement: Measurement) -> Iterator[TorqueExtreme]:
-    """Yield the largest and the smallest measured torque, with the number of samples at it."""
-    torque_nm, known_mask = measurement.torque_nm, measurement.torque_known
-    for torque_limit_nm in (torque_nm[known_mask].max(), torque_nm[known_mask].min()):
-        is_at_limit = known_mask & (torque_nm == torque_limit_nm)
-        is_repeated = is_at_limit & (np.roll(is_at_limit, 1) | np.roll(is_at_limit, -1))
-        yield TorqueExtreme(
-            float(torque_limit_nm),
-            int(np.count_nonzero(is_at_limit)),
-            int(np.count_nonzero(is_repeated)),
-        )
 
 
 def standstill_findings(measurement: Measurement) -> Iterator[Finding]:

@@ -360,7 +360,7 @@ class Comparison:
             incoherent_rad=0.0,
             incoherent_nm=0.0,
             incoherent_in_gaps_nm=0.0,
-        )._remove_torque(-np.asarray(self.incoherent_nm), -np.asarray(self.incoherent_in_gaps_nm))
+        )._remove_torque(-self.incoherent_nm, -self.incoherent_in_gaps_nm)
 
     def _use_coherent_angle(
         self,

@@ -153,8 +153,10 @@ def fit_modes_with_drag(
         Maximum number of computations of the drag torque.
     """
     without_drag = candidate_set.comparison.use_whole_angle()
-    mode_starts = _mode_starts(modal_fit)
-    whole_angle_fit = modes_with_poles(without_drag, modal_fit.noise, mode_starts)
+    whole_angle_fit: ModalFit | None = modal_fit
+    if without_drag is not candidate_set.comparison:
+        mode_starts = _mode_starts(modal_fit)
+        whole_angle_fit = modes_with_poles(without_drag, modal_fit.noise, mode_starts)
     if whole_angle_fit is None or not _drag_matters(whole_angle_fit, drag_spectrum):
         return None
     current = ModesWithDrag(modal_fit, DragLaw(0.0), 0.0, without_drag, drag_spectrum[None])
