@@ -36,6 +36,8 @@ from rigd.devices.parameters import RigParameters
 Real = NDArray[np.float64]
 
 _AIR_KG_PER_M3 = 1.2
+_STEPS_PER_PERIOD = 4
+"""With one step, the extrapolated drag has 3 % more size and lags by 5 mrad at 45 Hz."""
 NAME = "finite_elements"
 """Name of drive and sensor in a profile."""
 
@@ -94,7 +96,7 @@ class Plant:
     """Motor and beam, advanced by periods of the loop."""
 
     def __init__(self, rig: RigParameters, beam: ModalBeam) -> None:
-        modes, period_s = beam.omega_rad_s.size, 1 / rig.rate_hz
+        modes, step_s = beam.omega_rad_s.size, 1 / (_STEPS_PER_PERIOD * rig.rate_hz)
         inertia = np.eye(modes + 1)
         inertia[0, 0] = rig.motor.inertia_kg_m2 + beam.inertia_kg_m2
         inertia[0, 1:] = inertia[1:, 0] = beam.share
@@ -108,7 +110,7 @@ class Plant:
         generator[n // 2 : n, : n // 2] = -inverse @ stiffness
         generator[n // 2 : n, n // 2 : n] = -inverse @ loss
         generator[n // 2 : n, n:] = inverse
-        step = expm(generator * period_s)
+        step = expm(generator * step_s)
         self._free, self._forced = step[:n, :n], step[:n, n:]
         acceleration = generator[n // 2 : n]
         # Torque and shear at the beam's root, by state and forces, without the drag's own part.
@@ -146,19 +148,21 @@ class Plant:
 
     def advance(self) -> None:
         """Go to the next tick."""
-        # The mean over the period of the straight line through the last two.
-        forces = 1.5 * self._drag_forces - 0.5 * self._last_drag_forces
-        forces[0] += self._acting_nm
-        unbraked = self._free @ self._state + self._forced @ forces
-        brake = -unbraked[self._speed] / self._forced[self._speed, 0]
-        forces[0] += min(max(brake, -self._coulomb_nm), self._coulomb_nm)
-        self._state = self._free @ self._state + self._forced @ forces
-        drag_nm = drag_n = 0.0
-        if self._drag:
-            along = self._state[self._speed :] @ self._reach
-            force = self._drag * np.abs(along) * along
-            self._last_drag_forces, self._drag_forces = self._drag_forces, self._reach @ force
-            drag_nm, drag_n = float(self._drag_forces[0]), float(force.sum())
+        drag_n = 0.0
+        for _ in range(_STEPS_PER_PERIOD):
+            # The mean over the step of the straight line through the last two.
+            forces = 1.5 * self._drag_forces - 0.5 * self._last_drag_forces
+            forces[0] += self._acting_nm
+            unbraked = self._free @ self._state + self._forced @ forces
+            brake = -unbraked[self._speed] / self._forced[self._speed, 0]
+            forces[0] += min(max(brake, -self._coulomb_nm), self._coulomb_nm)
+            self._state = self._free @ self._state + self._forced @ forces
+            if self._drag:
+                along = self._state[self._speed :] @ self._reach
+                force = self._drag * np.abs(along) * along
+                self._last_drag_forces, self._drag_forces = self._drag_forces, self._reach @ force
+                drag_n = float(force.sum())
+        drag_nm = float(self._drag_forces[0])
         # The torque jumps with the motor's: a signal without jumps passes through the middle.
         forces[0] += 0.5 * (self._next_nm - self._acting_nm)
         self._acting_nm = self._next_nm

@@ -21,12 +21,12 @@ from analysis.models import LARGEST_FRACTION_OF_RATE
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._modal_model import ModalModel
+    from analysis.identify._modal_model import ModalEstimate, ModalModel
     from analysis.identify.drag_torque import DragLaw
     from analysis.identify.noise import Hum, NoiseSpectrum
     from rigd.beam import Plant, Pole
@@ -455,7 +455,7 @@ class Comparison:
         )
 
     def drag_response(
-        self, plant: Plant, poles_rad_s: Mapping[int, complex] | None = None
+        self, plant: Plant, measured_modes: ModalEstimate | None = None
     ) -> DragResponse:
         """Return the response of a beam in air to the motion of the record.
 
@@ -463,15 +463,15 @@ class Comparison:
         ----------
         plant : Plant
             Beam on which the drag acts.
-        poles_rad_s : mapping of int to complex, optional
-            Measured upper poles of modes, as for `DragResponse`.
+        measured_modes : ModalEstimate, optional
+            Modes whose poles and phases replace those of the plant, as for `DragResponse`.
         """
         # Drag acts on the whole motion, whether or not it follows the reference.
         angle_rad = self.angle_rad + self.incoherent_rad
-        return DragResponse(angle_rad, self.decimation.rate_hz, plant, poles_rad_s)
+        return DragResponse(angle_rad, self.decimation.rate_hz, plant, measured_modes)
 
     def remove_drag_torque(
-        self, plant: Plant, law: DragLaw, poles_rad_s: Mapping[int, complex] | None = None
+        self, plant: Plant, law: DragLaw, measured_modes: ModalEstimate | None = None
     ) -> Comparison:
         """Return the comparison without the torque by air drag, with that torque's derivatives.
 
@@ -481,15 +481,15 @@ class Comparison:
             Beam on which the drag acts.
         law : DragLaw
             Drag coefficient as a function of the speed.
-        poles_rad_s : mapping of int to complex, optional
-            Measured upper poles of modes, as for `DragResponse`.
+        measured_modes : ModalEstimate, optional
+            Modes whose poles and phases replace those of the plant, as for `DragResponse`.
 
         Raises
         ------
         DragError
             The drag is too large for the time steps.
         """
-        drag_response = self.drag_response(plant, poles_rad_s)
+        drag_response = self.drag_response(plant, measured_modes)
         drag_torque = drag_response.torque(law, range(1, self.visible_modes + 1))
 
         def band(time_series: NDArray[np.float64]) -> NDArray[np.complex128]:

@@ -35,13 +35,12 @@ from analysis.statistics import NORMAL_95
 from rigd.beam import mode_shape
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping
-
     from numpy.typing import NDArray
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._comparison import Comparison
+    from analysis.identify._modal_model import ModalEstimate
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
     from rigd.beam import Plant
@@ -208,13 +207,13 @@ def _drag_may_improve_fit(candidate_set: CandidateSet) -> bool:
 
 
 def small_drag_spectrum(
-    comparison: Comparison, plant: Plant, poles_rad_s: Mapping[int, complex] | None = None
+    comparison: Comparison, plant: Plant, measured_modes: ModalEstimate | None = None
 ) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small air drag per metre of C_D d, in N·m/m, shape (1, K).
 
-    `poles_rad_s` are measured upper poles by mode number, which replace those of the plant.
+    `measured_modes` replace those of the plant, as for `DragResponse`.
     """
-    drag_response = comparison.drag_response(plant, poles_rad_s)
+    drag_response = comparison.drag_response(plant, measured_modes)
     return comparison.spectrum(drag_response.first_order()[None, comparison.retained])
 
 

@@ -183,6 +183,10 @@ class ModalEstimate:
             if number
         }
 
+    def residue(self, mode_number: int) -> complex:
+        """Return the residue at the upper pole of a mode, in N·m/s."""
+        return self.model.residues[self.numbers.index(mode_number)]
+
     def rows(self, mode_numbers: Sequence[int]) -> NDArray[np.intp]:
         """Return the indices of the constants of some modes in `constants`, shape (4 m,).
 

@@ -190,7 +190,7 @@ def fit_modes_with_drag(
         assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
         try:
             comparison = without_drag.remove_drag_torque(
-                candidate_set.likeliest.plant, assumed_law, fit_with_drag.poles_rad_s
+                candidate_set.likeliest.plant, assumed_law, fit_with_drag
             )
         except DragError:
             break  # that of the last fit is not exact

@@ -333,7 +333,7 @@ def _explains_record(
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small drag on a beam with these modes, shape (K,)."""
     plant = modal_fit.plant_with_modal_frequencies(candidate_set.likeliest.plant)
-    drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit.poles_rad_s)
+    drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
 
 

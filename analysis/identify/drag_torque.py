@@ -58,10 +58,11 @@ from rigd.beam import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Mapping, Sequence
+    from collections.abc import Sequence
 
     from numpy.typing import NDArray
 
+    from analysis.identify._modal_model import ModalEstimate
     from rigd.beam import Plant
 
     Real = NDArray[np.float64]
@@ -191,9 +192,9 @@ class DragResponse:
         Sampling rate of the angle.
     plant : Plant
         Rig with the linear beam.
-    poles_rad_s : mapping of int to complex, optional
-        Upper poles of modes of the beam, by mode number. They replace those of the plant, so that
-        the speeds are right on a beam that is not uniform.
+    measured_modes : ModalEstimate, optional
+        Modes of the beam whose poles and phases replace those of the plant, so that the torque is
+        right on a beam that is not uniform.
 
     Attributes
     ----------
@@ -206,7 +207,7 @@ class DragResponse:
         angle_rad: Real,
         rate_hz: float,
         plant: Plant,
-        poles_rad_s: Mapping[int, complex] | None = None,
+        measured_modes: ModalEstimate | None = None,
     ) -> None:
         self.plant, self._samples, self._rate_hz = plant, angle_rad.size, rate_hz
         self._transform = CausalTransform.for_record(angle_rad.size, rate_hz)
@@ -219,7 +220,8 @@ class DragResponse:
         z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
-        for mode_number, pole in (poles_rad_s or {}).items():
+        measured_poles = measured_modes.poles_rad_s if measured_modes else {}
+        for mode_number, pole in measured_poles.items():
             pole_pair = np.array([pole, pole.conjugate()])
             z[mode_number - 1] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
             self._pole_pairs[mode_number - 1] = pole_pair
@@ -227,6 +229,7 @@ class DragResponse:
                 pole_pair - pole_pair.conjugate()
             )
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
+        self._phase_factors = np.ones_like(z)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
         self._torque_channel = plant.channel_response(s)
@@ -235,6 +238,10 @@ class DragResponse:
             self._inertial_response * s * angle_transform
         )
         self._speed_transform = s * angle_transform
+        # Drag on one mode moves its pole along the real axis whatever turns the phase of its
+        # residue (external damping, delay, clamp), so the torque must have the measured phase.
+        if measured_modes:
+            self._turn_to_measured_phases(measured_modes)
 
     def first_order(self) -> Real:
         """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
@@ -285,7 +292,7 @@ class DragResponse:
         modal_speeds = self._modal_speed_by_angle + self._speed_per_force * force_spectra[:-1]
         speed_sources: list[tuple[int, Real]] = []
         direct_torques = []
-        modal_torques = self._leverage[:, None] * self._inertial_response * force_spectra[:-1]
+        modal_torques = self._modal_torques(force_spectra)
         for mode_number in mode_numbers:
             upper_pole = self._pole_pairs[mode_number - 1][0]
             pole_term, conjugate_term = (
@@ -548,10 +555,15 @@ class DragResponse:
 
         It is in N·m·s at the points `s`, without the delay of the torque.
         """
-        torque_spectrum: Complex = (
-            self._leverage @ (self._inertial_response * force_spectra[:-1]) - force_spectra[-1]
-        )
+        torque_spectrum: Complex = self._modal_torques(force_spectra).sum(axis=0)
+        torque_spectrum -= force_spectra[-1]
         return torque_spectrum
+
+    def _modal_torques(self, force_spectra: Complex) -> Complex:
+        """Return the transforms of the torque that each modal force causes, shape (modes, bins)."""
+        torque_per_force = self._inertial_response * self._phase_factors
+        modal_torques: Complex = self._leverage[:, None] * torque_per_force * force_spectra[:-1]
+        return modal_torques
 
     def _torque_over_time(self, modal_forces: Real) -> Real:
         """Return the torque in N·m, shape (m,), that modal forces and root moment cause."""
@@ -581,8 +593,23 @@ class DragResponse:
             * self._inertia_term
             * self._modal_speed_by_angle[mode_number - 1]
             / self.s
+            * self._phase_factors[mode_number - 1]
         )
         return torque_spectrum
+
+    def _turn_to_measured_phases(self, measured_modes: ModalEstimate) -> None:
+        """Turn the torque by each measured mode to the phase of its measured residue."""
+        for mode_number, pole in measured_modes.poles_rad_s.items():
+            damping, s = self.plant.damping, np.array([pole])
+            inertia_term = (
+                self.plant.beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
+            )
+            # That of j times the residue of - p² / Z, through the torque channel.
+            [computed] = inertia_term**2 * self.plant.channel_response(s) / pole.imag
+            turn = measured_modes.residue(mode_number) / (1j * computed)
+            turn /= abs(turn)
+            slope = turn.imag / pole.imag
+            self._phase_factors[mode_number - 1] = turn.real + slope * (self.s - pole.real)
 
     def _oversampled_values(self, laplace_transform: Complex) -> Real:
         """Convert a Laplace transform to values over time, at three times the sampling rate.
