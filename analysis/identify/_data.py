@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Final
 import numpy as np
 
 from analysis.decimation import MAX_GAP_PERIODS, interpolate_gaps, runs_of_true
+from analysis.identify._encoder import angle_without_alternating_counts
 from analysis.record_checks import MAX_GAP_S, longest_run, unknown_fraction_message
 from rigd.beam import Damping, Plant
 
@@ -230,7 +231,7 @@ class Measurement:
             )
         return cls(
             name=str(record.path),
-            angle_rad=record.angle_rad,
+            angle_rad=angle_without_alternating_counts(record.angle_rad, record.reference_rad),
             torque_nm=record.torque_nm,
             rate_hz=record.rate_hz,
             beam=record.beam,

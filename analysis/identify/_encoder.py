@@ -1,0 +1,59 @@
+"""Encoder readings of a motor at rest.
+
+A motor that rests near the edge between two counts, while the beam rings, moves by much less than a
+count. But its encoder alternates between the two, in step with the mode. A fit takes this square
+wave for motion that drives the mode, and shifts the frequency: in one of 14 searches by seven
+standard deviations. Each change of the reading shows that the motor is at the edge.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final
+
+import numpy as np
+
+from analysis.decimation import runs_of_true
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+_MIN_CHANGES: Final = 4
+"""Minimum number of alternating changes between two counts that do not show a motion."""
+
+_STEP_TOLERANCE: Final = 1.5
+"""Largest change over the smallest one of the record that is still a single count."""
+
+
+def angle_without_alternating_counts(
+    angle_rad: NDArray[np.float64], reference_rad: NDArray[np.float64] | None
+) -> NDArray[np.float64]:
+    """Return the angle in rad with alternating readings at rest replaced by their mean, shape (n,).
+
+    Only readings under a constant reference are replaced.
+
+    Parameters
+    ----------
+    angle_rad : ndarray, shape (n,)
+        Angle that the encoder read at each tick.
+    reference_rad : ndarray, shape (n,), or None
+        Reference of the motor's controller; None without a controller.
+    """
+    if reference_rad is None:
+        return angle_rad
+    differences_rad = np.diff(angle_rad)
+    change_indices = np.flatnonzero(differences_rad)
+    if change_indices.size < _MIN_CHANGES:
+        return angle_rad
+    changes_rad = differences_rad[change_indices]
+    reference_moves = np.cumsum(np.diff(reference_rad) != 0)[change_indices]
+    returns = (
+        (changes_rad[1:] == -changes_rad[:-1])
+        & (np.abs(changes_rad[1:]) <= _STEP_TOLERANCE * np.abs(changes_rad).min())
+        & (reference_moves[1:] == reference_moves[:-1])
+    )
+    settled_rad = angle_rad.copy()
+    for first, last in zip(*runs_of_true(returns), strict=True):
+        if last - first + 1 >= _MIN_CHANGES:
+            start, end = change_indices[[first, last]] + 1
+            settled_rad[start:end] = (angle_rad[start - 1] + angle_rad[start]) / 2
+    return settled_rad
