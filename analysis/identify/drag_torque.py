@@ -215,21 +215,23 @@ class DragResponse:
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
-        log_s = np.log(s)
-        p = beam.density_over_stiffness * s * s + damping.gamma * np.exp(damping.lambda_ * log_s)
-        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
+        p = self._inertia_term_at(s)
+        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * np.log(s)))
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
+        self._phase_factors = np.ones_like(z)
         measured_poles = measured_modes.poles_rad_s if measured_modes else {}
         for mode_number, pole in measured_poles.items():
-            pole_pair = np.array([pole, pole.conjugate()])
-            z[mode_number - 1] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
-            self._pole_pairs[mode_number - 1] = pole_pair
-            self._impedance_slopes[mode_number - 1] = beam.density_over_stiffness * (
+            assert measured_modes is not None
+            mode_index, pole_pair = mode_number - 1, np.array([pole, pole.conjugate()])
+            z[mode_index] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
+            self._pole_pairs[mode_index] = pole_pair
+            self._impedance_slopes[mode_index] = beam.density_over_stiffness * (
                 pole_pair - pole_pair.conjugate()
             )
+            residue = measured_modes.residue(mode_number)
+            self._phase_factors[mode_index] = self._phase_factor(pole, residue)
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
-        self._phase_factors = np.ones_like(z)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
         self._inertia_term = p
         self._torque_channel = plant.channel_response(s)
@@ -238,10 +240,6 @@ class DragResponse:
             self._inertial_response * s * angle_transform
         )
         self._speed_transform = s * angle_transform
-        # Drag on one mode moves its pole along the real axis whatever turns the phase of its
-        # residue (external damping, delay, clamp), so the torque must have the measured phase.
-        if measured_modes:
-            self._turn_to_measured_phases(measured_modes)
 
     def first_order(self) -> Real:
         """Return drag torque over C_D d in the limit of small drag, in N, shape (m,).
@@ -597,19 +595,25 @@ class DragResponse:
         )
         return torque_spectrum
 
-    def _turn_to_measured_phases(self, measured_modes: ModalEstimate) -> None:
-        """Turn the torque by each measured mode to the phase of its measured residue."""
-        for mode_number, pole in measured_modes.poles_rad_s.items():
-            damping, s = self.plant.damping, np.array([pole])
-            inertia_term = (
-                self.plant.beam.density_over_stiffness * s * s + damping.gamma * s**damping.lambda_
-            )
-            # That of j times the residue of - p² / Z, through the torque channel.
-            [computed] = inertia_term**2 * self.plant.channel_response(s) / pole.imag
-            turn = measured_modes.residue(mode_number) / (1j * computed)
-            turn /= abs(turn)
-            slope = turn.imag / pole.imag
-            self._phase_factors[mode_number - 1] = turn.real + slope * (self.s - pole.real)
+    def _inertia_term_at(self, s: Complex) -> Complex:
+        """Return p, which includes the external damping, of the shape of `s` in rad/s."""
+        damping = self.plant.damping
+        external_damping = damping.gamma * np.exp(damping.lambda_ * np.log(s))
+        inertia_term: Complex = self.plant.beam.density_over_stiffness * s * s + external_damping
+        return inertia_term
+
+    def _phase_factor(self, pole: complex, residue: complex) -> Complex:
+        """Return the factor that gives the torque of a mode its measured phase, shape (bins,).
+
+        Drag on a mode moves its pole to the left, whatever turns the phase of its residue: external
+        damping, delay or clamp. Torque of another phase would move the frequency.
+        """
+        # The residue of -p² / Z, through the torque channel, is j times a multiple of this.
+        inertia_term = self._inertia_term_at(np.array([pole]))[0]
+        turn = residue / (1j * inertia_term**2 * self.plant.channel_response(pole))
+        turn /= abs(turn)
+        factor: Complex = turn.real + turn.imag * (self.s - pole.real) / pole.imag
+        return factor
 
     def _oversampled_values(self, laplace_transform: Complex) -> Real:
         """Convert a Laplace transform to values over time, at three times the sampling rate.

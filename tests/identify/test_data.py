@@ -45,6 +45,36 @@ def test_a_record_is_taken_over():
     assert measurement.angle_from_rest(50.0) == pytest.approx(RECORD.angle_rad - 0.1)
 
 
+COUNT_RAD = 7e-5
+
+
+def counts_used(counts, reference_rad):
+    """Angle in counts that a fit uses for an encoder's readings."""
+    record = {"angle_rad": counts * COUNT_RAD, "reference_rad": reference_rad}
+    return Measurement.of_record(SimpleNamespace(**vars(RECORD) | record)).angle_rad / COUNT_RAD
+
+
+def test_an_encoder_between_two_counts_at_rest_is_at_the_edge():
+    counts = np.repeat([0, 5, 5, 6, 5, 6, 5, 6, 6, 6], 30)
+    settled = counts.astype(float)
+    settled[90:210] = 5.5
+    assert counts_used(counts, np.zeros(300)) == pytest.approx(settled)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "reference_rad"),
+    [
+        ([0, 5, 5, 6, 5, 6, 5, 6, 6, 6], np.linspace(0.0, 1e-3, 300)),  # follows a reference
+        ([0, 5, 5, 7, 5, 7, 5, 7, 7, 6], np.zeros(300)),  # moves by more than a count
+        ([0, 5, 5, 6, 7, 6, 5, 6, 7, 6], np.zeros(300)),  # passes several counts
+        ([0, 5, 5, 6, 5, 6, 6, 6, 6, 6], np.zeros(300)),  # returns twice only
+    ],
+)
+def test_an_encoder_that_shows_motion_is_read_as_it_is(pattern, reference_rad):
+    counts = np.repeat(pattern, 30)
+    assert counts_used(counts, reference_rad) == pytest.approx(counts)
+
+
 def test_a_motor_that_was_held_excites_nothing():
     held = SimpleNamespace(**vars(RECORD) | {"metadata": {"excitation": "hold"}})
     with pytest.raises(MeasurementError, match="the motor was held"):

@@ -1,6 +1,7 @@
 """Torque by drag of the air: against steps in time, its derivatives, and the published case."""
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -8,7 +9,7 @@ from cases import further
 
 from analysis.identify import Comparison, Measurement
 from analysis.identify.drag_torque import DragError, DragLaw, DragResponse
-from rigd.beam import Beam, Damping, Plant
+from rigd.beam import Beam, Damping, Plant, transfer
 
 pytestmark = pytest.mark.fit
 
@@ -168,3 +169,34 @@ def test_drag_that_cannot_be_followed_is_given_up():
     light = replace(LINK, density_kg_per_m=1e-7, bending_stiffness_n_m2=1e-6)
     with pytest.raises(DragError):
         response(comparison, Plant(light, Damping(zeta=7.1e-5))).torque(DragLaw(2.3e-3))
+
+
+def measured_modes(plant):
+    """Poles of three modes, and their residues by an integral around each pole."""
+    poles = {pole.mode: pole.at_rad_s for pole in plant.mode_poles(3, ())}
+    circle = np.exp(2j * np.pi * np.arange(16) / 16)
+
+    def residue(mode):
+        distance = 0.1 * poles[mode].imag * circle
+        return np.mean(transfer(poles[mode] + distance, plant.beam, plant.damping) * distance)
+
+    return SimpleNamespace(poles_rad_s=poles, residue=residue)
+
+
+def test_the_torque_has_the_measured_phase_of_each_mode(short):
+    """Where the assumed beam is not externally damped, and its torque is late."""
+    true_plant, assumed = plant(gamma=0.1), plant(zeta=1e-9, gamma=0.0, delay_s=2e-4)
+    true_modes = measured_modes(true_plant)
+    near_mode_1 = np.abs(short.frequency_hz / 2.55 - 1) < 0.1
+
+    def drag_spectrum(*plant_and_modes):
+        drag = DragResponse(short.angle_rad, short.decimation.rate_hz, *plant_and_modes)
+        return short.spectrum(drag.first_order()[short.retained])[near_mode_1]
+
+    def lag_rad(residue):
+        modes = SimpleNamespace(poles_rad_s=true_modes.poles_rad_s, residue=residue)
+        return np.angle(np.vdot(drag_spectrum(assumed, modes), drag_spectrum(true_plant)))
+
+    assert abs(lag_rad(true_modes.residue)) < 0.01
+    without_external_damping = 1j * true_modes.poles_rad_s[1] ** 4
+    assert lag_rad(lambda _: without_external_damping) == pytest.approx(-0.24, abs=0.02)
