@@ -19,17 +19,20 @@ from __future__ import annotations
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
 from analysis.identify._estimates import ModeEstimate
+from rigd.beam import Beam, Damping, clamped_free_eigenvalues, participation
 
 if TYPE_CHECKING:
     from collections.abc import Mapping, Sequence
 
     from numpy.typing import NDArray
+
+    from rigd.beam import Plant
 
 BACKGROUND_COEFFICIENTS: Final = 5
 """Number of coefficients of the background polynomial, b0 to b4."""
@@ -244,6 +247,40 @@ class ModalEstimate:
             )
         )
         return self.model.effective_inertias_kg_m2[self.numbers.index(mode_number)], relative_std
+
+    def uniform_plant(self, nominal: Plant) -> Plant:
+        """Return a rig whose uniform beam has the inertias and frequencies of the modes on average.
+
+        The highest mode determines its damping. Without visible modes it is `nominal`.
+
+        Parameters
+        ----------
+        nominal : Plant
+            Rig and specimen as the file states them.
+        """
+        mode_numbers, length_m = self.visible, nominal.beam.length_m
+        if not mode_numbers:
+            return nominal
+        inertia_per_density = participation(nominal.beam, mode_numbers[-1])
+        eigenvalues = clamped_free_eigenvalues(mode_numbers[-1])
+        ln_density, ln_stiffness = np.mean(
+            [
+                (
+                    ln_density := math.log(self.inertia(n)[0] / inertia_per_density[n - 1]),
+                    ln_density
+                    + 2 * math.log(abs(self.poles_rad_s[n]))
+                    - 4 * math.log(eigenvalues[n - 1] / length_m),
+                )
+                for n in mode_numbers
+            ],
+            axis=0,
+        ).tolist()
+        highest_pole = self.poles_rad_s[mode_numbers[-1]]
+        return replace(
+            nominal,
+            beam=Beam(length_m, math.exp(ln_density), math.exp(ln_stiffness)),
+            damping=Damping(zeta=-2 * highest_pole.real / abs(highest_pole) ** 2),
+        )
 
     def restrict_to_visible_modes(self) -> ModalEstimate:
         """Return the modal model restricted to the visible modes, with the same background."""

@@ -144,7 +144,7 @@ def fit_modes_with_drag(
     Parameters
     ----------
     candidate_set : CandidateSet
-        Candidates without drag; the plant of the likeliest one provides what the modes do not.
+        Candidates without drag.
     modal_fit : ModalFit
         Modes fitted without drag.
     drag_spectrum : ndarray of complex, shape (K,)
@@ -190,7 +190,9 @@ def fit_modes_with_drag(
         assumed_law = DragLaw(max(law.constant_m, _LEAST_DRAG_M))
         try:
             comparison = without_drag.remove_drag_torque(
-                candidate_set.likeliest.plant, assumed_law, fit_with_drag
+                fit_with_drag.uniform_plant(without_drag.measurement.nominal),
+                assumed_law,
+                fit_with_drag,
             )
         except DragError:
             break  # that of the last fit is not exact

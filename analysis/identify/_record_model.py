@@ -332,7 +332,7 @@ def _explains_record(
 
 def _small_drag(candidate_set: CandidateSet, modal_fit: ModalFit) -> NDArray[np.complex128]:
     """Return the torque spectrum of a small drag on a beam with these modes, shape (K,)."""
-    plant = modal_fit.plant_with_modal_frequencies(candidate_set.likeliest.plant)
+    plant = modal_fit.uniform_plant(candidate_set.comparison.measurement.nominal)
     drag_spectra = small_drag_spectrum(candidate_set.comparison, plant, modal_fit)
     return np.asarray(drag_spectra[0])
 

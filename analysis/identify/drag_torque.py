@@ -215,8 +215,9 @@ class DragResponse:
         beam, damping = plant.beam, plant.damping
         self._grid = DragGrid.of(beam, DRAG_MODES, DRAG_POINTS)
         k = (eigenvalues(DRAG_MODES) / beam.length_m) ** 4
-        p = self._inertia_term_at(s)
-        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * np.log(s)))
+        log_s, inertia = np.log(s), beam.density_over_stiffness * s * s
+        p = np.tile(inertia + damping.gamma * np.exp(damping.lambda_ * log_s), (DRAG_MODES, 1))
+        z = p + k[:, None] * (1 + damping.zeta * np.exp(damping.alpha * log_s))
         self._pole_pairs = _pole_pairs(k * beam.length_m**4, plant)
         self._impedance_slopes = _impedance_slopes(self._pole_pairs, plant)
         self._phase_factors = np.ones_like(z)
@@ -224,6 +225,8 @@ class DragResponse:
         for mode_number, pole in measured_poles.items():
             assert measured_modes is not None
             mode_index, pole_pair = mode_number - 1, np.array([pole, pole.conjugate()])
+            # The external damping of a fit without drag is arbitrary; pole and phase contain it.
+            p[mode_index] = inertia
             z[mode_index] = beam.density_over_stiffness * (s - pole) * (s - pole.conjugate())
             self._pole_pairs[mode_index] = pole_pair
             self._impedance_slopes[mode_index] = beam.density_over_stiffness * (
@@ -233,7 +236,7 @@ class DragResponse:
             self._phase_factors[mode_index] = self._phase_factor(pole, residue)
         self._inertial_response = p / z  # p / Z_i, shape (modes, bins)
         self._speed_per_force = s / z / beam.bending_stiffness_n_m2
-        self._inertia_term = p
+        self._inertia_terms = p
         self._torque_channel = plant.channel_response(s)
         angle_transform = self._transform.forward(angle_rad)
         self._modal_speed_by_angle = -self._grid.leverage_m[:, None] * (
@@ -306,7 +309,8 @@ class DragResponse:
                 )
                 direct_torques.append(self.in_time(modal_torques[mode_number - 1] * pole_factor))
         for mode_number in _LOWEST_MODE_INDICES:
-            for pole_factor in (1 / self._inertia_term, self.s / self._inertia_term):
+            inertia_term = self._inertia_terms[mode_number]
+            for pole_factor in (1 / inertia_term, self.s / inertia_term):
                 speed_sources.append(
                     (
                         mode_number,
@@ -588,19 +592,12 @@ class DragResponse:
         torque_factor = self.plant.beam.bending_stiffness_n_m2 * self._leverage[mode_number - 1]
         torque_spectrum: Complex = (
             torque_factor
-            * self._inertia_term
+            * self._inertia_terms[mode_number - 1]
             * self._modal_speed_by_angle[mode_number - 1]
             / self.s
             * self._phase_factors[mode_number - 1]
         )
         return torque_spectrum
-
-    def _inertia_term_at(self, s: Complex) -> Complex:
-        """Return p, which includes the external damping, of the shape of `s` in rad/s."""
-        damping = self.plant.damping
-        external_damping = damping.gamma * np.exp(damping.lambda_ * np.log(s))
-        inertia_term: Complex = self.plant.beam.density_over_stiffness * s * s + external_damping
-        return inertia_term
 
     def _phase_factor(self, pole: complex, residue: complex) -> Complex:
         """Return the factor that gives the torque of a mode its measured phase, shape (bins,).
@@ -608,9 +605,8 @@ class DragResponse:
         Drag on a mode moves its pole to the left, whatever turns the phase of its residue: external
         damping, delay or clamp. Torque of another phase would move the frequency.
         """
-        # The residue of -p² / Z, through the torque channel, is j times a multiple of this.
-        inertia_term = self._inertia_term_at(np.array([pole]))[0]
-        turn = residue / (1j * inertia_term**2 * self.plant.channel_response(pole))
+        # The residue of -s⁴ / Z, through the torque channel, is j times a multiple of this.
+        turn = residue / (1j * pole**4 * self.plant.channel_response(pole))
         turn /= abs(turn)
         factor: Complex = turn.real + turn.imag * (self.s - pole.real) / pole.imag
         return factor
