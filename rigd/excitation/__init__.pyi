@@ -1,4 +1,3 @@
-from ._added import EXCITATION_GROUP as EXCITATION_GROUP
 from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
 from ._fisher_information import information as information
