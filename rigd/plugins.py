@@ -192,8 +192,8 @@ def load_declaration(plugin: Plugin, expected: type[D]) -> D:
 class Registry(Mapping[str, T]):
     """Parts of one group by name: those that are built in, then those of installed packages.
 
-    Iteration imports the parts of packages, and leaves out those that cannot be used. A look-up
-    raises `PluginError` if the package of the part cannot be used.
+    Iteration imports the parts of packages, and leaves out those that cannot be used. Access by
+    name raises `PluginError` for a part that cannot be used.
 
     Parameters
     ----------

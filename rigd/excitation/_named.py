@@ -7,9 +7,9 @@ from typing import Final, Protocol
 
 from rigd.excitation._added import MakeExcitation, added_function, load_excitation
 from rigd.excitation._from_file import from_csv
+from rigd.excitation._move import MoveRig, move
 from rigd.excitation._narrow_sweeps import SweepRig, modes
 from rigd.excitation._options import ExcitationOption, declared_options
-from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
 from rigd.excitation._until import ScanRig, until

@@ -32,7 +32,7 @@ from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
 from rigd.engine.messages import Connected, Ending, FileHeader
-from rigd.excitation import Excitation, find_excitation
+from rigd.excitation import Excitation, PrecisionExcitation, PrecisionSearch, find_excitation
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
@@ -75,11 +75,22 @@ class Order:
     touch: TouchSearch | None = None
     """Settings of the search for an obstacle, or None for a session without a search."""
     watch_fit: bool = False
-    """Whether the record is fitted repeatedly during the session."""
+    """Whether the record is fitted repeatedly, even if the end of the session is planned."""
     seed: int | None = None
     """Seed of a simulated rig's noise, or None for a random seed."""
     accepted: tuple[FailedCheck, ...] = ()
     """Failed checks of the profile that the operator accepted."""
+
+    @property
+    def search(self) -> PrecisionSearch | None:
+        """Precision at which the session ends, or None if its end is planned."""
+        excitation = self.excitation
+        return excitation.search if isinstance(excitation, PrecisionExcitation) else None
+
+    @property
+    def makes_fits(self) -> bool:
+        """Whether the record is fitted during the session."""
+        return self.watch_fit or self.excitation.ends_itself
 
 
 def load_rig(
