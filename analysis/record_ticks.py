@@ -6,7 +6,7 @@ The grid needs no signals, so that a long record can be checked before its signa
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from rigd.session import Session
 
-SIGNAL_FIELDS: Final = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
+SIGNAL_FIELDS = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
 """Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
 
 _REPORTED_FLAGS = (

@@ -54,8 +54,19 @@ def search(profile: Profile, passes: int) -> Excitation:
     )
 
 
+def without_detector(searching: Excitation) -> Excitation:
+    """Return the same motion, during which the loop does not watch for touches."""
+    return Excitation(
+        searching.kind,
+        searching.parameters,
+        searching.rate_hz,
+        searching.reference_rad,
+        searching.segments,
+    )
+
+
 def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurement:
-    """Run a session with or without the detector, and measure its loop."""
+    """Run a session and measure its loop."""
     with (
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
         loops.connected_rig(profile) as (rig, group),
@@ -69,7 +80,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
             profile,
             excitation,
             Path(folder) / "bench.mcap",
-            touch=touch_search(profile, excitation) if name == WITH else None,
+            touch=touch_search(profile, excitation),
         )
         result = rig.run(order, StopRequest(), watch)
         if result.outcome != "complete" or result.path is None:
@@ -109,12 +120,13 @@ def main() -> None:
     granted = settings_granted(profile.realtime)
     print("; ".join(f"{name} {text}" for name, text in granted.items()))
     searching = search(profile, passes)
+    motions = {WITHOUT: without_detector(searching), WITH: searching}
     later: dict[str, list[float]] = {"p50": [], "p99": []}
     work_us: dict[str, list[tuple[float, float]]] = {"p50": [], "p99": []}
     for number in range(rounds):
         print(f"round {number + 1}")
-        order = (WITHOUT, WITH) if number % 2 == 0 else (WITH, WITHOUT)
-        found = {name: show(session(name, profile, searching)) for name in order}
+        order = list(motions) if number % 2 == 0 else list(reversed(motions))
+        found = {name: show(session(name, profile, motions[name])) for name in order}
         (late, work), (late_with, work_with) = found[WITHOUT], found[WITH]
         for which in ("p50", "p99"):
             later[which].append(getattr(late_with, which) / getattr(late, which))
