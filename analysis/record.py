@@ -27,13 +27,13 @@ from analysis.record_checks import (
     stated_uncertainty,
     stated_uniformity,
 )
-from analysis.record_signals import (
-    LONGEST_FULL_RATE_SAMPLES,
+from analysis.record_ticks import (
+    FullRateSignals,
+    Gaps,
     RecordSignals,
+    TickGrid,
     TorqueExtreme,
-    collector_of_signals,
 )
-from analysis.record_ticks import Gaps, TickGrid
 from rigd.session import Session, limits, read_session, readable_texts
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record_part import PartOption
+    from analysis.signal_decimation import SignalDecimation
     from rigd.beam import Beam
 
 __all__ = [
@@ -63,6 +64,10 @@ MAX_SAMPLES = MAX_TICKS
 
 _TICK_FIELDS = ("t_ns", "tick", "status")
 """Fields of the samples that are read before the signals of a file that may be long."""
+
+LONGEST_FULL_RATE_SAMPLES = 720_000
+"""Maximum number of samples of a record that is analysed at its full rate: 12 minutes at 1 kHz,
+which take 0.5 GB of memory. The signals of a longer record are decimated while they are read."""
 
 _MIN_SAMPLE_BYTES = 60
 """Assumed minimum size of a sample in a file, in bytes after compression."""
@@ -270,7 +275,7 @@ def load_record(
     )
     grid, covered_s = _grid_of(session, part_s)
     rest_angles_rad: list[NDArray[np.float64]] = []
-    collector = collector_of_signals(grid, highest_hz, longest_samples)
+    collector = _collector_of_signals(grid, highest_hz, longest_samples)
 
     def add_samples(samples: NDArray[np.void]) -> None:
         rest_angles_rad.append(_rest_angles_rad(session, samples))
@@ -320,10 +325,22 @@ def record_of(
         The samples cannot be analysed.
     """
     grid, covered_s = _grid_of(session, part_s)
-    collector = collector_of_signals(grid, highest_hz, longest_samples)
+    collector = _collector_of_signals(grid, highest_hz, longest_samples)
     collector.add(session.samples)
     rest_angle_rad = _median_rad([_rest_angles_rad(session, session.samples)])
     return _record(session, grid, collector.finish(), covered_s, rest_angle_rad)
+
+
+def _collector_of_signals(
+    grid: TickGrid, highest_hz: float, longest_samples: int
+) -> FullRateSignals | SignalDecimation:
+    """Return the collector for the signals of a record: decimated if the record is long."""
+    if grid.count <= longest_samples:
+        return FullRateSignals(grid)
+    from analysis.signal_decimation import SignalDecimation  # late: for a long record only
+
+    decimation = SignalDecimation(grid, highest_hz)
+    return decimation if decimation.factor > 1 else FullRateSignals(grid)
 
 
 def _rest_angles_rad(session: Session, samples: NDArray[np.void]) -> NDArray[np.float64]:

@@ -1,6 +1,6 @@
-"""Grid of a session's ticks: missing and stale samples, flags, and ranges of the sweep.
+"""Grid of a session's ticks, with missing and stale samples, flags and the sweep; and its signals.
 
-It needs no signals, so that a long record can be checked before its signals are read.
+The grid needs no signals, so that a long record can be checked before its signals are read.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ from analysis.record_checks import (
     RecordError,
     check_clock,
     check_fillable,
+    check_finite,
+    check_sensor,
     check_span,
     longest_run,
 )
@@ -25,6 +27,9 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from rigd.session import Session
+
+SIGNAL_FIELDS = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
+"""Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
 
 _REPORTED_FLAGS = (
     (Status.TORQUE_SATURATED, "torque command saturated"),
@@ -280,3 +285,165 @@ def _describe_faults(
                 f"{flag_counts[flag_name]} samples of the sweep: {flag_name}. {flag_consequence}"
             )
     return tuple(sentences)
+
+
+# Signals
+
+
+@dataclass(frozen=True, slots=True)
+class TorqueExtreme:
+    """Largest or smallest measured torque, and how often it was measured.
+
+    Attributes
+    ----------
+    limit_nm : float
+        Torque.
+    values : int
+        Number of samples with exactly this torque.
+    repeated : int
+        Number of these samples that are next to another one.
+    """
+
+    limit_nm: float
+    values: int
+    repeated: int
+
+
+class ExtremeCount:
+    """Count of the samples at the extreme of a torque that arrives in blocks; NaN is unknown.
+
+    Parameters
+    ----------
+    sign : int
+        1 for the largest value, -1 for the smallest.
+    """
+
+    def __init__(self, sign: int) -> None:
+        self._sign = sign
+        self._limit_nm = -np.inf
+        self._values = self._repeated = 0
+        self._last_nm = np.full(2, np.nan)
+
+    def add(self, torque_nm: NDArray[np.float64]) -> None:
+        """Include the next values."""
+        signed_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
+        largest_nm = float(np.max(signed_nm[2:], initial=-np.inf, where=~np.isnan(signed_nm[2:])))
+        if largest_nm > self._limit_nm:
+            self._limit_nm, self._values, self._repeated = largest_nm, 0, 0
+        is_at_limit = signed_nm == self._limit_nm
+        follows_another = is_at_limit[2:] & is_at_limit[1:-1]
+        self._values += int(np.count_nonzero(is_at_limit[2:]))
+        # The first of a run of such values counts when the second arrives.
+        self._repeated += int(np.count_nonzero(follows_another))
+        self._repeated += int(np.count_nonzero(follows_another & ~is_at_limit[:-2]))
+        self._last_nm = signed_nm[-2:]
+
+    def result(self) -> TorqueExtreme:
+        """Return the extreme of all values."""
+        return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
+
+
+def torque_extremes(torque_nm: NDArray[np.float64]) -> tuple[TorqueExtreme, ...]:
+    """Return the largest and the smallest value of a torque in N·m; NaN is unknown."""
+    counts = (ExtremeCount(1), ExtremeCount(-1))
+    for count in counts:
+        count.add(torque_nm)
+    return tuple(count.result() for count in counts)
+
+
+@dataclass(frozen=True, slots=True)
+class RecordSignals:
+    """Signals of a record, with masks of their known values.
+
+    Attributes
+    ----------
+    values : ndarray, shape (3, n)
+        Reference and measured angle in rad, and coupling torque in N·m.
+    angle_known, torque_known : ndarray of bool, shape (n,)
+        Whether angle and torque were measured at all ticks on which a sample depends.
+    first_tick : int
+        Tick of the first sample, relative to the first tick of the record.
+    factor : int
+        Number of ticks from one sample to the next.
+    torque_extremes : tuple of TorqueExtreme
+        Largest and smallest measured torque before the signals were decimated; empty if they were
+        not.
+    """
+
+    values: NDArray[np.float64]
+    angle_known: NDArray[np.bool_]
+    torque_known: NDArray[np.bool_]
+    first_tick: int = 0
+    factor: int = 1
+    torque_extremes: tuple[TorqueExtreme, ...] = ()
+
+    def samples_in(self, ticks: slice) -> slice:
+        """Return the range of the samples inside a range of ticks of the record.
+
+        Parameters
+        ----------
+        ticks : slice
+            First tick, and the tick after the last, relative to the first tick of the record.
+        """
+        start, stop = (
+            min(max(-((self.first_tick - tick) // self.factor), 0), self.values.shape[1])
+            for tick in (ticks.start, ticks.stop)
+        )
+        return slice(start, stop)
+
+
+class FullRateSignals:
+    """Signals of a record at its full rate, with linear interpolation of unknown values.
+
+    Parameters
+    ----------
+    grid : TickGrid
+        Ticks of the record.
+    """
+
+    def __init__(self, grid: TickGrid) -> None:
+        self.grid = grid
+        self._values = np.zeros((len(SIGNAL_FIELDS), grid.count))
+
+    def add(self, samples: NDArray[np.void]) -> None:
+        """Include samples of the record, as for `SignalDecimation`."""
+        samples, ticks = samples_on_grid(self.grid, samples)
+        for row, field_name in enumerate(SIGNAL_FIELDS):
+            check_finite(self.grid.session.path, field_name, samples[field_name], samples["tick"])
+            self._values[row, ticks] = samples[field_name]
+
+    def finish(self) -> RecordSignals:
+        """Return the signals after the last sample was added.
+
+        Raises
+        ------
+        RecordError
+            The torque is constant.
+        """
+        grid, is_missing = self.grid, self.grid.is_missing
+        check_sensor(grid.session.path, self._values[2, ~is_missing])
+        is_angle_unknown = grid.is_angle_unknown
+        for row, is_unknown in enumerate((is_missing, is_angle_unknown, grid.is_torque_unknown)):
+            if is_unknown.any() and not is_unknown.all():
+                known_indices = np.flatnonzero(~is_unknown)
+                self._values[row, is_unknown] = np.interp(
+                    np.flatnonzero(is_unknown), known_indices, self._values[row, known_indices]
+                )
+        return RecordSignals(self._values, ~is_angle_unknown, grid.is_torque_measured)
+
+
+def samples_on_grid(
+    grid: TickGrid, samples: NDArray[np.void]
+) -> tuple[NDArray[np.void], NDArray[np.int64]]:
+    """Return the samples on a grid, and their ticks relative to its first.
+
+    Parameters
+    ----------
+    grid : TickGrid
+        Ticks of the record.
+    samples : ndarray of `rigd.session.layout.SAMPLE_DTYPE`, shape (n,)
+        Samples in the order of their ticks.
+    """
+    ticks = samples["tick"].astype(np.int64) - grid.first_tick
+    is_inside = (ticks >= 0) & (ticks < grid.count)
+    return (samples, ticks) if is_inside.all() else (samples[is_inside], ticks[is_inside])

@@ -17,19 +17,9 @@ import numpy as np
 
 from analysis.models import STRUCTURES, Structure, described
 from rigd.beam import PARAMETERS, Parameter
-from rigd.plugins import (
-    Plugin,
-    find_plugin,
-    installed_plugins,
-    load_declaration,
-    plugin_errors,
-    refuse_built_in,
-)
+from rigd.plugins import Plugin, Registry, load_declaration, plugin_errors
 from rigd.printable import listed, printable
 from rigd.units import unit_of
-
-STRUCTURE_GROUP: Final = "analysis.structures"
-"""Group of the entry points by which packages add damping structures."""
 
 _MAX_STARTS: Final = 64
 """Largest number of combinations of start values; each costs an evaluation of the whole record."""
@@ -134,6 +124,21 @@ class AddedStructure:
     plugin: Plugin
 
 
+def _load_structure(plugin: Plugin) -> Structure:
+    """Import the damping structure of a package; raise PluginError if it is invalid."""
+    structure = load_declaration(plugin, Structure)
+    with plugin_errors(plugin):
+        try:
+            check_structure(structure)
+        except ValueError as error:
+            raise plugin.error(str(error)) from error
+    return structure
+
+
+_REGISTRY: Final = Registry("analysis.structures", STRUCTURES, _load_structure, "the analyser")
+"""Damping structures, by name."""
+
+
 def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
     """Return the structures of given names that installed packages add.
 
@@ -151,38 +156,15 @@ def added_structures(names: Sequence[str]) -> tuple[AddedStructure, ...]:
     """
     structures = []
     for name in names:
-        plugin = find_plugin(STRUCTURE_GROUP, name)
+        plugin = _REGISTRY.owner(name)
         if plugin is None:
-            there = [each.name for each in installed_plugins(STRUCTURE_GROUP) if not each.problem]
+            there = [each.name for each in _REGISTRY.added() if not each.problem]
             raise LookupError(
                 f"no installed package adds a structure '{printable(name, 40)}'; "
                 f"{'there are ' + listed(there) if there else 'none adds any'}."
             )
-        structures.append(AddedStructure(load_structure(plugin), plugin))
+        structures.append(AddedStructure(_REGISTRY.load(plugin), plugin))
     return tuple(structures)
-
-
-def load_structure(plugin: Plugin) -> Structure:
-    """Import the damping structure of a package, and check its declaration.
-
-    Parameters
-    ----------
-    plugin : Plugin
-        Part of an installed package.
-
-    Raises
-    ------
-    PluginError
-        If it cannot be used.
-    """
-    refuse_built_in(plugin, {name.lower() for name in STRUCTURES}, "the analyser")
-    structure = load_declaration(plugin, Structure)
-    with plugin_errors(plugin):
-        try:
-            check_structure(structure)
-        except ValueError as error:
-            raise plugin.error(str(error)) from error
-    return structure
 
 
 def check_structure_plugin(plugin: Plugin) -> str:
@@ -198,4 +180,4 @@ def check_structure_plugin(plugin: Plugin) -> str:
     PluginError
         If it cannot be used.
     """
-    return load_structure(plugin).description
+    return _REGISTRY.load(plugin).description

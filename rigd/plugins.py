@@ -11,7 +11,7 @@ import importlib
 import os
 import re
 import sys
-from collections.abc import Container, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -21,7 +21,7 @@ from rigd.errors import FailureError, UserError
 from rigd.printable import listed, printable
 
 T = TypeVar("T")
-"""Type of the object that an entry point names."""
+"""Type of a part, or of the object that an entry point names."""
 
 
 class Declaration(Protocol):
@@ -36,8 +36,8 @@ D = TypeVar("D", bound=Declaration)
 """Type of the declaration that an entry point names."""
 
 GROUPS: Final = {
-    "rigd.devices": ("device", "rigd.profile:check_device_plugin"),
-    "rigd.controllers": ("controller", "rigd.profile:check_controller_plugin"),
+    "rigd.devices": ("device", "rigd.profile:check_part_plugin"),
+    "rigd.controllers": ("controller", "rigd.profile:check_part_plugin"),
     "rigd.excitations": ("excitation", "rigd.excitation:check_excitation_plugin"),
     "analysis.formats": ("file format", "analysis.exchange:check_format_plugin"),
     "analysis.structures": ("structure", "analysis.structures:check_structure_plugin"),
@@ -165,29 +165,6 @@ def load_plugin(plugin: Plugin, expected: type[T]) -> T:
     return found
 
 
-def refuse_built_in(plugin: Plugin, built_in: Container[str], program: str = "rigd") -> None:
-    """Raise if a package adds a part whose name is built in.
-
-    Parameters
-    ----------
-    plugin
-        Part of an installed package.
-    built_in
-        Names of the parts that come with rigd.
-    program
-        Program that has them, for the message.
-
-    Raises
-    ------
-    PluginError
-        If the name is built in.
-    """
-    if plugin.name in built_in:
-        raise plugin.error(
-            f"this {plugin.noun} is built into {program} and cannot be replaced; rename it."
-        )
-
-
 def load_declaration(plugin: Plugin, expected: type[D]) -> D:
     """Import a package and return the declaration of its part, which has the entry point's name.
 
@@ -210,6 +187,88 @@ def load_declaration(plugin: Plugin, expected: type[D]) -> D:
             "equal: rename one."
         )
     return declaration
+
+
+class Registry(Mapping[str, T]):
+    """Parts of one group by name: those that are built in, then those of installed packages.
+
+    Iteration imports the parts of packages, and leaves out those that cannot be used. Access by
+    name raises `PluginError` for a part that cannot be used.
+
+    Parameters
+    ----------
+    group
+        Group of the entry points by which packages add parts, a key of `GROUPS`.
+    built_in
+        Parts that no package can replace, by name.
+    load
+        Function that imports and checks the part of a package; it raises `PluginError`.
+    program
+        Program into which the parts are built, for messages.
+    """
+
+    def __init__(
+        self,
+        group: str,
+        built_in: Mapping[str, T],
+        load: Callable[[Plugin], T],
+        program: str = "rigd",
+    ) -> None:
+        self.group = group
+        self.built_in = built_in
+        self._load = load
+        self._program = program
+
+    def owner(self, name: str) -> Plugin | None:
+        """Return the package that adds a part, or None for a built-in or unknown one.
+
+        Raises
+        ------
+        PluginError
+            If the part is known to be unusable.
+        """
+        return None if name in self.built_in else find_plugin(self.group, name)
+
+    def load(self, plugin: Plugin) -> T:
+        """Import and check the part that a package adds.
+
+        Raises
+        ------
+        PluginError
+            If the package cannot be imported, or its declaration is invalid or replaces a built-in
+            part.
+        """
+        if plugin.name in map(str.lower, self.built_in):
+            raise plugin.error(
+                f"this {plugin.noun} is built into {self._program} and cannot be replaced; rename "
+                "it."
+            )
+        return self._load(plugin)
+
+    def added(self) -> tuple[Plugin, ...]:
+        """Return what installed packages add, in the order of the names; nothing is imported."""
+        return installed_plugins(self.group)
+
+    def names(self) -> list[str]:
+        """Return the names of all parts, usable or not; nothing is imported."""
+        return [*self.built_in, *(plugin.name for plugin in self.added())]
+
+    def __getitem__(self, name: str) -> T:
+        """Return the part of a name."""
+        owner = self.owner(name)
+        return self.built_in[name] if owner is None else self.load(owner)
+
+    def __iter__(self) -> Iterator[str]:
+        """Yield the names of the parts that can be used."""
+        yield from self.built_in
+        for plugin in self.added():
+            with contextlib.suppress(PluginError):
+                self.load(plugin)
+                yield plugin.name
+
+    def __len__(self) -> int:
+        """Return the number of parts that can be used."""
+        return sum(1 for _ in self)
 
 
 def check_plugin(plugin: Plugin) -> str:

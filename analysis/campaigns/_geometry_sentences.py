@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._orders import PooledOrder
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import PooledEstimate
-    from analysis.identify.uniform_beam import TolerantEstimate
+    from analysis.identify.tolerant_estimate import TolerantEstimate
 
 _OTHER_BASES: Final = {
     "losses": "damping ratios and residue phases alone",

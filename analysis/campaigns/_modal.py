@@ -17,12 +17,8 @@ import numpy as np
 
 from analysis.campaigns.pooling import PooledMode, random_effects
 from analysis.identify import MODE_CONSTANT_NAMES, ModalEstimate, ModalModel
-from analysis.identify.uniform_beam import (
-    TolerantEstimate,
-    UniformBeamTest,
-    tolerant_estimate,
-    uniform_beam_test,
-)
+from analysis.identify.beam_uniformity import UniformBeamTest, uniform_beam_test
+from analysis.identify.tolerant_estimate import TolerantEstimate, tolerant_estimate
 from analysis.statistics import NORMAL_95, chi_square_p_value, student_t_quantile
 
 if TYPE_CHECKING:

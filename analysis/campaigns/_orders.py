@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
     from analysis.identify.profile_likelihood import Order
-    from analysis.identify.uniform_beam import TolerantEstimate
+    from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.identify.verdict import Verdict
 
 

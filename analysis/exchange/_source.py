@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
-from rigd.plugins import (
-    Plugin,
-    PluginError,
-    find_plugin,
-    installed_plugins,
-    load_plugin,
-    plugin_errors,
-    refuse_built_in,
-)
+from rigd.plugins import Plugin, PluginError, Registry, load_plugin, plugin_errors
 from rigd.printable import printable
 from rigd.session.limits import MAX_SAMPLES
 
@@ -132,23 +124,40 @@ def _shipped(name: str, module: str, max_bytes: int) -> ImportFormat:
 _MEGABYTE: Final = 1_000_000
 """Number of bytes in a megabyte."""
 
-FORMAT_GROUP: Final = "analysis.formats"
-"""Group of the entry points by which packages add file formats."""
 
-_FORMATS: Final = {
-    ".csv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".txt": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".dat": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".tsv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".asc": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".lvm": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
-    ".mat": _shipped("MATLAB", "_matlab_format", 512 * _MEGABYTE),
-    ".tdms": _shipped("TDMS", "_tdms_format", 512 * _MEGABYTE),
-    ".uff": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
-    ".unv": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
-    ".uf58": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
-}
-"""File format by the suffix of the file's name."""
+def _load_format(plugin: Plugin) -> ImportFormat:
+    """Import the file format of a package, and check its declaration."""
+    file_format = load_plugin(plugin, ImportFormat)
+    if not (isinstance(file_format.name, str) and file_format.name.strip()):
+        raise plugin.error("its format has no name.")
+    if not callable(file_format.read):
+        raise plugin.error("its function that reads channels is no function.")
+    if not (isinstance(file_format.max_bytes, int) and file_format.max_bytes > 0):
+        raise plugin.error(
+            f"its largest file, max_bytes = {file_format.max_bytes}, is not a number of bytes "
+            "above 0."
+        )
+    return file_format
+
+
+_FORMATS: Final = Registry(
+    "analysis.formats",
+    {
+        "csv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "txt": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "dat": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "tsv": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "asc": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "lvm": _shipped("CSV", "_csv_format", 512 * _MEGABYTE),
+        "mat": _shipped("MATLAB", "_matlab_format", 512 * _MEGABYTE),
+        "tdms": _shipped("TDMS", "_tdms_format", 512 * _MEGABYTE),
+        "uff": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+        "unv": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+        "uf58": _shipped("UFF58", "_uff_format", 128 * _MEGABYTE),
+    },
+    _load_format,
+)
+"""File format by the suffix of the file's name, without the dot."""
 
 
 def read_source(
@@ -176,17 +185,15 @@ def read_source(
     ExchangeError
         If the file cannot be read, or lacks a requested channel of numbers.
     """
-    suffix = path.suffix.lower()
+    suffix = path.suffix.lower().removeprefix(".")
     try:
-        owner = None if suffix in _FORMATS else find_plugin(FORMAT_GROUP, suffix.removeprefix("."))
-        file_format = _FORMATS.get(suffix) if owner is None else _load_format(owner)
+        owner, file_format = _FORMATS.owner(suffix), _FORMATS.get(suffix)
     except PluginError as error:
         raise ExchangeError(f"{path}: {error}") from error
     if file_format is None:
-        added = [f".{plugin.name}" for plugin in installed_plugins(FORMAT_GROUP)]
         raise ExchangeError(
             f"{path}: the ending of the name selects the format; give a file that ends in one of "
-            f"{', '.join([*_FORMATS, *added])}."
+            f"{', '.join(f'.{name}' for name in _FORMATS.names())}."
         )
     _check_file(path, file_format)
     try:
@@ -242,23 +249,7 @@ def check_format_plugin(plugin: Plugin) -> str:
     PluginError
         If it cannot be used.
     """
-    refuse_built_in(plugin, {suffix.removeprefix(".") for suffix in _FORMATS})
-    return f"{_load_format(plugin).name}, import of .{plugin.name}"
-
-
-def _load_format(plugin: Plugin) -> ImportFormat:
-    """Import the file format of a package, and check its declaration."""
-    file_format = load_plugin(plugin, ImportFormat)
-    if not (isinstance(file_format.name, str) and file_format.name.strip()):
-        raise plugin.error("its format has no name.")
-    if not callable(file_format.read):
-        raise plugin.error("its function that reads channels is no function.")
-    if not (isinstance(file_format.max_bytes, int) and file_format.max_bytes > 0):
-        raise plugin.error(
-            f"its largest file, max_bytes = {file_format.max_bytes}, is not a number of bytes "
-            "above 0."
-        )
-    return file_format
+    return f"{_FORMATS.load(plugin).name}, import of .{plugin.name}"
 
 
 def _check_file(path: Path, file_format: ImportFormat) -> None:

@@ -1,3 +1,4 @@
+from . import beam_uniformity as beam_uniformity
 from . import drag_torque as drag_torque
 from . import free_decay as free_decay
 from . import headline as headline
@@ -7,6 +8,7 @@ from . import profile_likelihood as profile_likelihood
 from . import residual_tests as residual_tests
 from . import scales as scales
 from . import sentences as sentences
+from . import tolerant_estimate as tolerant_estimate
 from . import uniform_beam as uniform_beam
 from . import verdict as verdict
 from ._candidate import Candidate as Candidate

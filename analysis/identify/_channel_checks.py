@@ -14,7 +14,7 @@ import numpy as np
 
 from analysis.identify._finding import Finding
 from analysis.record_checks import longest_run
-from analysis.record_signals import torque_extremes
+from analysis.record_ticks import torque_extremes
 from rigd.beam import Damping, transfer
 
 if TYPE_CHECKING:

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record import Record
-    from analysis.record_signals import TorqueExtreme
+    from analysis.record_ticks import TorqueExtreme
     from rigd.beam import Beam
 
 

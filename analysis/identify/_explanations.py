@@ -16,7 +16,8 @@ import numpy as np
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._causes import CAUSES, RELAXATION
 from analysis.identify._finding import Finding
-from analysis.identify.uniform_beam import MIN_P_VALUE_OF_UNIFORM_BEAM, UniformBeamProblem
+from analysis.identify.beam_uniformity import MIN_P_VALUE_OF_UNIFORM_BEAM
+from analysis.identify.uniform_beam import UniformBeamProblem
 from analysis.statistics import chi_square_p_value
 
 if TYPE_CHECKING:
@@ -28,7 +29,7 @@ if TYPE_CHECKING:
     from analysis.identify._causes import Cause
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._step_in_time import StiffnessStep
-    from analysis.identify.uniform_beam import UniformBeamTest
+    from analysis.identify.beam_uniformity import UniformBeamTest
     from rigd.beam import Damping, Plant
 
 _CONSTANT_TOLERANCES: Final = (0.03, 1e-3, 0.0)

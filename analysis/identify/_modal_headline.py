@@ -36,9 +36,10 @@ if TYPE_CHECKING:
 
     from analysis.identify._explanations import CauseFit
     from analysis.identify._modal_model import ModalEstimate
+    from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.headline import Headline, ReportedLossFactor, StructureStatus
     from analysis.identify.profile_likelihood import LikelihoodProfile, Order
-    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.tolerant_estimate import TolerantEstimate
 
 NOT_UNIFORM: Final = (
     "the modes are not those of a uniform beam, and what makes them differ may change this value"

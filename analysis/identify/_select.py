@@ -41,6 +41,7 @@ from analysis.identify._step_in_time import best_stiffness_step
 from analysis.identify._time_varying import (
     temporal_change_findings,
 )
+from analysis.identify.beam_uniformity import uniform_beam_test
 from analysis.identify.headline import (
     Headline,
     headline,
@@ -48,7 +49,7 @@ from analysis.identify.headline import (
 )
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION, profile_both_orders
 from analysis.identify.sentences import experiments, headline_sentences
-from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
+from analysis.identify.tolerant_estimate import tolerant_estimate
 from analysis.identify.verdict import (
     ORDER_NOT_DETERMINED_REASON,
     CandidateRow,
@@ -71,8 +72,8 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._result import RecordFit
     from analysis.identify._settings import Setting
+    from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.profile_likelihood import Order
-    from analysis.identify.uniform_beam import UniformBeamTest
 
 
 _ONLINE_DRAG_COMPUTATIONS: Final = 4

@@ -32,7 +32,8 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import RecordFit
-    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.beam_uniformity import UniformBeamTest
+    from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.identify.verdict import OrderVerdict
 
 EXACTLY_UNIFORM_CONDITION: Final = "if the beam is uniform to 1e-5"

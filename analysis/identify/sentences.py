@@ -19,9 +19,10 @@ if TYPE_CHECKING:
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
     from analysis.identify._finding import Finding
+    from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.identify.headline import ConditionalEstimate, Headline
     from analysis.identify.profile_likelihood import Order
-    from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
+    from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.identify.verdict import OrderVerdict, Status
     from rigd.estimates import Estimate
 

@@ -1,37 +1,31 @@
-"""Test of a uniform beam against the modal constants, and estimate of its parameters.
+"""Least-squares fit of a uniform beam to the modal constants of a record.
 
 A uniform beam with internal and external damping predicts frequency, damping ratio and residue of
-every mode from seven parameters. The test compares the measured constants with the predicted ones
-by chi-square. No real antenna is as uniform as the frequencies are precise. So the parameters are
-estimated with a stated tolerance: in addition to the measurement noise, each ln frequency has that
-standard deviation, and each ln residue three times as much.
+every mode from seven parameters.
 """
 
 from __future__ import annotations
 
 import itertools
 import math
-from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Any, Final, Literal
+from dataclasses import replace
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
 from analysis.identify._altered_beam import Alteration, galerkin_mode_terms
 from analysis.identify._modal_model import MODE_CONSTANT_NAMES
 from analysis.optimizer import Box, NormalEquations, descend
-from analysis.statistics import NORMAL_95, chi_square_p_value
 from rigd.beam import (
     BEAM_PARAMETERS,
     DAMPING_PARAMETERS,
-    LOGARITHMIC_PARAMETERS,
     Beam,
     Damping,
     clamped_free_eigenvalues,
 )
-from rigd.session import BeamUniformity
 
 if TYPE_CHECKING:
-    from collections.abc import Callable, Mapping, Sequence
+    from collections.abc import Callable, Sequence
 
     from numpy.typing import NDArray
 
@@ -46,7 +40,7 @@ PARAMETERS: Final = (*DAMPING_PARAMETERS, *BEAM_PARAMETERS, "delay_s")
 _START_ORDERS: Final = (0.4, 1.0, 1.6)
 """Values of alpha and lambda at which the descents start."""
 
-_ORDER_RANGE: Final = (0.02, 1.98)
+ORDER_RANGE: Final = (0.02, 1.98)
 """Smallest and largest value of alpha and lambda in the search."""
 
 _LN_LOSS_RANGE: Final = (-18.0, 2.0)
@@ -81,55 +75,12 @@ _COST_TOLERANCE: Final = 1e-4
 _MAX_EVALUATIONS: Final = 80
 """Largest number of evaluations of chi-square in one descent."""
 
-TestStatus = Literal["passed", "refused", "not tested"]
-"""Result of the uniform-beam test."""
-
-EstimateBasis = Literal["geometry", "losses", "none"]
-"""Data that an estimate with tolerance uses."""
-
-MIN_P_VALUE_OF_UNIFORM_BEAM: Final = 0.01
-"""p-value below which the test refuses a uniform beam."""
-
-_PLAUSIBLE_P_VALUE: Final = 0.3
-"""p-value from which the stated tolerance suffices. A beam that is more uneven reaches a lower
-p-value, since orders compensate a part of the excess."""
-
-_PLAUSIBLE_P_VALUE_WIDER: Final = 0.1
-"""p-value from which the wider tolerance suffices."""
-
-_WIDER_TOLERANCE: Final = 3e-3
-"""Relative frequency tolerance that is tried if the stated one does not suffice."""
-
-_LOOSE_TOLERANCE: Final = 0.05
-"""Relative frequency tolerance at which frequencies and residues have almost no weight."""
-
-_INTEGRAL_TOLERANCE_RATIO: Final = 3
+INTEGRAL_TOLERANCE_RATIO: Final = 3
 """Relative tolerance of residues, and of damping ratios if the beam is not uniform, over that of
 the frequencies. They are integrals over a mode's shape, which vary more than its frequency."""
 
-_LOSS_TOLERANCE: Final = 0.01
-"""Relative tolerance of the damping ratios of a beam so uneven that only its losses are data."""
-
-_MIN_VISIBLE_MODES: Final = 2
-"""Smallest number of visible modes for an estimate with tolerance."""
-
 _IDLE_CURVATURE: Final = 1e-4
 """Second derivative of chi-square below which an unknown counts as without effect."""
-
-_DAMPING_COEFFICIENTS: Final = ("zeta", "gamma")
-"""Damping coefficients that are tested for their absence."""
-
-_MAX_PROFILE_STEPS: Final = 8
-"""Largest number of values at which the profile is computed towards one end of an interval."""
-
-_INTERVAL_END_TOLERANCE: Final = 0.05
-"""Distance of the root of the chi-square rise from 1.96 at which an interval end is accepted."""
-
-_MAX_DISTANCE_GROWTH: Final = 3.0
-"""Largest factor by which one profile step increases the distance from the estimate."""
-
-_MAX_EXPONENT: Final = 300.0
-"""Largest exponent of an interval end, which keeps `exp` finite."""
 
 
 class UniformBeamProblem:
@@ -176,7 +127,7 @@ class UniformBeamProblem:
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_frequency")] = uniformity
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_damping_ratio")] = loss_tolerance
         tolerance_std[:, MODE_CONSTANT_NAMES.index("ln_residue")] = (
-            _INTEGRAL_TOLERANCE_RATIO * uniformity
+            INTEGRAL_TOLERANCE_RATIO * uniformity
         )
         self.covariance = fit.covariance[np.ix_(constant_rows, constant_rows)] + np.diag(
             tolerance_std.ravel() ** 2
@@ -202,9 +153,9 @@ class UniformBeamProblem:
         self.lower = np.array(
             [
                 smallest_ln_loss,
-                _ORDER_RANGE[0],
+                ORDER_RANGE[0],
                 smallest_ln_loss,
-                _ORDER_RANGE[0],
+                ORDER_RANGE[0],
                 self._ln_density_over_stiffness - _LN_BEAM_HALF_RANGE,
                 self._ln_stiffness - _LN_BEAM_HALF_RANGE,
                 -_DELAY_UNKNOWN_LIMIT,
@@ -213,9 +164,9 @@ class UniformBeamProblem:
         self.upper = np.array(
             [
                 largest_ln_loss,
-                _ORDER_RANGE[1],
+                ORDER_RANGE[1],
                 largest_ln_loss,
-                _ORDER_RANGE[1],
+                ORDER_RANGE[1],
                 self._ln_density_over_stiffness + _LN_BEAM_HALF_RANGE,
                 self._ln_stiffness + _LN_BEAM_HALF_RANGE,
                 _DELAY_UNKNOWN_LIMIT,
@@ -511,6 +462,20 @@ class UniformBeamProblem:
         )
         return replace(constrained_minimum, x=from_transformed @ constrained_minimum.x)
 
+    def count_idle_unknowns(self, minimum: Minimum) -> int:
+        """Count the unknowns that are at a bound or do not affect chi-square at a minimum.
+
+        The order of a vanishing damping is one of them.
+
+        Parameters
+        ----------
+        minimum : Minimum
+            Minimum of chi-square.
+        """
+        chi_square_curvature = np.diag(minimum.equations.hessian)
+        is_at_bound = minimum.equations.held(minimum.x, self.lower, self.upper)
+        return int(np.count_nonzero(is_at_bound | (chi_square_curvature < _IDLE_CURVATURE)))
+
 
 def _minimize_within_bounds(
     equations: Callable[[NDArray[np.float64]], NormalEquations],
@@ -526,383 +491,3 @@ def _minimize_within_bounds(
         relative_tolerance=_COST_TOLERANCE,
         max_evaluations=_MAX_EVALUATIONS,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class UniformBeamTest:
-    """Result of the test whether a uniform beam predicts the modal constants of a record.
-
-    Attributes
-    ----------
-    status : str
-        "passed", "refused", or "not tested" if there are no degrees of freedom.
-    chi_square : float
-        Weighted sum of squared differences between measured and predicted constants.
-    degrees_of_freedom : int
-        Number of constants minus number of effective beam parameters.
-    p_value : float or None
-        Probability of at least this chi-square by chance. None without degrees of freedom.
-    modes : tuple of int
-        Numbers of the compared modes.
-    measured, predicted, std : ndarray, shape (4 n,)
-        Measured and predicted `MODE_CONSTANT_NAMES`, mode by mode, and the standard deviations of
-        the measured ones.
-    """
-
-    status: TestStatus
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float | None
-    modes: tuple[int, ...]
-    measured: NDArray[np.float64]
-    predicted: NDArray[np.float64]
-    std: NDArray[np.float64]
-
-    @property
-    def summary(self) -> BeamUniformity:
-        """Return status and p-value of the uniform-beam test."""
-        return BeamUniformity(self.status, self.p_value)
-
-    def as_json(self) -> dict[str, Any]:
-        """Return the result of the test as a dict for JSON. Numbers may be NaN or infinite."""
-        return {
-            **self.summary.as_json(),
-            "chi_square": self.chi_square,
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "constants": [
-                {
-                    "mode": self.modes[constant_index // len(MODE_CONSTANT_NAMES)],
-                    "name": MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)],
-                    "measured": measured_value,
-                    "std": std,
-                    "predicted": predicted_value,
-                }
-                for constant_index, (measured_value, std, predicted_value) in enumerate(
-                    zip(
-                        self.measured.tolist(),
-                        self.std.tolist(),
-                        self.predicted.tolist(),
-                        strict=True,
-                    )
-                )
-            ],
-        }
-
-
-@dataclass(frozen=True, slots=True)
-class TolerantEstimate:
-    """Beam parameters from the modal constants, with a tolerance for a nearly uniform beam.
-
-    Attributes
-    ----------
-    basis : str
-        "geometry": frequencies and residues of all modes within the tolerance; "losses": damping
-        ratios and residue phases alone; "none": no beam with two dampings of one order each
-        explains even these.
-    uniformity : float
-        Assumed relative standard deviation of each frequency.
-    p_value : float or None
-        Probability of at least the remaining chi-square by chance. None without degrees of
-        freedom.
-    plant : Plant
-        Rig and beam with the estimated parameters.
-    values, std : mapping of str to float
-        Estimates and standard deviations, by the names of `PARAMETERS`.
-    interval : mapping of str to (float, float)
-        95 % intervals by the profile of chi-square. An end that the modes do not bound is infinite
-        or the edge of the range.
-    covariance : ndarray, shape (7, 7)
-        Covariance of `PARAMETERS`, with those in `LOGARITHMIC_PARAMETERS` as logarithms.
-    first_rad_s : float
-        Frequency of the first visible mode, in rad/s.
-    deviance_of_order_one : mapping of str to float
-        Increase of chi-square if "alpha" or "lambda" is fixed at 1, with damping ratios and residue
-        phases alone. 0 if the interval contains 1.
-    deviance_without_damping : mapping of str to float
-        Increase of chi-square if the damping with coefficient "zeta" or "gamma" is left out.
-    """
-
-    basis: EstimateBasis
-    uniformity: float
-    p_value: float | None
-    plant: Plant
-    values: Mapping[str, float]
-    std: Mapping[str, float]
-    interval: Mapping[str, tuple[float, float]]
-    covariance: NDArray[np.float64]
-    first_rad_s: float
-    deviance_of_order_one: dict[str, float]
-    deviance_without_damping: dict[str, float]
-
-    def covariance_json(self) -> dict[str, Any]:
-        """Return names and covariance matrix of the beam parameters as a dict for JSON.
-
-        A name with the prefix ``ln_`` means the logarithm of the parameter.
-        """
-        parameter_names = [
-            f"ln_{parameter_name}" if parameter_name in LOGARITHMIC_PARAMETERS else parameter_name
-            for parameter_name in PARAMETERS
-        ]
-        return {"names": parameter_names, "matrix": self.covariance.tolist()}
-
-
-def uniform_beam_test(
-    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
-) -> UniformBeamTest:
-    """Test whether a uniform beam predicts the modal constants of the visible modes.
-
-    Parameters
-    ----------
-    fit : ModalEstimate
-        Fitted modal model with the covariance of its constants.
-    nominal : Plant
-        Rig and specimen as the file states them, with the tip mass if the file states one.
-    tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
-    """
-    mode_numbers = fit.visible
-    constant_rows = fit.rows(mode_numbers)
-    measured_constants, std = (
-        fit.constants[constant_rows],
-        np.sqrt(np.diag(fit.covariance)[constant_rows]),
-    )
-    degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
-    if degrees_of_freedom <= 0:
-        nan_prediction = np.full(measured_constants.size, np.nan)
-        return UniformBeamTest(
-            "not tested", math.nan, 0, None, mode_numbers, measured_constants, nan_prediction, std
-        )
-    problem = UniformBeamProblem(fit, mode_numbers, nominal, tilt_deg=tilt_deg)
-    best_minimum = problem.minima()[0]
-    degrees_of_freedom += _count_idle_unknowns(problem, best_minimum)
-    p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
-    return UniformBeamTest(
-        status="passed" if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM else "refused",
-        chi_square=best_minimum.cost,
-        degrees_of_freedom=degrees_of_freedom,
-        p_value=p_value,
-        modes=mode_numbers,
-        measured=measured_constants,
-        predicted=problem.constants(best_minimum.x[None])[0],
-        std=std,
-    )
-
-
-def tolerant_estimate(
-    fit: ModalEstimate,
-    nominal: Plant,
-    uniformity: float,
-    tilt_deg: float | None = None,
-    *,
-    is_uniform: bool,
-) -> TolerantEstimate | None:
-    """Estimate damping and beam parameters from the modal constants, with a tolerance.
-
-    If a uniform beam with the stated tolerance does not predict the constants, a wider tolerance is
-    used. If that fails, too, only damping ratios and residue phases are used. What makes a beam
-    uneven changes its losses as well: if it is not uniform, damping ratios have a tolerance, too.
-
-    Parameters
-    ----------
-    fit : ModalEstimate
-        Fitted modal model with the covariance of its constants.
-    nominal : Plant
-        Rig and specimen as the file states them.
-    uniformity : float
-        Stated relative standard deviation of each frequency.
-    tilt_deg : float, optional
-        Inclination of the plane of motion along the resting beam, as the file states it, in
-        degrees.
-    is_uniform : bool
-        Whether a uniform beam predicts the modes (`uniform_beam_test`).
-
-    Returns
-    -------
-    TolerantEstimate or None
-        None if fewer than two modes are visible.
-    """
-    mode_numbers = fit.visible
-    if len(mode_numbers) < _MIN_VISIBLE_MODES:
-        return None
-    wider_tolerance = max(_WIDER_TOLERANCE, uniformity)
-    tolerance_attempts: tuple[tuple[EstimateBasis, float, float], ...] = (
-        ("geometry", uniformity, _PLAUSIBLE_P_VALUE),
-        ("geometry", wider_tolerance, _PLAUSIBLE_P_VALUE_WIDER),
-        ("losses", _LOOSE_TOLERANCE, MIN_P_VALUE_OF_UNIFORM_BEAM),
-    )
-    for estimate_basis, frequency_tolerance, least_p_value in tolerance_attempts:
-        loss_tolerance = (
-            0.0
-            if is_uniform
-            else _LOSS_TOLERANCE
-            if estimate_basis == "losses"
-            else _INTEGRAL_TOLERANCE_RATIO * frequency_tolerance
-        )
-        problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, frequency_tolerance, tilt_deg, loss_tolerance
-        )
-        minima = problem.minima()
-        # With the loose tolerance frequencies and residues do not count as data.
-        constant_count = problem.compared // (2 if estimate_basis == "losses" else 1)
-        degrees_of_freedom = constant_count - (
-            len(PARAMETERS) if estimate_basis == "geometry" else len(PARAMETERS) - 2
-        )
-        degrees_of_freedom += _count_idle_unknowns(problem, minima[0])
-        p_value = (
-            float(chi_square_p_value(minima[0].cost, degrees_of_freedom))
-            if degrees_of_freedom > 0
-            else None
-        )
-        if p_value is None or p_value >= least_p_value:
-            break
-    else:
-        estimate_basis = "none"
-    beam_estimate = _estimate_at_minimum(problem, minima, estimate_basis, p_value)
-    orders_excluding_one = [
-        order_name for order_name in ("alpha", "lambda")
-        if not beam_estimate.interval[order_name][0] <= 1 <= beam_estimate.interval[order_name][1]
-    ]  # fmt: skip
-    if not orders_excluding_one:
-        return beam_estimate
-    if estimate_basis == "geometry":
-        problem = UniformBeamProblem(
-            fit, mode_numbers, nominal, _LOOSE_TOLERANCE, tilt_deg, loss_tolerance
-        )
-        minima = problem.minima()
-    best_minimum = minima[0]
-    order_one_deviances = {
-        order_name: problem.minimize_with_fixed(
-            PARAMETERS.index(order_name), 1.0, best_minimum.x
-        ).cost
-        - best_minimum.cost
-        for order_name in orders_excluding_one
-    }
-    return replace(
-        beam_estimate,
-        deviance_of_order_one=beam_estimate.deviance_of_order_one | order_one_deviances,
-    )
-
-
-def _count_idle_unknowns(problem: UniformBeamProblem, minimum: Minimum) -> int:
-    """Count the unknowns that are at a bound or do not affect chi-square at a minimum.
-
-    The order of a vanishing damping is one of them.
-    """
-    chi_square_curvature = np.diag(minimum.equations.hessian)
-    is_at_bound = minimum.equations.held(minimum.x, problem.lower, problem.upper)
-    return int(np.count_nonzero(is_at_bound | (chi_square_curvature < _IDLE_CURVATURE)))
-
-
-def _estimate_at_minimum(
-    problem: UniformBeamProblem,
-    minima: Sequence[Minimum],
-    estimate_basis: EstimateBasis,
-    p_value: float | None,
-) -> TolerantEstimate:
-    """Return the beam parameters at the lowest minimum, with their uncertainties.
-
-    The minima are sorted by chi-square, the lowest first.
-    """
-    best_minimum = minima[0]
-    plant = problem.plant(best_minimum.x)
-    bounded_hessian = best_minimum.equations.hessian + np.diag(
-        1 / (problem.upper - problem.lower) ** 2
-    )
-    covariance = problem.transform @ np.linalg.inv(bounded_hessian) @ problem.transform.T
-    parameter_values = problem.parameters(best_minimum.x)
-    parameter_stds = np.sqrt(np.diag(covariance))
-    deviance_without_damping = {
-        parameter_name: problem.minimize_without_damping(
-            PARAMETERS.index(parameter_name), best_minimum.x
-        ).cost
-        - best_minimum.cost
-        for parameter_name in _DAMPING_COEFFICIENTS
-    }
-    near_minima = [minimum for minimum in minima if minimum.cost - best_minimum.cost < NORMAL_95**2]
-    intervals: dict[str, tuple[float, float]] = {}
-    std: dict[str, float] = {}
-    for parameter_index, parameter_name in enumerate(PARAMETERS):
-        parameter_value, parameter_std = (
-            float(parameter_values[parameter_index]),
-            float(parameter_stds[parameter_index]),
-        )
-        if parameter_name in DAMPING_PARAMETERS:
-            lower_end, upper_end = (
-                _interval_end(problem, parameter_index, best_minimum, interval_side * parameter_std)
-                for interval_side in (-1.0, 1.0)
-            )
-            near_minimum_values = [
-                float(problem.parameters(minimum.x)[parameter_index]) for minimum in near_minima
-            ]
-            lower_end, upper_end = (
-                min(lower_end, *near_minimum_values),
-                max(upper_end, *near_minimum_values),
-            )
-        else:
-            lower_end, upper_end = (
-                parameter_value - NORMAL_95 * parameter_std,
-                parameter_value + NORMAL_95 * parameter_std,
-            )
-        if parameter_name in LOGARITHMIC_PARAMETERS:
-            parameter_value, parameter_std = (
-                math.exp(parameter_value),
-                math.exp(parameter_value) * parameter_std,
-            )
-            lower_end, upper_end = math.exp(lower_end), math.exp(min(upper_end, _MAX_EXPONENT))
-        intervals[parameter_name], std[parameter_name] = (lower_end, upper_end), parameter_std
-    return TolerantEstimate(
-        basis=estimate_basis,
-        uniformity=problem.uniformity,
-        p_value=p_value,
-        plant=plant,
-        values=plant.parameters,
-        std=std,
-        interval=intervals,
-        covariance=covariance,
-        first_rad_s=float(2 * np.pi * np.exp(problem.measured[0])),
-        deviance_of_order_one={"alpha": 0.0, "lambda": 0.0},
-        deviance_without_damping=deviance_without_damping,
-    )
-
-
-def _interval_end(
-    problem: UniformBeamProblem, parameter_index: int, best_minimum: Minimum, signed_std: float
-) -> float:
-    """Return one end of the 95 % interval of a parameter, where chi-square has risen by 3.84.
-
-    Return the edge of the range if chi-square does not rise so far. `parameter_index` is the index
-    of the parameter in `PARAMETERS`. `signed_std` is its standard deviation, negative for the lower
-    end.
-    """
-    estimated_value = float(problem.parameters(best_minimum.x)[parameter_index])
-    range_edge = math.copysign(math.inf, signed_std)
-    if PARAMETERS[parameter_index] in ("alpha", "lambda"):
-        range_edge = _ORDER_RANGE[0 if signed_std < 0 else 1]
-    inside_value, inside_root, x = estimated_value, 0.0, best_minimum.x
-    trial_value = estimated_value + NORMAL_95 * signed_std
-    outside_value: float | None = None
-    for _ in range(_MAX_PROFILE_STEPS):
-        trial_value = (
-            max(trial_value, range_edge) if signed_std < 0 else min(trial_value, range_edge)
-        )
-        trial_minimum = problem.minimize_with_fixed(parameter_index, trial_value, x)
-        deviance_root = math.sqrt(max(trial_minimum.cost - best_minimum.cost, 0.0))
-        if abs(deviance_root - NORMAL_95) < _INTERVAL_END_TOLERANCE:
-            return trial_value
-        if deviance_root < NORMAL_95:
-            inside_value, inside_root, x = trial_value, deviance_root, trial_minimum.x
-            if trial_value == range_edge:
-                return range_edge
-        else:
-            outside_value, outside_root = trial_value, deviance_root
-        if outside_value is None:
-            value_distance = (inside_value - estimated_value) * min(
-                NORMAL_95 / max(inside_root, 0.2), _MAX_DISTANCE_GROWTH
-            )
-            trial_value = estimated_value + value_distance
-        else:
-            trial_value = inside_value + (outside_value - inside_value) * (
-                NORMAL_95 - inside_root
-            ) / (outside_root - inside_root)
-    return trial_value if outside_value is not None else range_edge

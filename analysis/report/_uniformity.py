@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
     from numpy.typing import NDArray
 
-    from analysis.identify.uniform_beam import UniformBeamTest
+    from analysis.identify.beam_uniformity import UniformBeamTest
     from analysis.report.table import Entry
 
 UNIFORMITY: Final = "uniform_beam"

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import ModalFit, RecordAnalysis
-    from analysis.identify.uniform_beam import TolerantEstimate
+    from analysis.identify.tolerant_estimate import TolerantEstimate
     from analysis.models import Structure
     from analysis.record import Record
     from analysis.results import WholeRecord

@@ -19,7 +19,7 @@ from rigd.devices import ActuationTarget, actuation_target, open_devices
 from rigd.devices.cia402 import DriveCapabilities
 from rigd.devices.cia402.requirements import WATCHDOG, Watchdog
 from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.kinds import find_kind, find_owner
+from rigd.devices.kinds import DEVICES
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import find_simulator
 from rigd.engine.timing import RealClock
@@ -331,10 +331,10 @@ def _assess_diagnostic(
 
 def _stream_hz(rig: RigParameters) -> float | None:
     """Return the records per second that the sensor streams, or None if it is polled."""
-    kind = find_kind(rig.devices.sensor)
+    kind = DEVICES.get(rig.devices.sensor)
     if kind is None or kind.stream_hz is None:
         return None
-    with plugin_errors(find_owner(kind.name)):
+    with plugin_errors(DEVICES.owner(kind.name)):
         return kind.stream_hz(rig)
 
 
@@ -563,9 +563,9 @@ def _link_rows(rig: RigParameters, target: ActuationTarget) -> Iterator[CheckRow
     if rig.can is not None:
         bus_text = f"{rig.can.channel} ({rig.can.interface})"
         yield CheckRow("link", "CAN", bus_text, "", CheckResult.OK)
-    sensor_kind = find_kind(rig.devices.sensor)
+    sensor_kind = DEVICES.get(rig.devices.sensor)
     if sensor_kind is not None and sensor_kind.address is not None:
-        owner = find_owner(sensor_kind.name)
+        owner = DEVICES.owner(sensor_kind.name)
         with plugin_errors(owner):
             sensor_address = sensor_kind.address(rig)
         label = "serial" if owner is None else sensor_kind.name

@@ -40,9 +40,9 @@ from rigd.beam.realisation import RealisationError
 from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.control import ControlDesignError, stable_loop
 from rigd.control.contracts import ControllerError
-from rigd.control.kinds import controller_owner, load_controller, make_controller
+from rigd.control.kinds import CONTROLLERS, make_controller
 from rigd.devices import MAY_BE_UNKNOWN, is_simulated_here, unknown_values
-from rigd.devices.kinds import find_owner, selected_kinds
+from rigd.devices.kinds import DEVICES, selected_kinds
 from rigd.devices.parameters import RigParameters
 from rigd.excitation import chirp
 from rigd.plugins import PluginError, plugin_errors
@@ -629,7 +629,7 @@ DEVICE_ROW = "device_settings"
 def added_device_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the rows that the kinds of the profile's devices declare."""
     for kind in selected_kinds(profile.rig.devices):
-        owner = find_owner(kind.name)
+        owner = DEVICES.owner(kind.name)
         if owner is not None:
             yield CheckRow("devices", kind.name, owner.label, "", CheckResult.OK)
         if kind.check_rows is not None:
@@ -647,7 +647,7 @@ _LARGEST_START_FRACTION = 1e-6
 def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
     """Yield the rows on the controller of an installed package; none for the shipped one."""
     name = profile.control.controller
-    owner = controller_owner(name)
+    owner = CONTROLLERS.owner(name)
     if owner is None:
         return
     yield CheckRow("controller", name, owner.label, "", CheckResult.OK)
@@ -660,7 +660,7 @@ def added_controller_rows(profile: Profile) -> Iterator[CheckRow]:
             controller.reset(start_rad)
             controller.step(start_rad, start_rad, 0.0)
             start_torques_nm.append(abs(controller.unlimited_torque_nm))
-        kind = load_controller(owner)
+        kind = CONTROLLERS.load(owner)
         with plugin_errors(owner):
             declared_rows = () if kind.check_rows is None else tuple(kind.check_rows(rig))
     except (ControllerError, ControlDesignError, PluginError) as error:

@@ -67,20 +67,19 @@ def show(
 
     Example: rigd plugins show netft
     """
-    from rigd.control.kinds import controller_owner, find_controller
-    from rigd.devices.kinds import find_kind, find_owner
+    from rigd.control.kinds import CONTROLLERS
+    from rigd.devices.kinds import DEVICES
     from rigd.profile import section_text
 
-    device = find_kind(name)
-    if device is not None and find_owner(name) is not None:
-        typer.echo(section_text(device), nl=False)
+    if DEVICES.owner(name) is not None:
+        typer.echo(section_text(DEVICES[name]), nl=False)
         return
-    controller = find_controller(name)
-    if controller is None or controller_owner(name) is None:
+    if CONTROLLERS.owner(name) is None:
         fail(
             f"No installed package adds a device or a controller {printable(name, 40)}.",
             EXIT_WRONG_USE,
         )
+    controller = CONTROLLERS[name]
     typer.echo(f'# In [control]: controller = "{name}"')
     typer.echo(section_text(controller), nl=False)
 
@@ -173,12 +172,11 @@ def new(
 
 def _is_taken(kind: PartKind, name: str) -> bool:
     """Return whether rigd or an installed package has a part of this kind and name."""
-    from rigd.control.kinds import find_controller
-    from rigd.devices.kinds import find_kind
+    from rigd.control.kinds import CONTROLLERS
+    from rigd.devices.kinds import DEVICES
     from rigd.plugins import PluginError
 
     try:
-        found = find_kind(name) if kind is PartKind.DEVICE else find_controller(name)
+        return name in DEVICES if kind is PartKind.DEVICE else name in CONTROLLERS
     except PluginError:
         return True
-    return found is not None

@@ -9,18 +9,7 @@ from rigd.control._loop_model import LinearController
 from rigd.control._pid import SHIPPED_CONTROLLER, PidController, design_pid
 from rigd.control.contracts import Controller, LoopController
 from rigd.control.declaration import ControlledRig, ControllerKind
-from rigd.plugins import (
-    Plugin,
-    PluginError,
-    find_plugin,
-    installed_plugins,
-    load_declaration,
-    plugin_errors,
-    refuse_built_in,
-)
-
-CONTROLLER_GROUP: Final = "rigd.controllers"
-"""Group of the entry points by which packages add controllers."""
+from rigd.plugins import Plugin, PluginError, Registry, load_declaration, plugin_errors
 
 
 def _make_pid(rig: ControlledRig) -> PidController:
@@ -45,46 +34,16 @@ SHIPPED: Final = {
 """Controllers that come with rigd, by their names in a profile."""
 
 
-def find_controller(name: str) -> ControllerKind | None:
-    """Return the kind of controller of a name, shipped or of an installed package, or None.
-
-    Parameters
-    ----------
-    name
-        Value of ``control.controller`` in a profile.
-
-    Raises
-    ------
-    PluginError
-        If the package that adds the kind cannot be used.
-    """
-    owner = controller_owner(name)
-    return SHIPPED.get(name) if owner is None else load_controller(owner)
-
-
-def load_controller(plugin: Plugin) -> ControllerKind:
-    """Import the kind of controller that a package adds.
-
-    Raises
-    ------
-    PluginError
-        If the package cannot be imported, or its declaration is invalid or replaces a shipped kind.
-    """
-    refuse_built_in(plugin, SHIPPED)
+def _load_controller(plugin: Plugin) -> ControllerKind:
+    """Import the kind of controller that a package adds; raise PluginError if it is invalid."""
     kind = load_declaration(plugin, ControllerKind)
     if not (callable(kind.linear) or callable(kind.make)):
         raise plugin.error("it has neither matrices nor code; add linear or make.")
     return kind
 
 
-def controller_owner(name: str) -> Plugin | None:
-    """Return the package that adds a controller, or None for a shipped or unknown one."""
-    return None if name in SHIPPED else find_plugin(CONTROLLER_GROUP, name)
-
-
-def known_controllers() -> list[str]:
-    """Return the names of the controllers that come with rigd, and of those of packages."""
-    return [*SHIPPED, *(plugin.name for plugin in installed_plugins(CONTROLLER_GROUP))]
+CONTROLLERS: Final = Registry("rigd.controllers", SHIPPED, _load_controller)
+"""Kinds of controllers, by their names in a profile."""
 
 
 def make_controller(rig: ControlledRig) -> LoopController:
@@ -109,7 +68,7 @@ def make_controller(rig: ControlledRig) -> LoopController:
         loop_controller = shipped(rig)
         assert isinstance(loop_controller, LoopController)
         return loop_controller
-    kind = load_controller(owner)
+    kind = CONTROLLERS.load(owner)
     if kind.make is None:
         linear = linear_controller(rig)
         assert linear is not None
@@ -141,7 +100,7 @@ def linear_controller(rig: ControlledRig) -> LinearController | None:
     if owner is None:
         return None
     with plugin_errors(owner):
-        return _linear_controller(load_controller(owner), owner, rig)
+        return _linear_controller(CONTROLLERS.load(owner), owner, rig)
 
 
 def _owner_of(rig: ControlledRig) -> Plugin | None:
@@ -153,7 +112,7 @@ def _owner_of(rig: ControlledRig) -> Plugin | None:
         If there is no such controller any more, or its package cannot be used.
     """
     name = rig.loop.settings.controller
-    owner = controller_owner(name)
+    owner = CONTROLLERS.owner(name)
     if owner is None and name not in SHIPPED:
         raise PluginError(
             f'control.controller = "{name}": no installed package adds it; install the package, or '

@@ -7,7 +7,7 @@ from types import ModuleType
 
 from rigd.devices._unknown import describe_unknown_values
 from rigd.devices.contracts import DeviceError, Devices
-from rigd.devices.kinds import find_kind, find_owner, fits, known_selections
+from rigd.devices.kinds import DEVICES, fits, known_selections
 from rigd.devices.parameters import DeviceSelection, RigParameters
 from rigd.devices.running_simulator import differences, find_simulator
 from rigd.errors import UserError
@@ -56,7 +56,7 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
     PluginError
         If the package that adds one of the devices cannot be used.
     """
-    drive, sensor = find_kind(selection.drive), find_kind(selection.sensor)
+    drive, sensor = DEVICES.get(selection.drive), DEVICES.get(selection.sensor)
     if drive is None or sensor is None or not fits(drive, sensor):
         known_pairs = "; ".join(known_selections())
         file_prefix = "" if source is None else f"{source}: "
@@ -69,7 +69,7 @@ def check_selection(selection: DeviceSelection, source: Path | None = None) -> N
 
 def is_simulated_here(rig: RigParameters) -> bool:
     """Return whether the drive of a rig is a simulation in the process that opens it."""
-    kind = find_kind(rig.devices.drive)
+    kind = DEVICES.get(rig.devices.drive)
     return kind is not None and kind.in_process
 
 
@@ -101,10 +101,10 @@ def describe_actuation_target(rig: RigParameters, target: ActuationTarget) -> st
 
 def drive_address(rig: RigParameters) -> str:
     """Return where the drive of a rig is connected, as a phrase."""
-    kind = find_kind(rig.devices.drive)
+    kind = DEVICES.get(rig.devices.drive)
     if kind is None or kind.address is None:
         return rig.devices.drive
-    with plugin_errors(find_owner(kind.name)):
+    with plugin_errors(DEVICES.owner(kind.name)):
         return kind.address(rig)
 
 
@@ -159,13 +159,13 @@ def open_devices(rig: RigParameters, target: ActuationTarget | None = None) -> D
 
 def _create(rig: RigParameters) -> Devices:
     """Create drive and sensor of a rig with a valid selection of devices."""
-    drive_kind, sensor_kind = find_kind(rig.devices.drive), find_kind(rig.devices.sensor)
+    drive_kind, sensor_kind = DEVICES.get(rig.devices.drive), DEVICES.get(rig.devices.sensor)
     assert drive_kind is not None
     assert drive_kind.open_drive is not None
     assert sensor_kind is not None
     assert sensor_kind.open_sensor is not None
-    with plugin_errors(find_owner(drive_kind.name)):
+    with plugin_errors(DEVICES.owner(drive_kind.name)):
         opened = drive_kind.open_drive(rig)
-    with plugin_errors(find_owner(sensor_kind.name)):
+    with plugin_errors(DEVICES.owner(sensor_kind.name)):
         sensor = sensor_kind.open_sensor(opened.rig, opened)
     return Devices(opened.drive, sensor, opened.simulated, opened.renew_noise)

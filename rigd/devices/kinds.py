@@ -10,59 +10,19 @@ from rigd.devices._shipped import SHIPPED
 from rigd.devices.contracts import DeviceError
 from rigd.devices.declaration import DeviceKind
 from rigd.devices.parameters import DeviceSelection
-from rigd.plugins import (
-    Plugin,
-    error_of_package,
-    find_plugin,
-    installed_plugins,
-    load_declaration,
-    refuse_built_in,
-)
-
-DEVICE_GROUP: Final = "rigd.devices"
-"""Group of the entry points by which packages add kinds of devices."""
+from rigd.plugins import Plugin, Registry, error_of_package, load_declaration
 
 
-def shipped_kinds() -> tuple[DeviceKind, ...]:
-    """Return the kinds of devices that come with rigd."""
-    return tuple(SHIPPED.values())
-
-
-def find_kind(name: str) -> DeviceKind | None:
-    """Return the kind of device of a name, shipped or of an installed package, or None.
-
-    Parameters
-    ----------
-    name
-        Name in the section ``[devices]`` of a profile.
-
-    Raises
-    ------
-    PluginError
-        If the package that adds the kind cannot be used.
-    """
-    owner = find_owner(name)
-    return SHIPPED.get(name) if owner is None else load_kind(owner)
-
-
-def load_kind(plugin: Plugin) -> DeviceKind:
-    """Import the kind of device that a package adds.
-
-    Raises
-    ------
-    PluginError
-        If the package cannot be imported, or its declaration is invalid or replaces a shipped kind.
-    """
-    refuse_built_in(plugin, SHIPPED)
+def _load_device(plugin: Plugin) -> DeviceKind:
+    """Import the kind of device that a package adds; raise PluginError if it is invalid."""
     kind = load_declaration(plugin, DeviceKind)
     if kind.open_drive is None and kind.open_sensor is None:
         raise plugin.error("it is neither drive nor sensor; add open_drive or open_sensor.")
     return kind
 
 
-def find_owner(name: str) -> Plugin | None:
-    """Return the package that adds a kind of device, or None for a shipped or unknown kind."""
-    return None if name in SHIPPED else find_plugin(DEVICE_GROUP, name)
+DEVICES: Final = Registry("rigd.devices", SHIPPED, _load_device)
+"""Kinds of devices, by their names in a profile."""
 
 
 def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
@@ -83,7 +43,7 @@ def failure_of_device(error: Exception, selection: DeviceSelection) -> str:
     if isinstance(error, DeviceError | OSError):
         return str(error)
     for name in (selection.drive, selection.sensor):
-        owner = find_owner(name)
+        owner = DEVICES.owner(name)
         if owner is not None and (package_error := error_of_package(error, owner)) is not None:
             return str(package_error)
     raise error
@@ -98,7 +58,7 @@ def selected_kinds(selection: DeviceSelection) -> tuple[DeviceKind, ...]:
         If a package that adds one of them cannot be used.
     """
     names = dict.fromkeys((selection.drive, selection.sensor))
-    return tuple(kind for name in names if (kind := find_kind(name)) is not None)
+    return tuple(kind for name in names if (kind := DEVICES.get(name)) is not None)
 
 
 def known_selections() -> list[str]:
@@ -109,7 +69,7 @@ def known_selections() -> list[str]:
         for sensor in SHIPPED.values()
         if drive.open_drive and sensor.open_sensor and fits(drive, sensor)
     ]
-    added = [plugin.name for plugin in installed_plugins(DEVICE_GROUP)]
+    added = [plugin.name for plugin in DEVICES.added()]
     return [*phrases, *([f"installed packages add {', '.join(added)}"] if added else [])]
 
 

@@ -1,8 +1,8 @@
-from ._added import EXCITATION_GROUP as EXCITATION_GROUP
 from ._beam_estimate import BAND_HZ as BAND_HZ
 from ._beam_estimate import BeamEstimate as BeamEstimate
 from ._fisher_information import information as information
 from ._from_file import from_csv as from_csv
+from ._move import move as move
 from ._named import KINDS as KINDS
 from ._named import Value as Value
 from ._named import check_excitation_plugin as check_excitation_plugin
@@ -18,7 +18,6 @@ from ._segment_search import SHORTEST_S as SHORTEST_S
 from ._segment_search import PrecisionForecast as PrecisionForecast
 from ._segment_search import Segment as Segment
 from ._shortest_move import MovePlant as MovePlant
-from ._shortest_move import move as move
 from ._shortest_move import shortest_braking as shortest_braking
 from ._shortest_move import shortest_move as shortest_move
 from ._signals import Excitation as Excitation
@@ -29,9 +28,11 @@ from ._signals import multisine as multisine
 from ._signals import present_frequency_hz as present_frequency_hz
 from ._signals import step as step
 from ._touch_passes import Approach as Approach
+from ._touch_passes import TouchExcitation as TouchExcitation
 from ._touch_passes import TouchPass as TouchPass
 from ._touch_passes import reference_after_touch as reference_after_touch
 from ._touch_passes import touch as touch
 from ._until import PAUSE_S as PAUSE_S
+from ._until import PrecisionExcitation as PrecisionExcitation
 from ._until import PrecisionSearch as PrecisionSearch
 from ._until import until as until

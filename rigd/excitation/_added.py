@@ -1,7 +1,7 @@
 """Excitations of installed packages, as functions like those of rigd."""
 
 import inspect
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, fields
 from functools import lru_cache
 from typing import Any, Final, get_type_hints
@@ -16,86 +16,14 @@ from rigd.excitation._signals import (
     lay_out_segments,
 )
 from rigd.excitation.declaration import ExcitationKind
-from rigd.plugins import (
-    Plugin,
-    PluginError,
-    find_plugin,
-    installed_plugins,
-    load_declaration,
-    plugin_errors,
-    refuse_built_in,
-)
+from rigd.plugins import Plugin, load_declaration, plugin_errors
 from rigd.units import unit_of
 
-EXCITATION_GROUP: Final = "rigd.excitations"
-"""Group of the entry points by which packages add excitations."""
-_SEGMENT_OPTIONS = ("duration_s", "rest_s", "ring_down_s")
+_SEGMENT_OPTIONS: Final = ("duration_s", "rest_s", "ring_down_s")
 """Options that every excitation of a package has."""
 
 MakeExcitation = Callable[..., Excitation]
 """Function that returns an excitation, of the rate and its options."""
-
-
-class ExcitationKinds(Mapping[str, MakeExcitation]):
-    """Functions that return an excitation, by name: those of rigd, then those of packages.
-
-    Parameters
-    ----------
-    shipped
-        Functions of rigd, which no package can replace.
-    """
-
-    def __init__(self, shipped: Mapping[str, MakeExcitation]) -> None:
-        self._shipped = shipped
-
-    def __getitem__(self, name: str) -> MakeExcitation:
-        """Return the function of a name; raise PluginError if its package cannot be used."""
-        if name in self._shipped:
-            return self._shipped[name]
-        plugin = find_plugin(EXCITATION_GROUP, name)
-        if plugin is None:
-            raise KeyError(name)
-        return added_function(plugin)
-
-    def __iter__(self) -> Iterator[str]:
-        """Yield the names; those of packages that cannot be used are left out."""
-        yield from self._shipped
-        for plugin in installed_plugins(EXCITATION_GROUP):
-            try:
-                load_excitation(plugin)
-            except PluginError:
-                continue
-            if plugin.name not in self._shipped:
-                yield plugin.name
-
-    def __len__(self) -> int:
-        """Return the number of names."""
-        return sum(1 for _ in self)
-
-    def find_added(self, name: str) -> tuple[ExcitationKind, Plugin] | None:
-        """Return the excitation of a name that a package adds, with the package; else None.
-
-        Raises
-        ------
-        PluginError
-            If the package cannot be used.
-        """
-        if name in self._shipped:
-            return None
-        plugin = find_plugin(EXCITATION_GROUP, name)
-        return None if plugin is None else (load_excitation(plugin), plugin)
-
-    def check_plugin(self, plugin: Plugin) -> str:
-        """Import the excitation of a package, and return its summary.
-
-        Raises
-        ------
-        PluginError
-            If it cannot be used.
-        """
-        refuse_built_in(plugin, self._shipped)
-        added_function(plugin)
-        return load_excitation(plugin).summary
 
 
 def load_excitation(plugin: Plugin) -> ExcitationKind:

@@ -3,18 +3,18 @@
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Protocol
+from typing import Final, Protocol
 
-from rigd.excitation._added import ExcitationKinds
+from rigd.excitation._added import MakeExcitation, added_function, load_excitation
 from rigd.excitation._from_file import from_csv
+from rigd.excitation._move import MoveRig, move
 from rigd.excitation._narrow_sweeps import SweepRig, modes
 from rigd.excitation._options import ExcitationOption, declared_options
-from rigd.excitation._shortest_move import MoveRig, move
 from rigd.excitation._signals import Excitation, chirp, hold, multisine, step
 from rigd.excitation._touch_passes import touch
 from rigd.excitation._until import ScanRig, until
 from rigd.excitation.declaration import ExcitationKind
-from rigd.plugins import Plugin
+from rigd.plugins import Plugin, Registry
 
 Value = float | int | str | Path
 """Type of an option's value in a request for an excitation."""
@@ -24,7 +24,8 @@ class ExcitationRig(SweepRig, MoveRig, ScanRig, Protocol):
     """Interface to a rig for which any kind of excitation is planned: limits and predictions."""
 
 
-KINDS = ExcitationKinds(
+KINDS: Final[Registry[MakeExcitation]] = Registry(
+    "rigd.excitations",
     {
         "chirp": chirp,
         "hold": hold,
@@ -35,7 +36,8 @@ KINDS = ExcitationKinds(
         "move": move,
         "touch": touch,
         "until": until,
-    }
+    },
+    added_function,
 )
 """Functions that return an excitation, by its name on the command line and in session files.
 
@@ -107,7 +109,8 @@ def find_excitation(name: str) -> tuple[ExcitationKind, Plugin] | None:
     PluginError
         If the package cannot be used.
     """
-    return KINDS.find_added(name)
+    owner = KINDS.owner(name)
+    return None if owner is None else (load_excitation(owner), owner)
 
 
 def check_excitation_plugin(plugin: Plugin) -> str:
@@ -118,4 +121,5 @@ def check_excitation_plugin(plugin: Plugin) -> str:
     PluginError
         If it cannot be used.
     """
-    return KINDS.check_plugin(plugin)
+    KINDS.load(plugin)
+    return load_excitation(plugin).summary

@@ -13,15 +13,25 @@ import numpy as np
 from numpy.typing import NDArray
 
 from rigd.excitation._beam_estimate import BAND_HZ, BeamEstimate
-from rigd.excitation._fisher_information import (
-    RecordSoFar,
-    TorqueModel,
-    covariance_of,
-    responses,
-    whitened_kernels,
-)
+from rigd.excitation._fisher_information import RecordSoFar, TorqueModel, covariance_of
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
+from rigd.excitation._sine_mixture import (
+    UNREACHABLE_S,
+    best_mixture,
+    steady_sines,
+    time_with_ring_up,
+)
+from rigd.excitation._sweeps import (
+    FADE_S,
+    ContinuedDrive,
+    SegmentCandidate,
+    SweepBand,
+    UnitSweep,
+    candidate_bands,
+    describe_candidate,
+    largest_factor,
+)
 from rigd.excitation.moves import quintic
 from rigd.excitation.targets import Precision, Quantities
 
@@ -29,41 +39,34 @@ Real = NDArray[np.float64]
 
 DURATIONS_S: Final = (1.0, 1.5, 2.0, 3.0)
 """Durations in s of the candidate segments."""
+
 SHORTEST_S: Final = DURATIONS_S[0]
 """Duration in s of the shortest segment."""
 
-_FADE_S: Final = 0.25
-"""Shortest duration in s of a sweep's fade at either end."""
 _SETTLING_S: Final = 0.25
 """Time in s after a segment for which its response is checked against the limits."""
+
 _TAIL_S: Final = 1.0
 """Time in s after a segment over which the vibration of the modes is separated, and the modes that
 the segment does not excite are brought to rest."""
+
 HORIZON_S: Final = 8.0
 """Planning horizon in s from the start of a segment. A mode gives information on its damping only
 after it has rung for a while."""
-_HALF_WIDTH_HZ: Final = 0.5
-"""Half the width in Hz of a narrow sweep through a mode."""
-_RESONANCE_HALF_WIDTHS: Final = 2.0
-"""Half the width of a sweep over a whole resonance, in half-power half-widths of the mode."""
-_SIDE_OFFSET: Final = 0.06
-"""Distance of the off-resonance sweeps from a mode, relative to its frequency. They determine
-stiffness and tool inertia, without which the height of a resonance does not give the damping."""
-_SINE_OFFSETS: Final = (-4.0, -2.0, -1.0, 0.0, 1.0, 2.0, 4.0)
-"""Distances of the forecast's steady sines from a mode, in half-power half-widths of the mode."""
+
 _PHASE_COUNT: Final = 8
 """Number of phases of a sweep that are compared."""
+
 _BASE_AMPLITUDE_FACTORS: Final = (1.0, 0.8, 0.5)
 """Factors by which a segment's amplitude is multiplied when a further band is added to it."""
-_MIXTURE_STEPS: Final = 60
-"""Number of multiplicative steps in the search for a mixture of steady sines."""
+
 _MIXTURE_EFFICIENCY: Final = 0.7
 """Time of a mixture of steady sines over the time of segments with the same information, whose
 modes have to ring up (measured)."""
-_UNREACHABLE_S: Final = 1e5
-"""Time in s above which the targets count as never reached."""
+
 _MAX_RELAXATIONS: Final = 3
 """Largest number of times that the targets are relaxed to fit into the remaining time."""
+
 _LIMIT_CHECK_TICKS: Final = 4
 """Number of ticks from one check of the limits to the next while candidates are compared."""
 
@@ -105,91 +108,6 @@ class Segment:
     fraction_of_limits: float
     """Largest predicted fraction of a limit, or of the largest slope of the tip, including the
     vibration from before the segment."""
-
-
-# Sweeps of which segments consist
-
-
-@dataclass(frozen=True, slots=True)
-class _SweepBand:
-    """Band of frequencies that a candidate sweep covers, and the mode that it excites."""
-
-    mode_number: int
-    """Number of the mode, from 1."""
-    middle_hz: float
-    """Centre of the band in Hz."""
-    half_width_hz: float
-    """Half the width of the band in Hz; 0: a sine."""
-    fade_s: float
-    """Duration in s of the fade at either end of the sweep."""
-    at_mode: bool = True
-    """Whether the band is centred at the mode, not on one side of it."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _UnitSweep:
-    """Reference angle and predicted response of a sweep of amplitude 1 rad in one phase."""
-
-    reference_rad: Real
-    """Reference angle at each tick of the segment; shape (n,)."""
-    angle_rad: Real
-    """Predicted angle of the motor at each tick of the segment; shape (n,)."""
-    rows: Real
-    """Whitened derivatives of the torque by the free parameters from the beginning of the segment;
-    shape (k, samples)."""
-    weighted: Real
-    """Combinations of these derivatives with the weights of the mixture; shape (q, samples)."""
-    channels: Real
-    """Limited quantities, such as speed and torque, as fractions of their limits; shape
-    (6, ticks)."""
-    slope: Real
-    """Slope of the tip up to the planning horizon, as a fraction of its limit; shape (samples,)."""
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _SegmentCandidate:
-    """Candidate for the next segment of excitation, as a sum of sweeps within the limits."""
-
-    duration_s: float
-    """Duration of the segment in s."""
-    parts: tuple[tuple[_SweepBand, float], ...]
-    """Bands of the segment, and their amplitudes in rad."""
-    terms: tuple[tuple[float, _UnitSweep], ...]
-    """Amplitudes in rad and unit sweeps, whose sum of products is the segment."""
-    channels: Real
-    """Limited quantities as fractions of their limits, at one tick in `_LIMIT_CHECK_TICKS`; shape
-    (6, ticks)."""
-    weighted: Real
-    """Combinations of the torque's derivatives with the weights of the mixture; shape
-    (q, samples)."""
-    tip_slope: Real
-    """Slope of the tip as a fraction of its limit; shape (samples,)."""
-    value: float
-    """Information up to the planning horizon if the first band is driven on after the segment, as
-    the time in s in which the best mixture would give it."""
-
-    def weighted_sum(self, attribute_name: str) -> Real:
-        """Return the sum of an array attribute of the segment's sweeps, weighted by amplitude.
-
-        `attribute_name` is an attribute of `_UnitSweep`.
-        """
-        summed_values: Real = sum(
-            sweep_factor * getattr(candidate_sweep, attribute_name)
-            for sweep_factor, candidate_sweep in self.terms
-        )
-        return summed_values
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class _ContinuedDrive:
-    """Response to exciting a mode by a sine after a segment, in two phases of the sine."""
-
-    weighted: Real
-    """Weighted derivatives of the torque for a sine of amplitude 1 rad in either phase; shape
-    (2, q, samples)."""
-    per_amplitude: Real
-    """Amplitudes of the two sines that hold the mode's vibration constant, per real and imaginary
-    part of its amplitude; shape (2, 2)."""
 
 
 class SegmentSearch:
@@ -236,16 +154,18 @@ class SegmentSearch:
             [zero_channel, zero_channel, zero_channel, torque_nm, torque_nm, slope_rad]
         )
         self.ringing = ringing_channels / self.limits[:, None]
-        self.line_hz, line_amplitudes_rad = self.steady_sines()
+        self.line_hz, self.line_amplitudes_rad = steady_sines(
+            estimate, self.modes, plant, self.limits
+        )
         known_information = record.information_after(None, 0)
         self.mixture = best_mixture(
-            known_information, estimate, quantities, self.line_hz, line_amplitudes_rad
+            known_information, estimate, quantities, self.line_hz, self.line_amplitudes_rad
         )
-        self.needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
+        self.needed_s = self._mixture_time_s()
         # With too little time all targets are missed by one factor, not the last mode alone.
         relaxation, needed_s = 1.0, self.needed_s
         for _ in range(_MAX_RELAXATIONS):
-            if not time_left_s < needed_s < _UNREACHABLE_S:
+            if not time_left_s < needed_s < UNREACHABLE_S:
                 break
             relaxation *= (needed_s / time_left_s) ** 0.5
             self.mixture = best_mixture(
@@ -253,101 +173,17 @@ class SegmentSearch:
                 estimate,
                 quantities,
                 self.line_hz,
-                line_amplitudes_rad,
+                self.line_amplitudes_rad,
                 relaxation,
             )
-            needed_s = self.time_with_ring_up() / _MIXTURE_EFFICIENCY
+            needed_s = self._mixture_time_s()
         self.weighted_if_held = self.mixture.weights @ record.nuisance_projection @ record.ahead
-        self._continued_drives: dict[float, _ContinuedDrive] = {}
+        self._continued_drives: dict[float, ContinuedDrive] = {}
         self.tip_slope = self.ringing[-1, :: self.model.factor][: self.samples]
-
-    def candidate_bands(self) -> list[_SweepBand]:
-        """Return the frequency bands of candidate sweeps: at every mode, and on either side."""
-        sweep_bands = []
-        for beam_mode in self.modes:
-            hz = beam_mode.frequency_hz
-            # A sine, a narrow sweep, and one over the whole resonance where that is wider.
-            narrow_half_width_hz = min(_HALF_WIDTH_HZ, 0.2 * hz)
-            resonance_half_width_hz = min(
-                _RESONANCE_HALF_WIDTHS * beam_mode.damping_ratio * hz, 0.2 * hz
-            )
-            widths_hz = [
-                0.0,
-                narrow_half_width_hz,
-                *(
-                    [resonance_half_width_hz]
-                    if resonance_half_width_hz > 1.5 * narrow_half_width_hz
-                    else []
-                ),
-            ]
-            sweep_bands += [
-                _SweepBand(beam_mode.mode, hz, offset_width, _FADE_S) for offset_width in widths_hz
-            ]
-            # Fades as long as the beat with the mode: a shorter one excites the mode as well.
-            sweep_bands += [
-                _SweepBand(
-                    beam_mode.mode,
-                    (1.0 + offset_step) * hz,
-                    0.0,
-                    max(_FADE_S, 1.0 / (_SIDE_OFFSET * hz)),
-                    False,
-                )
-                for offset_step in (-_SIDE_OFFSET, _SIDE_OFFSET)
-                if (1.0 + offset_step) * hz < BAND_HZ
-            ]
-        return sweep_bands
-
-    def steady_sines(self) -> tuple[Real, Real]:
-        """Return frequencies and largest allowed amplitudes of the forecast's steady sines.
-
-        The results are frequencies in Hz and amplitudes of the angle in rad, each of shape (m,).
-        """
-        relative_offsets = [
-            (*(beam_mode.damping_ratio * np.array(_SINE_OFFSETS)), -_SIDE_OFFSET, _SIDE_OFFSET)
-            for beam_mode in self.modes
-        ]
-        frequency_hz = np.array(
-            [
-                beam_mode.frequency_hz * (1.0 + relative_offset)
-                for beam_mode, mode_offsets in zip(self.modes, relative_offsets, strict=True)
-                for relative_offset in mode_offsets
-            ]
-        )
-        frequency_hz = frequency_hz[(frequency_hz > 0.0) & (frequency_hz < BAND_HZ)]
-        s = 2j * pi * frequency_hz
-        _, torque_response, slope_response = responses(self.estimate, s)
-        # The response to a short pulse gives the torque for the motor's own inertia, and its lag.
-        pulse_reference_rad = np.zeros(round(self.plant.rate_hz))
-        pulse_rise = quintic(0.01, self.plant.rate_hz)
-        pulse_reference_rad[: 2 * pulse_rise.size] = 1e-3 * np.concatenate(
-            [pulse_rise, pulse_rise[::-1]]
-        )
-        pulse_response = self.plant.respond(pulse_reference_rad)
-        laplace_factors = np.exp(
-            -np.outer(s, np.arange(pulse_reference_rad.size) / self.plant.rate_hz)
-        )
-        angle_transform = laplace_factors @ pulse_response.angle_rad
-        lag = laplace_factors @ (pulse_reference_rad - pulse_response.angle_rad) / angle_transform
-        motor_torque_response = (
-            laplace_factors
-            @ (pulse_response.torque_nm - pulse_response.coupling_torque_nm)
-            / angle_transform
-        )
-        limit_fractions = np.abs(
-            [
-                np.ones_like(s),
-                s,
-                lag,
-                motor_torque_response + torque_response,
-                torque_response,
-                slope_response,
-            ]
-        )
-        return frequency_hz, 1.0 / (limit_fractions / self.limits[:, None]).max(axis=0)
 
     def best_candidate(
         self, time_left_s: float, mode_numbers: Collection[int] = ()
-    ) -> _SegmentCandidate:
+    ) -> SegmentCandidate:
         """Return the most informative candidate segment that fits into `time_left_s`.
 
         It drives one of the modes in `mode_numbers`, or any mode if `mode_numbers` is empty.
@@ -365,16 +201,16 @@ class SegmentSearch:
 
     def best_of_duration(
         self, duration_s: float, mode_numbers: Collection[int]
-    ) -> _SegmentCandidate:
+    ) -> SegmentCandidate:
         """Return the most informative candidate segment of a given duration.
 
         The best band comes first; bands of further modes are added if they give more information.
         """
         sweep_pairs = [
             (sweep_band, self.sweep_pair(sweep_band, duration_s))
-            for sweep_band in self.candidate_bands()
+            for sweep_band in candidate_bands(self.modes)
         ]
-        empty_candidate = _SegmentCandidate(
+        empty_candidate = SegmentCandidate(
             duration_s,
             (),
             (),
@@ -438,10 +274,10 @@ class SegmentSearch:
 
     def with_modes_at_rest(
         self,
-        start_candidate: _SegmentCandidate,
+        start_candidate: SegmentCandidate,
         mode_number: int,
-        mode_sweeps: dict[int, tuple[_UnitSweep, _UnitSweep]],
-    ) -> _SegmentCandidate:
+        mode_sweeps: dict[int, tuple[UnitSweep, UnitSweep]],
+    ) -> SegmentCandidate:
         """Return a candidate segment that also brings all modes but one to rest by its end.
 
         If the limits do not allow that, the modes' vibration is reduced as far as they allow.
@@ -471,7 +307,7 @@ class SegmentSearch:
             f * other_sweep.weighted
             for f, other_sweep in zip(sweep_factors, other_sweeps, strict=True)
         )
-        return _SegmentCandidate(
+        return SegmentCandidate(
             start_candidate.duration_s,
             (),
             tuple(
@@ -489,9 +325,7 @@ class SegmentSearch:
             0.0,
         )
 
-    def sweep_pair(
-        self, sweep_band: _SweepBand, duration_s: float
-    ) -> tuple[_UnitSweep, _UnitSweep]:
+    def sweep_pair(self, sweep_band: SweepBand, duration_s: float) -> tuple[UnitSweep, UnitSweep]:
         """Return two sweeps of 1 rad through a band, a quarter of a period apart in phase."""
         rate_hz = self.plant.rate_hz
         n = self.ticks(duration_s)
@@ -511,7 +345,7 @@ class SegmentSearch:
             fade_window * np.cos(phase_rad)
         )
 
-    def unit_sweep(self, reference_rad: Real) -> _UnitSweep:
+    def unit_sweep(self, reference_rad: Real) -> UnitSweep:
         """Return the predicted response to a reference of amplitude 1 rad from rest, shape (n,)."""
         n = reference_rad.size
         extended_reference_rad = np.concatenate(
@@ -531,7 +365,7 @@ class SegmentSearch:
                 slope_rad[: extended_reference_rad.size],
             ]
         )
-        return _UnitSweep(
+        return UnitSweep(
             reference_rad=reference_rad,
             angle_rad=loop_response.angle_rad[:n],
             rows=whitened_rows,
@@ -542,12 +376,12 @@ class SegmentSearch:
 
     def with_band(
         self,
-        base_candidate: _SegmentCandidate,
+        base_candidate: SegmentCandidate,
         amplitude_fraction: float,
-        sweep_band: _SweepBand,
-        sweep_pair: tuple[_UnitSweep, _UnitSweep],
+        sweep_band: SweepBand,
+        sweep_pair: tuple[UnitSweep, UnitSweep],
         phase_index: int,
-    ) -> _SegmentCandidate:
+    ) -> SegmentCandidate:
         """Return a candidate segment with a further band, at the largest allowed amplitude.
 
         The amplitudes of `base_candidate` are multiplied by `amplitude_fraction`. The phase of the
@@ -581,7 +415,7 @@ class SegmentSearch:
         information_value = self.information_to_horizon(
             leading_band, weighted_rows, tip_slope_fractions, base_candidate.duration_s
         )
-        return _SegmentCandidate(
+        return SegmentCandidate(
             base_candidate.duration_s,
             (
                 *(
@@ -606,7 +440,7 @@ class SegmentSearch:
 
     def information_to_horizon(
         self,
-        sweep_band: _SweepBand,
+        sweep_band: SweepBand,
         weighted_rows: Real,
         tip_slope_fractions: Real,
         duration_s: float,
@@ -645,7 +479,7 @@ class SegmentSearch:
         )
         return np.linalg.pinv(decay_columns.T)
 
-    def continued_drive(self, sweep_band: _SweepBand) -> _ContinuedDrive:
+    def continued_drive(self, sweep_band: SweepBand) -> ContinuedDrive:
         """Return the response to exciting a band's mode by a sine up to the planning horizon."""
         if sweep_band.middle_hz not in self._continued_drives:
             duration_s = HORIZON_S - DURATIONS_S[0]
@@ -654,11 +488,11 @@ class SegmentSearch:
             driven_mode = next(
                 beam_mode for beam_mode in self.modes if beam_mode.mode == sweep_band.mode_number
             )
-            end_sample = self.model_samples(duration_s - _FADE_S)
+            end_sample = self.model_samples(duration_s - FADE_S)
             tail_window = slice(end_sample - self.model_samples(_TAIL_S), end_sample)
             time_s = np.arange(tail_window.start, tail_window.stop) / self.model.sample_hz
             # Fraction of the steady amplitude that the mode has reached by then.
-            ring_up_fraction = 1.0 - np.exp(driven_mode.at_rad_s.real * (time_s - 0.5 * _FADE_S))
+            ring_up_fraction = 1.0 - np.exp(driven_mode.at_rad_s.real * (time_s - 0.5 * FADE_S))
             oscillation = np.exp(1j * driven_mode.at_rad_s.imag * time_s)
             oscillation_columns = (
                 np.stack([oscillation.real, -oscillation.imag], axis=1) * ring_up_fraction[:, None]
@@ -667,12 +501,12 @@ class SegmentSearch:
                 [sine_sweep.slope[tail_window] for sine_sweep in sine_pair], axis=1
             )
             drive_per_amplitude = np.linalg.inv(np.linalg.lstsq(oscillation_columns, tip_slopes)[0])
-            self._continued_drives[sweep_band.middle_hz] = _ContinuedDrive(
+            self._continued_drives[sweep_band.middle_hz] = ContinuedDrive(
                 weighted_rows, drive_per_amplitude
             )
         return self._continued_drives[sweep_band.middle_hz]
 
-    def segment(self, chosen_candidate: _SegmentCandidate, time_left_s: float) -> Segment:
+    def segment(self, chosen_candidate: SegmentCandidate, time_left_s: float) -> Segment:
         """Return a candidate as a segment, with the standard deviations expected after it."""
         estimate, quantities = self.estimate, self.quantities
         segment_samples = self.model_samples(chosen_candidate.duration_s)
@@ -688,7 +522,7 @@ class SegmentSearch:
             estimate,
         )
         return Segment(
-            name=_describe_candidate(chosen_candidate),
+            name=describe_candidate(chosen_candidate),
             reference_rad=amplitude_fraction * chosen_candidate.weighted_sum("reference_rad"),
             angle_rad=amplitude_fraction * chosen_candidate.weighted_sum("angle_rad"),
             names=estimate.names,
@@ -701,31 +535,10 @@ class SegmentSearch:
             * float(np.abs(ringing_channels + amplitude_fraction * segment_channels).max()),
         )
 
-    def time_with_ring_up(self) -> float:
-        """Return the time in s of the best mixture, plus the time in which its modes ring up.
-
-        The information on the damping grows as ``1 - exp(-t / tau)`` at a constant amplitude.
-        """
-        times_s = self.mixture.times_s
-        needed_s = float(times_s.sum())
-        time_ratios = np.geomspace(1e-3, 1e3, 400)
-        information_gain = (
-            time_ratios
-            - 2.0 * (1.0 - np.exp(-time_ratios))
-            + 0.5 * (1.0 - np.exp(-2.0 * time_ratios))
-        )
-        for beam_mode in self.modes:
-            range_hz = 1.5 * _SINE_OFFSETS[-1] * beam_mode.damping_ratio * beam_mode.frequency_hz
-            at_mode_s = float(
-                times_s[np.abs(self.line_hz - beam_mode.frequency_hz) < range_hz].sum()
-            )
-            decay_s = -1.0 / beam_mode.at_rad_s.real
-            if at_mode_s > 0.01 * needed_s:
-                needed_s += (
-                    decay_s * float(np.interp(at_mode_s / decay_s, information_gain, time_ratios))
-                    - at_mode_s
-                )
-        return needed_s
+    def _mixture_time_s(self) -> float:
+        """Return the time in s of segments with the information of the best mixture."""
+        ring_up_s = time_with_ring_up(self.mixture.times_s, self.line_hz, self.modes)
+        return ring_up_s / _MIXTURE_EFFICIENCY
 
     def forecast(self, time_left_s: float) -> PrecisionForecast:
         """Return the forecast of the time in s until all target standard deviations are reached."""
@@ -735,172 +548,10 @@ class SegmentSearch:
         if impossible_reasons:
             return PrecisionForecast(inf, impossible_reasons[0])
         forecast_s = self.needed_s
-        if not forecast_s < _UNREACHABLE_S:
+        if not forecast_s < UNREACHABLE_S:
             return PrecisionForecast(inf, "the motor cannot excite the modes that determine it")
         if forecast_s <= time_left_s:
             return PrecisionForecast(forecast_s, "")
         return PrecisionForecast(
             forecast_s, f"about {forecast_s:.0f} s are needed, and {time_left_s:.0f} s are left"
         )
-
-
-# Best mixture of steady sines
-
-
-@dataclass(frozen=True, slots=True, eq=False)
-class SineMixture:
-    """Durations of steady sines that reach all target precisions soonest, ring-up neglected."""
-
-    times_s: Real
-    """Time in s for which each sine lasts; shape (m,)."""
-    weights: Real
-    """Combinations of the torque's derivatives by the parameters, the sum of whose squares is the
-    information that brings the targets closer; shape (q, k)."""
-
-
-def best_mixture(
-    fisher_information: Real,
-    estimate: BeamEstimate,
-    quantities: Quantities,
-    frequency_hz: Real,
-    angle_rad: Real,
-    target_relaxation: float = 1.0,
-) -> SineMixture:
-    """Return durations of steady sines that together reach all target precisions soonest.
-
-    Uses multiplicative steps, as `time_fractions`, with a multiplier for each quantity. By the
-    equivalence theorem all sines of the best mixture give the same information per second on the
-    returned combinations, and no other sine gives more (V. V. Fedorov, Theory of optimal
-    experiments, 1972).
-
-    Parameters
-    ----------
-    fisher_information
-        Information that the record contains already, shape (k, k).
-    estimate
-        Beam, damping and noise.
-    quantities
-        The q target quantities.
-    frequency_hz, angle_rad
-        Frequencies of the sines and amplitudes of the angle, each of shape (m,).
-    target_relaxation
-        Factor by which all standard deviations may exceed their targets.
-    """
-    information_rates = _information_rates(estimate, frequency_hz, angle_rad)
-    target_stds = np.array(
-        [inf if precision.impossible else precision.target_std for precision in quantities.items]
-    )
-    scaled_gradients = quantities.gradients / (target_relaxation * target_stds[:, None])
-    if not scaled_gradients.any():
-        return SineMixture(np.zeros(frequency_hz.size), scaled_gradients)
-    multipliers = np.ones(len(scaled_gradients))
-    times_s = np.full(frequency_hz.size, 1.0 / frequency_hz.size)
-    for _ in range(_MIXTURE_STEPS):
-        covariance = covariance_of(
-            fisher_information + np.tensordot(times_s, information_rates, axes=1), estimate
-        )
-        gain_directions = scaled_gradients @ covariance
-        relative_variances = np.einsum("qi,qi->q", gain_directions, scaled_gradients)
-        multipliers = multipliers * np.maximum(relative_variances, 1e-12) ** 0.5
-        multipliers /= max(float(multipliers.sum()), 1e-300)
-        gain_rates = np.einsum(
-            "q,qi,fij,qj->f", multipliers, gain_directions, information_rates, gain_directions
-        )
-        times_s = times_s * np.sqrt(
-            gain_rates / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
-        )
-        # Scale the total time towards the targets, until they are met or the time is too long.
-        times_s *= float(np.clip(np.sqrt(relative_variances.max()), 0.5, 2.0))
-        if times_s.sum() > _UNREACHABLE_S:
-            break
-    multiplier_scales = np.sqrt(
-        multipliers / max(float(times_s @ gain_rates / times_s.sum()), 1e-300)
-    )
-    return SineMixture(times_s, multiplier_scales[:, None] * gain_directions)
-
-
-def _information_rates(estimate: BeamEstimate, frequency_hz: Real, angle_rad: Real) -> Real:
-    """Return the Fisher information per second of each steady sine, shape (m, k, k)."""
-    kernels = whitened_kernels(estimate, 2j * pi * frequency_hz, 1.0) * (angle_rad / 2.0**0.5)
-    information_rates: Real = np.einsum("if,jf->fij", kernels, kernels.conj()).real
-    return information_rates
-
-
-def least_deviations(
-    fisher_information: Real,
-    estimate: BeamEstimate,
-    quantities: Quantities,
-    frequency_hz: Real,
-    angle_rad: Real,
-    duration_s: float,
-) -> Real:
-    """Return the smallest standard deviation that each quantity can have in a record.
-
-    For each quantity the mixture of sines is the best for this quantity alone.
-
-    Parameters
-    ----------
-    fisher_information, estimate, quantities, frequency_hz, angle_rad
-        As for `best_mixture`.
-    duration_s
-        Total duration of all sines in s.
-
-    Returns
-    -------
-    ndarray, shape (q,)
-        Lower bound of each standard deviation for a record of this duration.
-    """
-    information_rates = _information_rates(estimate, frequency_hz, angle_rad)
-    least_stds = np.empty(len(quantities.gradients))
-    for row, gradient in enumerate(quantities.gradients):
-        times_s = np.full(frequency_hz.size, duration_s / frequency_hz.size)
-        for _ in range(_MIXTURE_STEPS):
-            total_information = fisher_information + np.tensordot(
-                times_s, information_rates, axes=1
-            )
-            gain_direction = gradient @ covariance_of(total_information, estimate)
-            least_stds[row] = np.sqrt(max(float(gain_direction @ gradient), 0.0))
-            times_s = times_s * np.sqrt(
-                np.einsum("i,fij,j->f", gain_direction, information_rates, gain_direction)
-            )
-            times_s *= duration_s / max(float(times_s.sum()), 1e-300)
-    return least_stds
-
-
-def largest_factor(existing_motion: Real, added_motion: Real) -> float:
-    """Return the largest factor with which a motion can be added within the limits.
-
-    All quantities are fractions of their limits, so the sum must be between -1 and 1. If the
-    existing motion exceeds this range by itself, the sum may be as large, but no larger.
-
-    Parameters
-    ----------
-    existing_motion, added_motion
-        Quantities of the existing motion and of the added motion, shape (c, n).
-    """
-    unit_magnitude = np.abs(added_motion)
-    limit_margin = (
-        np.maximum(1.0, np.abs(existing_motion)) - np.sign(added_motion) * existing_motion
-    )
-    with np.errstate(divide="ignore", invalid="ignore"):
-        allowed_factor = np.where(
-            unit_magnitude > 1e-9 * unit_magnitude.max(), limit_margin / unit_magnitude, inf
-        )
-    return max(float(allowed_factor.min()), 0.0)
-
-
-def _describe_candidate(chosen_candidate: _SegmentCandidate) -> str:
-    """Return a text for the operator with modes, bands, duration and amplitudes of a segment."""
-    sorted_parts = sorted(chosen_candidate.parts, key=lambda part: part[0].middle_hz)
-    band_texts = [
-        f"{band.middle_hz - band.half_width_hz:.3g}–{band.middle_hz + band.half_width_hz:.3g}"
-        if band.half_width_hz
-        else f"{band.middle_hz:.4g}"
-        for band, _ in sorted_parts
-    ]
-    return (
-        f"mode{'s' if len(sorted_parts) > 1 else ''} "
-        f"{' + '.join(str(band.mode_number) for band, _ in sorted_parts)}, "
-        f"{' + '.join(band_texts)} Hz, {chosen_candidate.duration_s:g} s, "
-        f"{' + '.join(f'{amplitude:.2g}' for _, amplitude in sorted_parts)} rad"
-    )

@@ -7,26 +7,14 @@ all limits are linear in the accelerations, and Coulomb friction is subtracted f
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil, inf
-from pathlib import Path
-from typing import Annotated, Final, Protocol
+from typing import Final, Protocol
 
 import numpy as np
-from annotated_types import doc
 from numpy.typing import NDArray
 
-from rigd.excitation._options import RestS, RingDownS, documented
-from rigd.excitation._residual_vibration import predict_move_end
-from rigd.excitation._signals import (
-    LIMIT_FRACTION,
-    Excitation,
-    ExcitationError,
-    assemble_excitation,
-    lay_out_segments,
-    require_finite,
-    require_within_turn,
-)
+from rigd.excitation._signals import LIMIT_FRACTION, ExcitationError
 from rigd.excitation.moves import (
     ROBUST_BELOW_HZ,
     Braking,
@@ -37,7 +25,7 @@ from rigd.excitation.moves import (
     quintic,
     residual_vibration_map,
 )
-from rigd.identified_beam import MOVE, IdentifiedBeam, Use
+from rigd.identified_beam import IdentifiedBeam
 
 Real = NDArray[np.float64]
 Complex = NDArray[np.complexfloating]
@@ -57,12 +45,8 @@ _CONVERGED_LIMIT_FRACTION: Final = 0.93
 would exceed the limits."""
 _MAX_ROUNDS: Final = 14
 """Largest number of durations that the search tries."""
-_MAX_END_ANGLE_FRACTION: Final = 0.98
-"""Largest fraction of the angle limit at which a move may end; the remainder is for overshoot."""
 _MAX_BACKWARD_SPEED_FRACTION: Final = 0.01
 """Largest backward speed of a robust move, as a fraction of its mean speed."""
-_MIN_DISTANCE_RAD: Final = 1e-3
-"""Smallest distance of a move in rad."""
 _BRAKING_STARTS: Final = 16
 """Number of ticks along a reference from which braking is simulated."""
 _BRAKING_DURATIONS_S: Final = (0.02, 5.0)
@@ -578,119 +562,3 @@ def shortest_braking(plant: MovePlant, reference_rad: Real) -> Braking:
         f"The reference cannot be braked within {longest_s:g} s by motor.peak_torque_nm = "
         f"{plant.peak_torque_nm:g} N·m; lower its speed."
     )
-
-
-# Excitation
-
-
-class MoveRig(Protocol):
-    """Interface to a rig for which a move of the motor to another angle is planned."""
-
-    @property
-    def start_rad(self) -> float:
-        """Present angle of the motor from the rig's zero, in rad."""
-
-    def move_plant(self, path: str | Path, use: Use) -> MovePlant:
-        """Return the model of the rig for planning, with the beam of an analysis.
-
-        Parameters
-        ----------
-        path
-            Document of ``analyze --json`` with the beam; empty: the beam of the profile.
-        use
-            Purpose for which the beam is used.
-        """
-
-
-@documented
-def move(
-    *,
-    rate_hz: Annotated[float, doc("Ticks a second.")],
-    angle_rad: Annotated[float | None, doc("Final angle from the rig's zero.")] = None,
-    by_rad: Annotated[
-        float | None,
-        doc("Distance from the present angle, of either sign, instead of `angle_rad`."),
-    ] = None,
-    path: Annotated[
-        str | Path,
-        doc(
-            "JSON written by ``analyze --json`` with the beam for which the move is planned; "
-            "empty: the beam of the profile."
-        ),
-    ] = "",
-    robust: Annotated[
-        int,
-        doc(
-            "1: the move tolerates a 1 % frequency error and does not turn back, but takes "
-            "longer. 0: the move is the shortest."
-        ),
-    ] = 0,
-    rest_s: RestS = 1.0,
-    ring_down_s: RingDownS = 5.0,
-    rig: Annotated[MoveRig | None, doc("Rig that is moved.")] = None,
-) -> Excitation:
-    """Return the shortest move to another angle that leaves no vibration; the motor stays there.
-
-    Raises
-    ------
-    ExcitationError
-        If not exactly one angle is given, or the move would leave the limits.
-    IdentifiedBeamError
-        If the file is invalid, or has an effect that a move does not take into account.
-    """
-    if rig is None:
-        raise ExcitationError("A move is planned for a rig; run it with its profile.")
-    if (angle_rad is None) == (by_rad is None):
-        raise ExcitationError("Give either angle_rad or by_rad (rad): where to, or by how much.")
-    for option_name, value_rad in (("angle_rad", angle_rad), ("by_rad", by_rad)):
-        if value_rad is not None:
-            require_finite(option_name, value_rad, "rad")
-    if robust not in (0, 1):
-        raise ExcitationError(f"robust = {robust} is neither 0 nor 1; choose one.")
-    start_rad = rig.start_rad
-    target_rad = start_rad + by_rad if angle_rad is None else angle_rad  # type: ignore[operator]
-    require_within_turn("angle_rad" if by_rad is None else "by_rad", target_rad - start_rad)
-    rig_plant = rig.move_plant(path, MOVE)
-    farthest_rad = _MAX_END_ANGLE_FRACTION * rig_plant.angle_rad
-    if not abs(target_rad) <= farthest_rad:
-        raise ExcitationError(
-            f"The move would end at {target_rad:.4g} rad, and limits.angle_rad = "
-            f"{rig_plant.angle_rad:g} rad allows {farthest_rad:.4g} rad from the zero to either "
-            "side; choose at most "
-            f"that{'' if by_rad is None else _allowed_range(farthest_rad, start_rad)}."
-        )
-    distance_rad = target_rad - start_rad
-    if abs(distance_rad) < _MIN_DISTANCE_RAD:
-        raise ExcitationError(
-            f"The motor stands at {start_rad:.4g} rad already, and a move is of "
-            f"{_MIN_DISTANCE_RAD:g} rad at least; choose another angle."
-        )
-    planned_move = shortest_move(rig_plant, distance_rad, start_rad=start_rad, robust=bool(robust))
-    segment_ticks = lay_out_segments(rate_hz, rest_s, planned_move.duration_s, ring_down_s)
-    end = predict_move_end(rig_plant, planned_move.reference_rad, ring_down_s)
-    parameters: dict[str, float | int | str] = {
-        "angle_rad": target_rad,
-        "by_rad": distance_rad,
-        "file": Path(path).name if path else "",
-        "robust": robust,
-        "duration_s": planned_move.duration_s,
-        "rest_s": rest_s,
-        "ring_down_s": ring_down_s,
-        "limits_share": planned_move.limit_fraction,
-        "residual_nm": end.residual_nm,
-        "residual_floor_nm": end.floor_nm,
-        "frequency_residual_nm": planned_move.residual_nm,
-        "quintic_residual_nm": planned_move.quintic_residual_nm,
-    }
-    if end.arrival_s is not None:
-        parameters["arrival_s"] = end.arrival_s
-    excitation = assemble_excitation(
-        "move", parameters, rate_hz, segment_ticks, planned_move.reference_rad
-    )
-    return replace(excitation, stays=True, model=rig_plant.model)
-
-
-def _allowed_range(farthest_rad: float, start_rad: float) -> str:
-    """Return the end of a message that states the range of distances which a move may have."""
-    lowest_rad, highest_rad = -farthest_rad - start_rad, farthest_rad - start_rad
-    return f", that is by {lowest_rad:.4g} to {highest_rad:.4g} rad from {start_rad:.4g} rad"

@@ -16,8 +16,6 @@ from rigd.session.limits import MAX_SAMPLES
 from rigd.units import is_usable_size
 
 if TYPE_CHECKING:
-    from rigd.excitation._touch_passes import Approach
-    from rigd.excitation._until import PrecisionSearch
     from rigd.identified_beam import IdentifiedBeam
 
 FloatArray = NDArray[np.float64]
@@ -59,12 +57,10 @@ class Excitation:
     stays
         Whether the motor stays at the end of the reference. Otherwise it returns to the start
         angle.
-    approach
-        Reaction of the loop to a touch; None: the loop does not watch for touches.
-    search
-        Target precisions of a session that ends when they are reached; None: its end is planned.
     model
         Beam of an analysis for which the excitation was planned; None: the profile's beam.
+    motion
+        What the motor does in the sweep, as a clause for the operator; empty if the kind says it.
     """
 
     kind: str
@@ -73,17 +69,33 @@ class Excitation:
     reference_rad: FloatArray
     segments: Mapping[str, tuple[int, int]]
     stays: bool = False
-    approach: "Approach | None" = None
-    search: "PrecisionSearch | None" = None
     model: "IdentifiedBeam | None" = None
+    motion: str = ""
 
     @property
     def shows_modes(self) -> bool:
-        """Whether a record of the excitation can show the beam's modes.
+        """Whether a record of the excitation can show the beam's modes; that of a move cannot."""
+        return not self.stays
 
-        The record of a move or of a search for an obstacle cannot.
-        """
-        return not self.stays and self.approach is None
+    @property
+    def limits_force(self) -> bool:
+        """Whether a contact force ends the session, which the rig knows from the base shear."""
+        return False
+
+    @property
+    def planned_ticks(self) -> int | None:
+        """Number of ticks of the reference that are planned before the session; None: all."""
+        return None
+
+    @property
+    def ends_itself(self) -> bool:
+        """Whether the session itself plans its end."""
+        return self.planned_ticks is not None
+
+    @property
+    def later_tip_slope_rad(self) -> float:
+        """Largest slope of the beam's free end in what is planned during the session; 0: none."""
+        return 0.0
 
 
 def present_frequency_hz(excitation: Excitation, tick: int) -> float | None:
@@ -238,14 +250,22 @@ def assemble_excitation(
     segments: Mapping[str, tuple[int, int]],
     sweep_rad: FloatArray,
     *,
-    approach: "Approach | None" = None,
+    motion: str = "",
 ) -> Excitation:
     """Return an excitation with a sweep, shape (n,) in rad, between rest and ring-down."""
+    reference_rad = assemble_reference(segments, sweep_rad)
+    return Excitation(kind, parameters, rate_hz, reference_rad, segments, motion=motion)
+
+
+def assemble_reference(
+    segments: Mapping[str, tuple[int, int]], sweep_rad: FloatArray
+) -> FloatArray:
+    """Return the reference in rad at each tick of rest, sweep and ring-down, read-only."""
     reference_rad = np.zeros(segments["ring_down"][1])
     reference_rad[slice(*segments["sweep"])] = sweep_rad
     reference_rad[slice(*segments["ring_down"])] = sweep_rad[-1]
     reference_rad.flags.writeable = False
-    return Excitation(kind, parameters, rate_hz, reference_rad, segments, approach=approach)
+    return reference_rad
 
 
 # Signals
@@ -337,7 +357,12 @@ def chirp(
         "taper_s": taper_s,
         **({"there_and_back": 1} if there_and_back else {}),
     }
-    return assemble_excitation("chirp", parameters, rate_hz, segment_ticks, sweep_rad)
+    direction_text = " down" if stop_hz < start_hz else ""
+    return_text = f" and back, {duration_s:g} s each way" if there_and_back else ""
+    motion = f"sweeps{direction_text} from {start_hz:g} to {stop_hz:g} Hz{return_text}"
+    return assemble_excitation(
+        "chirp", parameters, rate_hz, segment_ticks, sweep_rad, motion=motion
+    )
 
 
 @documented

@@ -6,7 +6,7 @@ the motor brakes, holds, and returns to the beginning of the pass. A session the
 number of ticks with and without a touch. Neither way excites a vibration.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Annotated
@@ -15,12 +15,13 @@ import numpy as np
 from annotated_types import doc
 from numpy.typing import NDArray
 
+from rigd.excitation._move import MoveRig
 from rigd.excitation._options import RestS, RingDownS, documented
-from rigd.excitation._shortest_move import MoveRig, shortest_braking
+from rigd.excitation._shortest_move import shortest_braking
 from rigd.excitation._signals import (
     Excitation,
     ExcitationError,
-    assemble_excitation,
+    assemble_reference,
     check_ticks,
     lay_out_segments,
     require_finite,
@@ -66,6 +67,29 @@ class Approach:
     """Contact force in N above which the torque is switched off."""
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TouchExcitation(Excitation):
+    """Excitation during which the loop watches for touches.
+
+    Attributes
+    ----------
+    approach
+        Passes of the search, and the reaction to a touch.
+    """
+
+    approach: Approach
+
+    @property
+    def shows_modes(self) -> bool:
+        """Whether a record of the excitation can show the beam's modes: it cannot."""
+        return False
+
+    @property
+    def limits_force(self) -> bool:
+        """Whether a contact force ends the session: it does."""
+        return True
+
+
 @documented
 def touch(
     *,
@@ -99,7 +123,7 @@ def touch(
         ),
     ] = "",
     rig: Annotated[MoveRig | None, doc("Rig that is moved.")] = None,
-) -> Excitation:
+) -> TouchExcitation:
     """Return an excitation that moves the beam until it touches an obstacle, and then back.
 
     Raises
@@ -188,11 +212,20 @@ def touch(
         "by_rad": by_rad,
         "braking_s": braking.duration_s,
     }
-    sweep_rad = np.tile(single_pass, passes)
-    excitation = assemble_excitation(
-        "touch", parameters, rate_hz, segment_ticks, sweep_rad, approach=approach
+    return TouchExcitation(
+        kind="touch",
+        parameters=parameters,
+        rate_hz=rate_hz,
+        reference_rad=assemble_reference(segment_ticks, np.tile(single_pass, passes)),
+        segments=segment_ticks,
+        model=move_plant.model,
+        motion=(
+            f"goes to {angle_rad:.4g} rad at {speed_rad_s:g} rad/s"
+            f"{f', {passes} times' if passes > 1 else ''}, brakes within "
+            f"{1e3 * braking.duration_s:.0f} ms of a touch (beam of {path or 'profile'})"
+        ),
+        approach=approach,
     )
-    return replace(excitation, model=move_plant.model)
 
 
 def reference_after_touch(

@@ -105,6 +105,29 @@ class PrecisionSearch:
     uniformity_percent: float | None = None
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PrecisionExcitation(Excitation):
+    """Excitation that is planned during the session, until a precision is reached.
+
+    Attributes
+    ----------
+    search
+        Target standard deviations, and the planned quick sweep.
+    """
+
+    search: PrecisionSearch
+
+    @property
+    def planned_ticks(self) -> int:
+        """Number of ticks of the reference that are planned before the session."""
+        return self.search.planned_ticks
+
+    @property
+    def later_tip_slope_rad(self) -> float:
+        """Largest slope of the beam's free end in the segments that the session plans."""
+        return self.search.tip_slope_rad
+
+
 @documented
 def until(
     *,
@@ -150,7 +173,7 @@ def until(
             "frequencies."
         ),
     ] = None,
-) -> Excitation:
+) -> PrecisionExcitation:
     """Return the excitation of a session until target standard deviations are reached.
 
     It begins with a quick scan of all modes. The segments after it are planned during the session:
@@ -213,7 +236,8 @@ def until(
     reference_rad = np.zeros(record_ticks)
     reference_rad[: scan_rad.size] = scan_rad
     reference_rad.flags.writeable = False
-    return Excitation(
+    targets_text = ", ".join(map(str, requested_targets))
+    return PrecisionExcitation(
         kind="until",
         parameters={
             "targets": targets,
@@ -234,6 +258,11 @@ def until(
             "scan": (scan_begin, end),
             "sweep": (scan_begin, record_ticks),
         },
+        motion=(
+            f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_s:g} s at up to {amplitude_rad:.3g} "
+            f"rad, then chooses the most informative excitation until {targets_text} (standard "
+            "deviation)"
+        ),
         search=PrecisionSearch(
             requested_targets,
             planned_ticks,

@@ -31,10 +31,10 @@ from rigd.excitation._segment_search import (
     SHORTEST_S,
     Segment,
     SegmentSearch,
-    least_deviations,
 )
 from rigd.excitation._shortest_move import MovePlant
 from rigd.excitation._signals import ExcitationError
+from rigd.excitation._sine_mixture import least_deviations
 from rigd.excitation.targets import MODE_QUANTITIES, Precision, Quantities, Target
 
 Real = NDArray[np.float64]
@@ -214,7 +214,8 @@ def geometry_floors(
             np.zeros((len(beam_estimate.names), len(beam_estimate.names))),
             beam_estimate,
             Quantities.linearised(targets, beam_estimate),
-            *segment_search.steady_sines(),
+            segment_search.line_hz,
+            segment_search.line_amplitudes_rad,
             duration_s,
         )
         for beam_estimate in (tolerant_estimate, estimate)

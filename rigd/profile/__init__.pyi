@@ -7,8 +7,7 @@ from ._locations import specimen_files as specimen_files
 from ._locations import user_folder as user_folder
 from ._schema import Profile as Profile
 from ._schema import RealtimeSettings as RealtimeSettings
-from ._schema import check_controller_plugin as check_controller_plugin
-from ._schema import check_device_plugin as check_device_plugin
+from ._schema import check_part_plugin as check_part_plugin
 from ._schema import section_text as section_text
 from ._specimen import load_specimen as load_specimen
 from ._specimen import with_specimen as with_specimen

@@ -15,10 +15,10 @@ from pydantic_core import ErrorDetails
 from rigd.beam import Beam, undamped_frequencies_rad_s
 from rigd.control import ControlDesignError, design_pid
 from rigd.control.declaration import ControllerKind
-from rigd.control.kinds import controller_owner, find_controller, known_controllers
+from rigd.control.kinds import CONTROLLERS
 from rigd.devices import MAY_BE_UNKNOWN
 from rigd.devices.declaration import DeviceKind
-from rigd.devices.kinds import find_owner, selected_kinds
+from rigd.devices.kinds import DEVICES, selected_kinds
 from rigd.devices.obstacles import (
     INCOMPATIBLE_WITH_FORCES,
     INCOMPATIBLE_WITH_OBSTACLES,
@@ -452,11 +452,11 @@ def wiring_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:
         yield from _acquisition_contradictions(profile_values)
     for kind in _selected_kinds(profile_values):
         if kind.contradictions is not None:
-            with plugin_errors(find_owner(kind.name)):
+            with plugin_errors(DEVICES.owner(kind.name)):
                 yield from kind.contradictions(profile_values)
     controller = _selected_controller(profile_values)
     if controller is not None and controller.contradictions is not None:
-        with plugin_errors(controller_owner(controller.name)):
+        with plugin_errors(CONTROLLERS.owner(controller.name)):
             yield from controller.contradictions(profile_values)
     yield from _delay_contradictions(profile_values)
 
@@ -469,7 +469,7 @@ def _section_problems(profile_values: Mapping[str, Any]) -> Iterator[str]:
     if controller is None:
         yield (
             f'control.controller = "{controller_name}" is not known; choose '
-            f"{_quoted_choice(tuple(known_controllers()))}."
+            f"{_quoted_choice(tuple(CONTROLLERS.names()))}."
         )
     controller_sections = () if controller is None else controller.required_sections
     required_sections = {
@@ -511,7 +511,7 @@ def _selected_kinds(profile_values: Mapping[str, Any]) -> tuple[DeviceKind, ...]
 
 def _selected_controller(profile_values: Mapping[str, Any]) -> ControllerKind | None:
     """Return the kind of controller that a profile names, or None if it is not known."""
-    return find_controller(profile_values["control.controller"])
+    return CONTROLLERS.get(profile_values["control.controller"])
 
 
 def _acquisition_contradictions(profile_values: Mapping[str, Any]) -> Iterator[str]:

@@ -17,9 +17,9 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, create_model
 
 from rigd import documents
 from rigd.control import SHIPPED_CONTROLLER
-from rigd.control.kinds import controller_owner, load_controller
+from rigd.control.kinds import CONTROLLERS
 from rigd.devices import MAY_BE_UNKNOWN
-from rigd.devices.kinds import find_kind, find_owner
+from rigd.devices.kinds import DEVICES
 from rigd.devices.parameters import RigParameters
 from rigd.documents import DocumentError
 from rigd.errors import UserError
@@ -187,7 +187,7 @@ def _add_sections_of_devices(document: Mapping[str, Any], profile_path: Path) ->
     added_sections = []
     for name in dict.fromkeys(filter(lambda value: isinstance(value, str), names)):
         try:
-            plugin, kind = find_owner(name), find_kind(name)
+            plugin, kind = DEVICES.owner(name), DEVICES.get(name)
             if plugin is not None and kind is not None:
                 add_section(kind, plugin)
                 if kind.settings is not None:
@@ -210,9 +210,9 @@ def _add_section_of_controller(document: Mapping[str, Any], profile_path: Path) 
     if not isinstance(name, str) or name == SHIPPED_CONTROLLER:
         return
     try:
-        owner = controller_owner(name)
+        owner = CONTROLLERS.owner(name)
         if owner is not None:
-            add_section(load_controller(owner), owner)
+            add_section(CONTROLLERS.load(owner), owner)
     except PluginError as error:
         raise ProfileError(f'{profile_path}: control.controller = "{name}": {error}') from error
 

@@ -12,10 +12,10 @@ from annotated_types import DocInfo, Ge, Gt, Le, MinLen
 from rigd.beam import Beam, Damping, Plant
 from rigd.control import SHIPPED_CONTROLLER, ControlSettings, LoopModel
 from rigd.control.declaration import ControlledRig, ControllerKind
-from rigd.control.kinds import find_controller, linear_controller, load_controller
+from rigd.control.kinds import CONTROLLERS, linear_controller
 from rigd.devices import describe_unknown_values
 from rigd.devices.declaration import DeviceKind
-from rigd.devices.kinds import load_kind, shipped_kinds
+from rigd.devices.kinds import DEVICES
 from rigd.devices.parameters import (
     OPTIONAL,
     Acquisition,
@@ -176,7 +176,7 @@ _ADDED_SECTIONS: dict[str, str] = {}
 
 def optional_sections() -> tuple[str, ...]:
     """Return the names of the sections that only some devices or controllers require."""
-    shipped = [name for kind in shipped_kinds() for name in kind.required_sections]
+    shipped = [name for kind in DEVICES.built_in.values() for name in kind.required_sections]
     return tuple(dict.fromkeys([*shipped, *sorted(_ADDED_SECTIONS)]))
 
 
@@ -236,28 +236,16 @@ def _settings_problem(settings: type) -> str:
     return ""
 
 
-def check_device_plugin(plugin: Plugin) -> str:
-    """Import the kind of device that an installed package adds, and return its summary.
+def check_part_plugin(plugin: Plugin) -> str:
+    """Import the device or controller that an installed package adds, and return its summary.
 
     Raises
     ------
     PluginError
         If it cannot be used.
     """
-    kind = load_kind(plugin)
-    add_section(kind, plugin)
-    return kind.summary
-
-
-def check_controller_plugin(plugin: Plugin) -> str:
-    """Import the controller that an installed package adds, and return its summary.
-
-    Raises
-    ------
-    PluginError
-        If it cannot be used.
-    """
-    kind = load_controller(plugin)
+    is_device = plugin.group == DEVICES.group
+    kind = DEVICES.load(plugin) if is_device else CONTROLLERS.load(plugin)
     add_section(kind, plugin)
     return kind.summary
 
@@ -466,7 +454,7 @@ class Profile:
         Own code of a package need not state matrices.
         """
         name = self.control.controller
-        kind = None if name == SHIPPED_CONTROLLER else find_controller(name)
+        kind = None if name == SHIPPED_CONTROLLER else CONTROLLERS.get(name)
         return kind is None or kind.linear is not None
 
     def loop_model(self) -> LoopModel:
@@ -485,7 +473,7 @@ class Profile:
         controller = linear_controller(rig)
         if controller is None:
             return rig.loop
-        kind = find_controller(self.control.controller)
+        kind = CONTROLLERS.get(self.control.controller)
         return replace(
             rig.loop,
             controller=controller,

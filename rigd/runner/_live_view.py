@@ -152,7 +152,7 @@ def _fit_modes(order: Order) -> int | None:
     Returns None if the session makes no fits.
     """
     excitation = order.excitation
-    if excitation.search is None and not order.watch_fit:
+    if not order.makes_fits:
         return None
     sweep_limits = (
         excitation.parameters.get(frequency_key, _DEFAULT_FIT_BAND_HZ)

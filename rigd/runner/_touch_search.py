@@ -15,7 +15,7 @@ from rigd.devices.parameters import RigParameters
 from rigd.engine.messages import TouchJob, TouchOrder, TouchReport
 from rigd.engine.shared_state import LogEvent
 from rigd.engine.workers import TOUCH
-from rigd.excitation import Excitation
+from rigd.excitation import Excitation, TouchExcitation
 from rigd.profile import Profile
 from rigd.runner._session_worker import SessionWorker
 from rigd.session.touches import packed_touches, touch_line
@@ -43,7 +43,7 @@ class TouchSearch:
 
 def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None:
     """Return the settings of the search for an obstacle, or None if there is no search."""
-    if excitation.approach is None:
+    if not isinstance(excitation, TouchExcitation):
         return None
     from rigd.touch import DetectorSettings, TouchModel, watched_beam
 

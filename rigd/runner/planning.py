@@ -329,7 +329,7 @@ def predict_session(
             f"{violation_text}: it will be clipped and flagged."
             for violation_text in torque_violations
         ]
-    if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
+    if excitation.limits_force and not any(profile.rig.sensor.shear_projection):
         warnings.append(_UNKNOWN_FORCE_WARNING)
     return Plan(
         prediction,
@@ -434,12 +434,12 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
     """
     return {
         "excitation": excitation.kind,
-        "sweep": _motion_text(excitation),
+        "sweep": excitation.motion,
         "profile": profile.name,
         "parameters": dict(excitation.parameters),
         "segments": {name: list(end_text) for name, end_text in excitation.segments.items()},
         "record_s": excitation.reference_rad.size / profile.rig.rate_hz,
-        "ends_itself": excitation.search is not None,
+        "ends_itself": excitation.ends_itself,
         **asdict(plan.prediction),
         "tip": tip_document(plan.prediction.tip, profile.rig.beam),
         "limits": {
@@ -463,94 +463,6 @@ def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[
 def _has_amplitude(kind: str) -> bool:
     """Return whether a kind of excitation has a parameter ``amplitude_rad``."""
     return "amplitude_rad" in inspect.signature(KINDS[kind]).parameters
-
-
-def _motion_text(excitation: Excitation) -> str:
-    """Return text that describes the sweep of a chirp, or the path of a move or of a search.
-
-    It is empty for other excitations.
-    """
-    if excitation.kind == "move":
-        return _move_text(excitation.parameters)
-    if excitation.kind == "touch":
-        return _obstacle_search_text(excitation.parameters)
-    if excitation.search is not None:
-        return _precision_search_text(excitation)
-    if excitation.kind != "chirp":
-        return ""
-    start_hz, stop_hz = (float(excitation.parameters[key]) for key in ("start_hz", "stop_hz"))
-    direction_text = " down" if stop_hz < start_hz else ""
-    return_text = ""
-    if excitation.parameters.get("there_and_back"):
-        return_text = f" and back, {float(excitation.parameters['duration_s']):g} s each way"
-    return f"sweeps{direction_text} from {start_hz:g} to {stop_hz:g} Hz{return_text}"
-
-
-def _move_text(parameters: Mapping[str, float | int | str]) -> str:
-    """Return text with target angle, duration and predicted residual vibration of a move."""
-    (
-        move_rad,
-        target_angle_rad,
-        duration_s,
-        residual_fraction,
-        residual_nm,
-        sensor_floor_nm,
-        detuned_residual_nm,
-        quintic_nm,
-    ) = (
-        float(parameters[parameter_name])
-        for parameter_name in (
-            *("by_rad", "angle_rad", "duration_s", "limits_share", "residual_nm"),
-            *("residual_floor_nm", "frequency_residual_nm", "quintic_residual_nm"),
-        )
-    )
-    arrival_text = "more than 1 s after that"
-    if "arrival_s" in parameters:
-        arrival_text = f"after {1e3 * float(parameters['arrival_s']):.0f} ms"
-    residual_text = f"{1e3 * residual_nm:.2g} mN·m"
-    if residual_nm < sensor_floor_nm:
-        residual_text = f"below what the sensor shows ({1e3 * sensor_floor_nm:.2g} mN·m)"
-    if detuned_residual_nm > max(residual_nm, sensor_floor_nm):
-        residual_text += (
-            f", {1e3 * detuned_residual_nm:.2g} mN·m if the beam's frequencies are wrong by their "
-            "uncertainty"
-        )
-    return (
-        f"moves by {move_rad:.4g} rad to {target_angle_rad:.4g} rad in {1e3 * duration_s:.0f} "
-        "ms, the angle "
-        f"within 1 mrad {arrival_text} ({100 * residual_fraction:.0f} % of the limits); "
-        "vibration left "
-        f"{residual_text}; a quintic of the same time leaves {1e3 * quintic_nm:.3g} mN·m (beam of "
-        f"{parameters['file'] or 'profile'})"
-    )
-
-
-def _obstacle_search_text(parameters: Mapping[str, float | int | str]) -> str:
-    """Return text with the target angle and speed of a search for an obstacle."""
-    pass_count = int(parameters["passes"])
-    return (
-        f"goes to {float(parameters['angle_rad']):.4g} rad at {parameters['speed_rad_s']:g} rad/s"
-        f"{f', {pass_count} times' if pass_count > 1 else ''}, brakes within "
-        f"{1e3 * float(parameters['braking_s']):.0f} ms of a touch (beam of "
-        f"{parameters['file'] or 'profile'})"
-    )
-
-
-def _precision_search_text(excitation: Excitation) -> str:
-    """Return text with the first chirp and the requested precision of an excitation ``until``."""
-    assert excitation.search is not None
-    start_hz, stop_hz, scan_duration_s, amplitude_rad = (
-        float(excitation.parameters[parameter_name])
-        for parameter_name in ("start_hz", "stop_hz", "scan_s", "amplitude_rad")
-    )
-    targets_text = ", ".join(
-        str(precision_target) for precision_target in excitation.search.targets
-    )
-    return (
-        f"scans {start_hz:g} to {stop_hz:g} Hz in {scan_duration_s:g} s at up to "
-        f"{amplitude_rad:.3g} rad, "
-        f"then chooses the most informative excitation until {targets_text} (standard deviation)"
-    )
 
 
 def predict(closed_loop: ClosedLoop, excitation: Excitation) -> SessionPrediction:
@@ -629,8 +541,9 @@ def predicted_metadata(
     fixed_peaks, clippable_peaks = _limited_peaks(profile, predicted)
     metadata = {}
     tip_slope = _limited_tip_slope(profile, predicted)
-    if tip_slope is not None and excitation.search is not None:
-        tip_slope = replace(tip_slope, value=max(tip_slope.value, excitation.search.tip_slope_rad))
+    if tip_slope is not None:
+        largest_rad = max(tip_slope.value, excitation.later_tip_slope_rad)
+        tip_slope = replace(tip_slope, value=largest_rad)
     for limited_peak in (
         *fixed_peaks,
         *clippable_peaks,

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from rigd import __version__
 from rigd.checks import FailedCheck
-from rigd.control.kinds import controller_owner
+from rigd.control.kinds import CONTROLLERS
 from rigd.devices import (
     ActuationTarget,
     actuation_target,
@@ -27,12 +27,12 @@ from rigd.devices import (
     describe_actuation_target,
     simulated_differently,
 )
-from rigd.devices.kinds import find_kind, find_owner
+from rigd.devices.kinds import DEVICES
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
 from rigd.engine.messages import Connected, Ending, FileHeader
-from rigd.excitation import Excitation, find_excitation
+from rigd.excitation import Excitation, PrecisionExcitation, PrecisionSearch, find_excitation
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
 from rigd.profile import Profile, load_profile
@@ -75,11 +75,22 @@ class Order:
     touch: TouchSearch | None = None
     """Settings of the search for an obstacle, or None for a session without a search."""
     watch_fit: bool = False
-    """Whether the record is fitted repeatedly during the session."""
+    """Whether the record is fitted repeatedly, even if the end of the session is planned."""
     seed: int | None = None
     """Seed of a simulated rig's noise, or None for a random seed."""
     accepted: tuple[FailedCheck, ...] = ()
     """Failed checks of the profile that the operator accepted."""
+
+    @property
+    def search(self) -> PrecisionSearch | None:
+        """Precision at which the session ends, or None if its end is planned."""
+        excitation = self.excitation
+        return excitation.search if isinstance(excitation, PrecisionExcitation) else None
+
+    @property
+    def makes_fits(self) -> bool:
+        """Whether the record is fitted during the session."""
+        return self.watch_fit or self.excitation.ends_itself
 
 
 def load_rig(
@@ -477,7 +488,7 @@ def _excitation_metadata(kind: str) -> dict[str, str]:
 
 def _controller_metadata(profile: Profile) -> dict[str, str]:
     """Return the controller that a package adds and the package; empty for the shipped one."""
-    owner = controller_owner(profile.control.controller)
+    owner = CONTROLLERS.owner(profile.control.controller)
     return {} if owner is None else {"controller": owner.name, "controller_package": owner.label}
 
 
@@ -485,7 +496,7 @@ def _device_metadata(rig: RigParameters) -> dict[str, str]:
     """Return the metadata that the kinds of the devices declare, and the packages that add them."""
     metadata: dict[str, str] = {}
     for role, name in (("drive", rig.devices.drive), ("sensor", rig.devices.sensor)):
-        kind, owner = find_kind(name), find_owner(name)
+        kind, owner = DEVICES.get(name), DEVICES.owner(name)
         if owner is not None:
             metadata[f"{role}_package"] = owner.label
         if kind is not None and kind.metadata is not None:

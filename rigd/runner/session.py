@@ -289,12 +289,12 @@ class SessionRun:
 
     def _run(self) -> RunResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
-        process_group, precision_search = self._group, self._order.excitation.search
+        process_group, excitation = self._group, self._order.excitation
         try:
             reference_spec = write_reference(
                 process_group.channels.reference_fd,
-                self._order.excitation.reference_rad,
-                None if precision_search is None else precision_search.planned_ticks,
+                excitation.reference_rad,
+                excitation.planned_ticks,
             )
         except OSError as error:
             raise SessionFailedError(
@@ -309,12 +309,12 @@ class SessionRun:
                 process_group, session_order.touch, profile.rig.rate_hz, realtime_settings
             )
             self._touches.await_ready(self._report_and_check_stop)
-        if precision_search is not None or session_order.watch_fit:
+        if session_order.makes_fits:
             self._fit = FitSupervisor(
-                process_group, profile, reference_spec, precision_search, realtime_settings
+                process_group, profile, reference_spec, session_order.search, realtime_settings
             )
             failure_reason = self._fit.await_ready(self._report_and_check_stop)
-            if failure_reason and precision_search is not None:
+            if failure_reason and excitation.ends_itself:
                 raise SessionFailedError(failure_reason)
         self._open_file()
         session_order = self._order

@@ -118,7 +118,7 @@ def test_clipping_is_found_in_all_samples(
 
 
 def test_a_record_that_no_analysis_has_room_for_names_the_remedies(paper_file, monkeypatch):
-    monkeypatch.setattr("analysis.record_signals.MAX_DECIMATED_SAMPLES", 16_000)
+    monkeypatch.setattr("analysis.signal_decimation.MAX_DECIMATED_SAMPLES", 16_000)
     with pytest.raises(RecordError, match=r"16\d\d\d samples.*--from, --to\) or lower --band"):
         load_record(paper_file, longest_samples=LONGEST)
     assert load_record(paper_file, highest_hz=20.0, longest_samples=LONGEST).rate_hz == 50.0

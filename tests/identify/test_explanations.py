@@ -13,7 +13,8 @@ from cauchy_residues import modal_constants
 from analysis.identify import ModalEstimate, ModalModel
 from analysis.identify._explanations import explanations, finding
 from analysis.identify._step_in_time import StiffnessStep
-from analysis.identify.uniform_beam import tolerant_estimate, uniform_beam_test
+from analysis.identify.beam_uniformity import uniform_beam_test
+from analysis.identify.tolerant_estimate import tolerant_estimate
 from rigd.beam import Beam, Damping, Plant
 
 LINK = Beam(length_m=0.98, density_kg_per_m=4.7e-3, bending_stiffness_n_m2=0.090275)

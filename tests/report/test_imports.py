@@ -40,7 +40,7 @@ def test_text_json_figures_and_rrd_need_no_pages(names):
     assert not modules.intersection(PAGES)
 
 
-MOST = 32  # two of them hold what reading a long record in blocks shares with a short one
+MOST = 30
 ESTIMATORS = ("analysis.identify", "analysis.paper", "analysis.decimation")
 ANALYZE = """
 import sys

@@ -1,4 +1,4 @@
-"""Signals of a record: at the full rate, or decimated block by block while the file is read.
+"""Signals of a long record, decimated block by block while its file is read.
 
 A fit to a band of 50 Hz needs 125 samples per second, and the signals of a long record at their
 full rate would fill the memory. They therefore pass a linear-phase low-pass filter in blocks.
@@ -12,7 +12,6 @@ whose filter window contains it.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
@@ -26,173 +25,22 @@ from analysis.decimation import (
 )
 from analysis.models import LARGEST_FRACTION_OF_RATE
 from analysis.record_checks import RecordError, check_finite, check_sensor
+from analysis.record_ticks import SIGNAL_FIELDS, ExtremeCount, RecordSignals, samples_on_grid
 
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.record_ticks import TickGrid
 
-LONGEST_FULL_RATE_SAMPLES: Final = 720_000
-"""Maximum number of samples of a record that is analysed at its full rate: 12 minutes at 1 kHz,
-which take 0.5 GB of memory. The signals of a longer record are decimated while they are read."""
-
 MAX_DECIMATED_SAMPLES: Final = 1_000_000
 """Maximum number of samples of a long record after decimation, with which an analysis takes 2 GB of
 memory. An hour has 450 000 for a band of 50 Hz."""
-
-SIGNAL_FIELDS: Final = ("angle_reference_rad", "angle_rad", "coupling_torque_nm")
-"""Fields of a sample that are filtered, in the order of the rows of `RecordSignals.values`."""
 
 _BLOCK_TICKS: Final = 1 << 16
 """Number of ticks after which a block is filtered."""
 
 _LONGEST_FILLED_S: Final = 1.0
 """Longest gap in seconds whose interpolation does not depend on where a block begins."""
-
-
-@dataclass(frozen=True, slots=True)
-class TorqueExtreme:
-    """Largest or smallest measured torque, and how often it was measured.
-
-    Attributes
-    ----------
-    limit_nm : float
-        Torque.
-    values : int
-        Number of samples with exactly this torque.
-    repeated : int
-        Number of these samples that are next to another one.
-    """
-
-    limit_nm: float
-    values: int
-    repeated: int
-
-
-class _ExtremeCount:
-    """Count of the samples at the extreme of a torque that arrives in blocks; NaN is unknown."""
-
-    def __init__(self, sign: int) -> None:
-        self._sign = sign
-        self._limit_nm = -np.inf
-        self._values = self._repeated = 0
-        self._last_nm = np.full(2, np.nan)
-
-    def add(self, torque_nm: NDArray[np.float64]) -> None:
-        """Include the next values."""
-        signed_nm = np.concatenate([self._last_nm, self._sign * torque_nm])
-        largest_nm = float(np.max(signed_nm[2:], initial=-np.inf, where=~np.isnan(signed_nm[2:])))
-        if largest_nm > self._limit_nm:
-            self._limit_nm, self._values, self._repeated = largest_nm, 0, 0
-        is_at_limit = signed_nm == self._limit_nm
-        follows_another = is_at_limit[2:] & is_at_limit[1:-1]
-        self._values += int(np.count_nonzero(is_at_limit[2:]))
-        # The first of a run of such values counts when the second arrives.
-        self._repeated += int(np.count_nonzero(follows_another))
-        self._repeated += int(np.count_nonzero(follows_another & ~is_at_limit[:-2]))
-        self._last_nm = signed_nm[-2:]
-
-    def result(self) -> TorqueExtreme:
-        """Return the extreme of all values."""
-        return TorqueExtreme(self._sign * self._limit_nm, self._values, self._repeated)
-
-
-def torque_extremes(torque_nm: NDArray[np.float64]) -> tuple[TorqueExtreme, ...]:
-    """Return the largest and the smallest value of a torque in N·m; NaN is unknown."""
-    counts = (_ExtremeCount(1), _ExtremeCount(-1))
-    for count in counts:
-        count.add(torque_nm)
-    return tuple(count.result() for count in counts)
-
-
-@dataclass(frozen=True, slots=True)
-class RecordSignals:
-    """Signals of a record, with masks of their known values.
-
-    Attributes
-    ----------
-    values : ndarray, shape (3, n)
-        Reference and measured angle in rad, and coupling torque in N·m.
-    angle_known, torque_known : ndarray of bool, shape (n,)
-        Whether angle and torque were measured at all ticks on which a sample depends.
-    first_tick : int
-        Tick of the first sample, relative to the first tick of the record.
-    factor : int
-        Number of ticks from one sample to the next.
-    torque_extremes : tuple of TorqueExtreme
-        Largest and smallest measured torque before the signals were decimated; empty if they were
-        not.
-    """
-
-    values: NDArray[np.float64]
-    angle_known: NDArray[np.bool_]
-    torque_known: NDArray[np.bool_]
-    first_tick: int = 0
-    factor: int = 1
-    torque_extremes: tuple[TorqueExtreme, ...] = ()
-
-    def samples_in(self, ticks: slice) -> slice:
-        """Return the range of the samples inside a range of ticks of the record.
-
-        Parameters
-        ----------
-        ticks : slice
-            First tick, and the tick after the last, relative to the first tick of the record.
-        """
-        start, stop = (
-            min(max(-((self.first_tick - tick) // self.factor), 0), self.values.shape[1])
-            for tick in (ticks.start, ticks.stop)
-        )
-        return slice(start, stop)
-
-
-class FullRateSignals:
-    """Signals of a record at its full rate, with linear interpolation of unknown values.
-
-    Parameters
-    ----------
-    grid : TickGrid
-        Ticks of the record.
-    """
-
-    def __init__(self, grid: TickGrid) -> None:
-        self.grid = grid
-        self._values = np.zeros((len(SIGNAL_FIELDS), grid.count))
-
-    def add(self, samples: NDArray[np.void]) -> None:
-        """Include samples of the record, as for `SignalDecimation`."""
-        samples, ticks = _inside(self.grid, samples)
-        for row, field_name in enumerate(SIGNAL_FIELDS):
-            check_finite(self.grid.session.path, field_name, samples[field_name], samples["tick"])
-            self._values[row, ticks] = samples[field_name]
-
-    def finish(self) -> RecordSignals:
-        """Return the signals after the last sample was added.
-
-        Raises
-        ------
-        RecordError
-            The torque is constant.
-        """
-        grid, is_missing = self.grid, self.grid.is_missing
-        check_sensor(grid.session.path, self._values[2, ~is_missing])
-        is_angle_unknown = grid.is_angle_unknown
-        for row, is_unknown in enumerate((is_missing, is_angle_unknown, grid.is_torque_unknown)):
-            if is_unknown.any() and not is_unknown.all():
-                known_indices = np.flatnonzero(~is_unknown)
-                self._values[row, is_unknown] = np.interp(
-                    np.flatnonzero(is_unknown), known_indices, self._values[row, known_indices]
-                )
-        return RecordSignals(self._values, ~is_angle_unknown, grid.is_torque_measured)
-
-
-def _inside(
-    grid: TickGrid, samples: NDArray[np.void]
-) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the samples on a grid, and their ticks relative to its first."""
-    ticks = samples["tick"].astype(np.int64) - grid.first_tick
-    is_inside = (ticks >= 0) & (ticks < grid.count)
-    return (samples, ticks) if is_inside.all() else (samples[is_inside], ticks[is_inside])
 
 
 class SignalDecimation:
@@ -225,7 +73,7 @@ class SignalDecimation:
         self._buffer = np.zeros((len(SIGNAL_FIELDS), _BLOCK_TICKS + 2 * self._margin_ticks))
         self._buffer_tick = self._end_tick = 0  # ticks of the buffer and after its last sample
         self._torque_range_nm = (np.inf, -np.inf)
-        self._extremes = (_ExtremeCount(1), _ExtremeCount(-1))
+        self._extremes = (ExtremeCount(1), ExtremeCount(-1))
 
     @property
     def factor(self) -> int:
@@ -257,7 +105,7 @@ class SignalDecimation:
         RecordError
             Values are not finite.
         """
-        samples, ticks = _inside(self.grid, samples)
+        samples, ticks = samples_on_grid(self.grid, samples)
         for start in range(0, len(samples), _BLOCK_TICKS // 4):
             block = slice(start, start + _BLOCK_TICKS // 4)
             self._add_block(samples[block], ticks[block])
@@ -352,31 +200,6 @@ class SignalDecimation:
                     gap_samples = max((gap_end - gap_start) // factor, 2)
                     angle_known[max(first_sample, 0) : max(first_sample + gap_samples, 0)] = False
         return angle_known, torque_known
-
-
-def collector_of_signals(
-    grid: TickGrid, highest_hz: float, longest_samples: int
-) -> FullRateSignals | SignalDecimation:
-    """Return the collector for the signals of a record: decimated if the record is long.
-
-    Parameters
-    ----------
-    grid : TickGrid
-        Ticks of the record.
-    highest_hz : float
-        Highest frequency of the analysis.
-    longest_samples : int
-        Maximum number of samples at the full rate.
-
-    Raises
-    ------
-    RecordError
-        The record has too many samples for the memory that an analysis may take.
-    """
-    if grid.count <= longest_samples:
-        return FullRateSignals(grid)
-    decimation = SignalDecimation(grid, highest_hz)
-    return decimation if decimation.factor > 1 else FullRateSignals(grid)
 
 
 def _check_length(grid: TickGrid, highest_hz: float, sample_count: int) -> None:

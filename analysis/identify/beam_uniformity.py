@@ -1,0 +1,130 @@
+"""Test of a uniform beam against the modal constants of a record, by chi-square."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Final, Literal
+
+import numpy as np
+
+from analysis.identify._modal_model import MODE_CONSTANT_NAMES
+from analysis.identify.uniform_beam import PARAMETERS, UniformBeamProblem
+from analysis.statistics import chi_square_p_value
+from rigd.session import BeamUniformity
+
+if TYPE_CHECKING:
+    from numpy.typing import NDArray
+
+    from analysis.identify._modal_model import ModalEstimate
+    from rigd.beam import Plant
+
+TestStatus = Literal["passed", "refused", "not tested"]
+"""Result of the uniform-beam test."""
+
+MIN_P_VALUE_OF_UNIFORM_BEAM: Final = 0.01
+"""p-value below which the test refuses a uniform beam."""
+
+
+@dataclass(frozen=True, slots=True)
+class UniformBeamTest:
+    """Result of the test whether a uniform beam predicts the modal constants of a record.
+
+    Attributes
+    ----------
+    status : str
+        "passed", "refused", or "not tested" if there are no degrees of freedom.
+    chi_square : float
+        Weighted sum of squared differences between measured and predicted constants.
+    degrees_of_freedom : int
+        Number of constants minus number of effective beam parameters.
+    p_value : float or None
+        Probability of at least this chi-square by chance. None without degrees of freedom.
+    modes : tuple of int
+        Numbers of the compared modes.
+    measured, predicted, std : ndarray, shape (4 n,)
+        Measured and predicted `MODE_CONSTANT_NAMES`, mode by mode, and the standard deviations of
+        the measured ones.
+    """
+
+    status: TestStatus
+    chi_square: float
+    degrees_of_freedom: int
+    p_value: float | None
+    modes: tuple[int, ...]
+    measured: NDArray[np.float64]
+    predicted: NDArray[np.float64]
+    std: NDArray[np.float64]
+
+    @property
+    def summary(self) -> BeamUniformity:
+        """Return status and p-value of the uniform-beam test."""
+        return BeamUniformity(self.status, self.p_value)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the result of the test as a dict for JSON. Numbers may be NaN or infinite."""
+        return {
+            **self.summary.as_json(),
+            "chi_square": self.chi_square,
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "constants": [
+                {
+                    "mode": self.modes[constant_index // len(MODE_CONSTANT_NAMES)],
+                    "name": MODE_CONSTANT_NAMES[constant_index % len(MODE_CONSTANT_NAMES)],
+                    "measured": measured_value,
+                    "std": std,
+                    "predicted": predicted_value,
+                }
+                for constant_index, (measured_value, std, predicted_value) in enumerate(
+                    zip(
+                        self.measured.tolist(),
+                        self.std.tolist(),
+                        self.predicted.tolist(),
+                        strict=True,
+                    )
+                )
+            ],
+        }
+
+
+def uniform_beam_test(
+    fit: ModalEstimate, nominal: Plant, tilt_deg: float | None = None
+) -> UniformBeamTest:
+    """Test whether a uniform beam predicts the modal constants of the visible modes.
+
+    Parameters
+    ----------
+    fit : ModalEstimate
+        Fitted modal model with the covariance of its constants.
+    nominal : Plant
+        Rig and specimen as the file states them, with the tip mass if the file states one.
+    tilt_deg : float, optional
+        Inclination of the plane of motion along the resting beam, as the file states it, in
+        degrees.
+    """
+    mode_numbers = fit.visible
+    constant_rows = fit.rows(mode_numbers)
+    measured_constants, std = (
+        fit.constants[constant_rows],
+        np.sqrt(np.diag(fit.covariance)[constant_rows]),
+    )
+    degrees_of_freedom = len(constant_rows) - len(PARAMETERS)
+    if degrees_of_freedom <= 0:
+        nan_prediction = np.full(measured_constants.size, np.nan)
+        return UniformBeamTest(
+            "not tested", math.nan, 0, None, mode_numbers, measured_constants, nan_prediction, std
+        )
+    problem = UniformBeamProblem(fit, mode_numbers, nominal, tilt_deg=tilt_deg)
+    best_minimum = problem.minima()[0]
+    degrees_of_freedom += problem.count_idle_unknowns(best_minimum)
+    p_value = float(chi_square_p_value(best_minimum.cost, degrees_of_freedom))
+    return UniformBeamTest(
+        status="passed" if p_value >= MIN_P_VALUE_OF_UNIFORM_BEAM else "refused",
+        chi_square=best_minimum.cost,
+        degrees_of_freedom=degrees_of_freedom,
+        p_value=p_value,
+        modes=mode_numbers,
+        measured=measured_constants,
+        predicted=problem.constants(best_minimum.x[None])[0],
+        std=std,
+    )
