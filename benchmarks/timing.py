@@ -4,11 +4,19 @@ import time
 from collections.abc import Callable
 
 
+def time_s(work: Callable[[], object]) -> float:
+    """Return the wall time of one run, in s."""
+    start = time.perf_counter()
+    work()
+    return time.perf_counter() - start
+
+
 def least_s(work: Callable[[], object], repeats: int) -> float:
-    """Least wall time of several runs, in s."""
-    times = []
-    for _ in range(repeats):
-        start = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - start)
-    return min(times)
+    """Return the least wall time of several runs, in s."""
+    return min(time_s(work) for _ in range(repeats))
+
+
+def least_in_turn_s(repeats: int, *works: Callable[[], object]) -> list[float]:
+    """Return the least wall time of each work, in s; they take turns, to bear the same load."""
+    rounds = [[time_s(work) for work in works] for _ in range(repeats)]
+    return [min(times) for times in zip(*rounds, strict=True)]
