@@ -68,7 +68,8 @@ class Row:
 
     def as_dict(self) -> dict[str, Any]:
         """Return the row as it is stored."""
-        return asdict(self) | {"passed": self.passed}
+        known = self.value is not None and math.isfinite(self.value)
+        return asdict(self) | {"value": self.value if known else None, "passed": self.passed}
 
 
 class Gate:
