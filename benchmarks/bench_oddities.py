@@ -36,15 +36,15 @@ NOT_UNIFORM = Plant(
 )
 PLANTS = {"uniform": Plant(LINK, DAMPING), "not uniform": NOT_UNIFORM}
 ROWS = (
-    # The paper has 10.7 and 8.5 (docs/validation/paper_method.md says what this route has).
-    Row("zeta of I, omega over const, beam not uniform", least=4, most=20),
-    Row("zeta of IV, omega over const, beam not uniform", least=4, most=20),
-    Row("alpha of VI with const weights, beam not uniform", least=1.2),
-    Row("alpha of VI with const weights, uniform beam", least=0.9, most=1.1),
+    # Measured 7.7, 8.3, 1.463, 0.985, 0.13 (-17.6 dB) and 626: docs/validation/paper_method.md.
+    Row("zeta of I, omega over const, beam not uniform", least=6, most=10),
+    Row("zeta of IV, omega over const, beam not uniform", least=6, most=10),
+    Row("alpha of VI with const weights, beam not uniform", least=1.35, most=1.6),
+    Row("alpha of VI with const weights, uniform beam", least=0.95, most=1.05),
     Row("whole record: worst mode without a flag", most=4.5, unit="standard deviations"),
     Row("whole record, first peak: worst damping ratio", most=4.5, unit="standard deviations"),
-    Row("Welch's first peak at a twentieth of the damping", most=0.75, unit="times the true one"),
-    Row("cost of VI with a sample of overlap less", least=1.2, unit="times that of the paper's"),
+    Row("Welch's first peak at a twentieth of the damping", most=0.2, unit="times the true one"),
+    Row("cost of VI with a sample of overlap less", least=100, unit="times that of the paper's"),
 )
 TYPES = ("I", "II", "III", "IV", "V", "VI")
 EXTERNAL = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)

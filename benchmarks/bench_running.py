@@ -21,7 +21,7 @@ BLOCK = 50
 BETWEEN_ESTIMATES = 500
 REPEATS = 15
 ROWS = (
-    # Measured 0.13 and 4.5: scipy transforms all of the record at once.
+    # Measured 0.13 to 0.17, and 4.5 to 5.6: scipy transforms all of the record at once.
     Row("running response, an estimate", most=0.3, unit="times welch_response anew"),
     Row("running spectrogram, whole", most=9, unit="times scipy's, not cut at 60 Hz"),
     # Measured 1.5 beside other programs.
