@@ -98,7 +98,7 @@ def judged(wire: Drag | None, made: Record) -> Line:
 def main() -> None:
     """Judge the records asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--every", type=int, default=5, help="which of the 36 cells")
+    parser.add_argument("--every", type=int, default=7, help="which of the 36 cells")
     parser.add_argument("--count", type=int, default=1, help="records of each of these")
     parser.add_argument("--none", type=int, default=3, help="records without air")
     parser.add_argument("--first", type=int, default=0, help="first seed")

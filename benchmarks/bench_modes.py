@@ -143,7 +143,7 @@ def compare(
             biases.append(abs(bias) / (0.25 + 3 / math.sqrt(count)))
     formal, empirical = np.exp(np.mean(np.log(ratios), axis=0))
     print(f"Damping, geometric mean: {formal:.2f} formal, {empirical:.2f} by scatter", flush=True)
-    return float(1 / formal), max(biases)
+    return float(1 / formal), float(np.max(biases))
 
 
 def profile_of(name: str) -> Profile:

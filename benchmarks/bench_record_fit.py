@@ -244,7 +244,7 @@ def errors(name: str, count: int, *, undeclared: bool, ringing: bool) -> tuple[f
         either_sign.append(tool_inertia_of_either_sign(measurement, analysis, PLANTS[name]))
     print(f"\nType {name}, {count} sessions, {spent / count:.3f} s of CPU each")
     print("parameter                    truth  mean error/std  allowed  scatter/std  coverage")
-    largest, held, intervals_known = 0.0, 0, 0
+    means, held, intervals_known = [], 0, 0
     for parameter, truth in plant.parameters.items():
         std = np.array([fit.std[parameter] or math.nan for fit in fits])
         if np.isnan(std).all():
@@ -264,9 +264,9 @@ def errors(name: str, count: int, *, undeclared: bool, ringing: bool) -> tuple[f
             judged = free_error = (np.array(either_sign) - truth) / typical
             shown += "\n" + row("the same, either sign", truth, free_error)
         mean, allowed = mean_and_allowed(judged)
-        largest = max(largest, abs(mean) / allowed)
+        means.append(abs(mean) / allowed)
         print(shown)
-    return largest, held, intervals_known
+    return float(np.max(means)), held, intervals_known
 
 
 def mean_and_allowed(error: NDArray[np.float64]) -> tuple[float, float]:
