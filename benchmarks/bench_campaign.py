@@ -27,6 +27,7 @@ from pathlib import Path
 import numpy as np
 from gate import Gate, Row
 from numpy.typing import NDArray
+from timing import spent_cpu_s
 
 from analysis.campaigns import SessionTask, analyse_session, campaign
 from analysis.campaigns.workers import process_pool
@@ -70,12 +71,6 @@ def recorded(folder: Path, sessions: int) -> list[Path]:
         ]
         subprocess.run([*command, "--output", folder], check=True, stdout=subprocess.DEVNULL)
     return sorted(folder.glob("*.mcap"))
-
-
-def cpu_s() -> float:
-    """CPU time of this process and of the workers that have ended."""
-    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
-    return sum(each.ru_utime + each.ru_stime for each in both)
 
 
 def welch_only(paths: list[Path]) -> int:
@@ -139,11 +134,11 @@ class Watch:
     """Wall and CPU time since it was made."""
 
     def __init__(self) -> None:
-        self.wall, self.cpu = time.perf_counter(), cpu_s()
+        self.wall, self.cpu = time.perf_counter(), spent_cpu_s()
 
     def __str__(self) -> str:
         """Both; half of the CPU time is what two free cores would take."""
-        wall, cpu = time.perf_counter() - self.wall, cpu_s() - self.cpu
+        wall, cpu = time.perf_counter() - self.wall, spent_cpu_s() - self.cpu
         return f"{wall:.1f} s, {cpu:.1f} s of CPU time"
 
 
@@ -170,7 +165,7 @@ def main() -> None:
         report.mkdir()
         watch = Watch()
         found = campaign(paths, jobs=JOBS)
-        cpu = cpu_s() - watch.cpu
+        cpu = spent_cpu_s() - watch.cpu
         print(f"Campaign with selection on every whole record and validation: {watch}")
         gate.measured("campaign, CPU time a session", cpu / len(paths))
         if found.verdict is not None:

@@ -72,7 +72,7 @@ def designed(
 ) -> tuple[Real, Real, list[Segment], float]:
     """Scan and pieces until everything is reached: reference, angle, pieces, slowest decision."""
     reference_rad = SCAN.reference_rad
-    angle_rad = rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
+    angle_rad = rig.plant_with(Plant(LINK, DAMPING)).respond(reference_rad).angle_rad
     pieces: list[Segment] = []
     slowest_s, left_s = 0.0, longest_s
     while left_s > 1.0:
@@ -91,7 +91,7 @@ def designed(
 def steady_s(rig: RigPreview, targets: list[Target], tip_slope_rad: float) -> float:
     """Time of the best steady sines from nothing: below it no session can be."""
     record = RecordSoFar.from_angle(np.zeros(8), ESTIMATE, RATE_HZ, 8.0)
-    plant = rig.plant_with(LINK, DAMPING)
+    plant = rig.plant_with(Plant(LINK, DAMPING))
     quantities = Quantities.linearised(targets, ESTIMATE)
     return float(
         SegmentSearch(ESTIMATE, quantities, plant, 0.0, record, tip_slope_rad).mixture.times_s.sum()
@@ -137,7 +137,9 @@ def worst_percent(angle_rad: Real) -> float:
 
 def curves(rig: RigPreview, slope_rad: float) -> dict[str, tuple[Real, Real]]:
     """Largest relative deviation of a mode's damping in %, against the time of the record."""
-    chirped = rig.plant_with(LINK, DAMPING).respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
+    chirped = (
+        rig.plant_with(Plant(LINK, DAMPING)).respond(chirp(rate_hz=RATE_HZ).reference_rad).angle_rad
+    )
     ends_s = np.array([41.0, 45.0, 60.0, 90.0, 100.0, 105.0, 108.0, 110.0, 115.0, 136.0])
     percent = [worst_percent(chirped[: round(end * RATE_HZ)]) for end in ends_s]
     found = {"paper's chirp, while it runs (slope 0.5 rad)": (ends_s, np.array(percent))}
@@ -182,7 +184,7 @@ def swept_rad(rig: RigPreview, duration_s: float) -> Real:
             taper_s=taper_s, rig=rig,
         )  # fmt: skip
     reference_rad = np.concatenate([SCAN.reference_rad, sweeps.reference_rad])
-    return rig.plant_with(LINK, DAMPING).respond(reference_rad).angle_rad
+    return rig.plant_with(Plant(LINK, DAMPING)).respond(reference_rad).angle_rad
 
 
 def draw(rig: RigPreview, path: Path, slope_rad: float) -> None:

@@ -21,7 +21,8 @@ ROWS = tuple(
     for name in SITUATIONS
     for row in (
         Row(f"{name}: stopped and reported", least=100, unit="%"),
-        Row(f"{name}: median", most=MOST_S, unit="s"),
+        # Measured 0.6 to 3.3 beside other programs.
+        Row(f"{name}: median", most=6, unit="times rigd --version"),
     )
 )
 
@@ -35,9 +36,8 @@ def main() -> None:
     if not can_isolate():
         raise SystemExit("rigd stop is not measured: that needs root and namespaces (unshare).")
     bare = [str(RIGD), "--version"]
-    bare_s = least_s(lambda: subprocess.run(bare, capture_output=True, check=True), 5)
-    print(f"rigd --version: {bare_s:.2f} s")
     for name in SITUATIONS:
+        bare_s = least_s(lambda: subprocess.run(bare, capture_output=True, check=True), 3)
         script = sys.path[0] + "/stop_scenarios.py"
         done = subprocess.run(
             isolated(sys.executable, script, name, count),
@@ -58,7 +58,7 @@ def main() -> None:
             if stop["wrong"]:
                 print(json.dumps(stop))
         gate.measured(f"{name}: stopped and reported", percent(right, count))
-        gate.measured(f"{name}: median", median(times))
+        gate.measured(f"{name}: median", median(times) / bare_s)
     gate.finish()
 
 

@@ -1,5 +1,6 @@
 """How the benchmarks take a time: the least of several runs, what the work costs undisturbed."""
 
+import resource
 import time
 from collections.abc import Callable
 
@@ -9,6 +10,19 @@ def time_s(work: Callable[[], object]) -> float:
     start = time.perf_counter()
     work()
     return time.perf_counter() - start
+
+
+def spent_cpu_s() -> float:
+    """Return the processor time of this process and of its children that have ended, in s."""
+    both = (resource.getrusage(who) for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
+    return sum(each.ru_utime + each.ru_stime for each in both)
+
+
+def cpu_s(work: Callable[[], object]) -> float:
+    """Return the processor time of one run, processes that it waits for included, in s."""
+    start = spent_cpu_s()
+    work()
+    return spent_cpu_s() - start
 
 
 def least_s(work: Callable[[], object], repeats: int) -> float:
