@@ -1,16 +1,17 @@
 """Time of the exact model, against Eq. 25 typed in as it stands with differences for derivatives.
 
-Run as ``python benchmarks/bench_beam.py``. Best of ten, on the 7907 points of the paper's fit band.
+Best of ten in turn, on the 7907 points of the paper's fit band.
 """
 
 import os
 
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # as in the control process
 
-from collections.abc import Callable
+import argparse
 
 import numpy as np
-from timing import least_s
+from gate import Gate, Row
+from timing import least_in_turn_s
 
 from rigd.beam import Beam, Damping, Plant, TransferGrid
 from rigd.beam.realisation import couple, propagator, realise
@@ -19,11 +20,19 @@ from rigd.sim import SimulatedPlant
 BEAM = Beam(0.98, 4.7e-3, 0.090275)
 DAMPING = Damping(7.1e-5, 0.996, 0.055, 0.594)
 TICKS = 20_000
-
-
-def best_of_ten(function: Callable[[], object]) -> float:
-    """Shortest of ten runs, in milliseconds."""
-    return 1e3 * least_s(function, 10)
+ROWS = (
+    # Measured 0.25, 0.033 and 0.058.
+    Row("G", most=0.5, unit="times the textbook form"),
+    Row("G and 4 derivatives", most=0.07, unit="times differences"),
+    Row("G and 4 derivatives, new grid", most=0.12, unit="times differences"),
+    # Measured 8e-4, what differences of 1e-7 come to.
+    Row("derivatives against the differences", most=2e-3, unit="relative deviation"),
+    # Measured 3.4e-5.
+    Row("error of the realisation", most=1e-4, unit="of the largest response"),
+    # Measured 9 to 12, and 2.2 to 2.9.
+    Row("realisation", most=25, unit="times G and 4 derivatives"),
+    Row("tick of the plant", most=5, unit="times its matrix product"),
+)
 
 
 def textbook(s: np.ndarray, zeta: float, alpha: float, gamma: float, lambda_: float) -> np.ndarray:
@@ -53,40 +62,40 @@ def tick_by_tick(plant: SimulatedPlant, torques: list[float]) -> None:
 
 
 def main() -> None:
-    """Print the table."""
+    """Measure, print and judge."""
+    gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     s = 2j * np.pi * np.arange(94, 8001) / 160
     grid = TransferGrid(s)
-    peer = best_of_ten(lambda: textbook_with_differences(s))
-    peer_value = best_of_ten(lambda: textbook(s, 7.1e-5, 0.996, 0.055, 0.594))
-    value = best_of_ten(lambda: grid.evaluate(BEAM, DAMPING))
-    gradient = best_of_ten(lambda: grid.evaluate_with_gradient(BEAM, DAMPING))
-    fresh = best_of_ten(lambda: TransferGrid(s).evaluate_with_gradient(BEAM, DAMPING))
-    print(f"{s.size} points, best of ten")
-    print(f"  G, textbook form                     {peer_value:7.2f} ms")
-    print(f"  G                                    {value:7.2f} ms   {peer_value / value:5.1f} x")
-    print(f"  G + 4 derivatives, differences       {peer:7.2f} ms")
-    print(f"  G + 4 derivatives                    {gradient:7.2f} ms   {peer / gradient:5.1f} x")
-    print(f"  G + 4 derivatives, grid rebuilt       {fresh:7.2f} ms   {peer / fresh:5.1f} x")
-
+    plain, value, differences, gradient, fresh, build = least_in_turn_s(
+        10,
+        lambda: textbook(s, 7.1e-5, 0.996, 0.055, 0.594),
+        lambda: grid.evaluate(BEAM, DAMPING),
+        lambda: textbook_with_differences(s),
+        lambda: grid.evaluate_with_gradient(BEAM, DAMPING),
+        lambda: TransferGrid(s).evaluate_with_gradient(BEAM, DAMPING),
+        lambda: realise(Plant(BEAM, DAMPING)),
+    )
+    print(f"{s.size} points: G {1e3 * value:.2f} ms, with 4 derivatives {1e3 * gradient:.2f} ms")
+    gate.measured("G", value / plain)
+    gate.measured("G and 4 derivatives", gradient / differences)
+    gate.measured("G and 4 derivatives, new grid", fresh / differences)
     exact = grid.evaluate_with_gradient(BEAM, DAMPING)[1]
-    differences = textbook_with_differences(s)[1]
-    error = np.max(np.abs(differences - exact) / np.abs(exact))
-    print(f"  largest relative error of the differences {error:.0e}")
+    error = np.max(np.abs(textbook_with_differences(s)[1] - exact) / np.abs(exact))
+    gate.measured("derivatives against the differences", error)
 
     realisation = realise(Plant(BEAM, DAMPING))
     model = couple(realisation, motor_inertia_kg_m2=2e-3, viscous_nm_s_per_rad=0.02)
-    build = best_of_ten(lambda: realise(Plant(BEAM, DAMPING)))
-    step = best_of_ten(lambda: propagator(model, 1e-3))
-    print(f"realisation, {realisation.b.size} states, error {realisation.relative_error:.1e}")
-    print(f"  build                                {build:7.2f} ms")
-    print(f"  propagator                           {step:7.2f} ms")
+    (step,) = least_in_turn_s(10, lambda: propagator(model, 1e-3))
+    print(f"realisation, {realisation.b.size} states: {1e3 * build:.2f} ms")
+    print(f"its propagator: {1e3 * step:.2f} ms")
+    gate.measured("error of the realisation", realisation.relative_error)
+    gate.measured("realisation", build / gradient)
 
     from rigd.profile import load_profile
 
     plant = SimulatedPlant(load_profile("sim").rig)
     plant.enable()
     torques = (0.2 * np.random.default_rng(0).standard_normal(TICKS)).tolist()
-    ticks = best_of_ten(lambda: tick_by_tick(plant, torques)) * 1e3 / TICKS
     matrix, x = np.ones((56, 53)), np.ones(53)
     y = np.empty(56)
 
@@ -94,10 +103,10 @@ def main() -> None:
         for _ in range(TICKS):
             np.dot(matrix, x, out=y)
 
-    product = best_of_ten(products) * 1e3 / TICKS
-    print(f"plant, {TICKS} ticks of the profile `sim`")
-    print(f"  its matrix product alone             {product:7.2f} us a tick")
-    print(f"  command and advance                  {ticks:7.2f} us a tick {ticks / product:4.1f} x")
+    ticks, product = least_in_turn_s(10, lambda: tick_by_tick(plant, torques), products)
+    print(f"plant of the profile `sim`: {1e6 * ticks / TICKS:.2f} µs a tick")
+    gate.measured("tick of the plant", ticks / product)
+    gate.finish()
 
 
 if __name__ == "__main__":

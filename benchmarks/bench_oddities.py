@@ -1,8 +1,8 @@
 """The oddities of the paper's results, reproduced: its route on beams whose parameters are known.
 
 Prints the tables of ``docs/validation/paper_method.md``, part by part (``--part``); with
-``--figures DIR`` it also draws the page's figures there. 20 sessions of each of two beams take some
-five minutes.
+``--figures DIR`` it also draws the page's figures there. 20 sessions of each of two beams, of which
+the tables are, take some five minutes; without ``--sessions`` there are 3.
 
 The beams are the paper's link with internal damping of order 1; on the second one the modes'
 stiffness is off by +0.6, +0.5 and -1.3 %, as a link's may be that is not quite uniform. The
@@ -18,6 +18,7 @@ from pathlib import Path
 import numpy as np
 import oddities_figures as draw
 from exact_sessions import LINK, Session, session
+from gate import Gate, Row
 from numpy.typing import NDArray
 
 from analysis.identify import RecordFit, Selection, fit_record, select
@@ -34,6 +35,17 @@ NOT_UNIFORM = Plant(
     stiffness_offsets=(1.005 / 1.006 - 1, 0.987 / 1.006 - 1),
 )
 PLANTS = {"uniform": Plant(LINK, DAMPING), "not uniform": NOT_UNIFORM}
+ROWS = (
+    # Measured 7.7, 8.3, 1.463, 0.985, 0.13 (-17.6 dB) and 626: docs/validation/paper_method.md.
+    Row("zeta of I, omega over const, beam not uniform", least=6, most=10),
+    Row("zeta of IV, omega over const, beam not uniform", least=6, most=10),
+    Row("alpha of VI with const weights, beam not uniform", least=1.35, most=1.6),
+    Row("alpha of VI with const weights, uniform beam", least=0.95, most=1.05),
+    Row("whole record: worst mode without a flag", most=4.5, unit="standard deviations"),
+    Row("whole record, first peak: worst damping ratio", most=4.5, unit="standard deviations"),
+    Row("Welch's first peak at a twentieth of the damping", most=0.2, unit="times the true one"),
+    Row("cost of VI with a sample of overlap less", least=100, unit="times that of the paper's"),
+)
 TYPES = ("I", "II", "III", "IV", "V", "VI")
 EXTERNAL = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 4.0)
 """External damping of the beams whose first peak is looked at, in parts of that of `DAMPING`."""
@@ -74,7 +86,7 @@ def paper_means() -> dict[tuple[str, str, str], float]:
         }
 
 
-def table3(count: int) -> dict[str, PaperRoute]:
+def table3(count: int, gate: Gate) -> dict[str, PaperRoute]:
     """Print the paper's Table 3 beside the same route on both beams."""
     routes = {name: PaperRoute.of(session(plant), count) for name, plant in PLANTS.items()}
     print(f"\nTable 3 of the paper, and its route here: mean ± std of {count} sessions")
@@ -93,10 +105,14 @@ def table3(count: int) -> dict[str, PaperRoute]:
         ]
         paper = paper_means()[name, "omega", "zeta"] / paper_means()[name, "const", "zeta"]
         print(f"zeta of {name}: omega over const, paper {paper:.1f}, here {np.round(ratios, 1)}")
+        gate.measured(f"zeta of {name}, omega over const, beam not uniform", ratios[-1])
+    for name, row in (("not uniform", "beam not uniform"), ("uniform", "uniform beam")):
+        alphas = routes[name].parameters["VI", "const"]["alpha"]
+        gate.measured(f"alpha of VI with const weights, {row}", alphas.mean())
     return routes
 
 
-def record_method(count: int) -> list[Selection]:
+def record_method(count: int, gate: Gate) -> list[Selection]:
     """Print what the whole-record method says of the beam that is not uniform."""
     made = session(NOT_UNIFORM)
     found = [select(made.noisy(seed).measurement()) for seed in range(count)]
@@ -106,6 +122,7 @@ def record_method(count: int) -> list[Selection]:
     print(f"  uniform beam: {dict(Counter(statuses))}")
     for order in ("alpha", "lambda_"):
         print(f"  {order}: {dict(Counter(getattr(e.verdict, order).status for e in found))}")
+    worst = np.nan
     print(f"  {'mode':26}{'truth':>10}  mean ± std of the sessions; typical std stated; flags")
     for place, pole in enumerate(NOT_UNIFORM.mode_poles(3, ())):
         at = pole.at_rad_s
@@ -117,11 +134,15 @@ def record_method(count: int) -> list[Selection]:
             values = size * np.array([each.value for each in numbers])
             stated = size * np.median([each.std for each in numbers])
             flags = sum(each.flag is not None for each in numbers)
+            errors = [abs(size * each.value - truth) / (size * each.std)
+                      for each in numbers if each.flag is None and each.std]  # fmt: skip
+            worst = np.fmax(worst, max(errors, default=np.nan))
             print(
                 f"  {f'{name} of mode {pole.mode}, {unit}':26}{truth:10.5g}  "
                 f"{values.mean():.5g} ± {values.std(ddof=min(1, count - 1)):.2g}; "
                 f"{stated:.2g}; {flags}"
             )
+    gate.measured("whole record: worst mode without a flag", worst)
     alphas = [fit.parameters["alpha"] for fit in _type_vi(found)]
     print(f"  alpha of VI on a uniform beam: {np.mean(alphas):.3f} ± {np.std(alphas):.3f}")
     return found
@@ -161,7 +182,7 @@ def peak_of(
     return 20 * float(np.log10(size[top])), float(edges[1] - edges[0])
 
 
-def first_peaks() -> list[FirstPeak]:
+def first_peaks(gate: Gate) -> list[FirstPeak]:
     """Print the first peak of beams of different external damping."""
     fine_hz = np.linspace(2.0, 3.2, 240_001)
     found = []
@@ -194,13 +215,23 @@ def first_peaks() -> list[FirstPeak]:
             " ".join(f"{100 * ratio:.3f}" for ratio in each.welch_ratio.values()),
             f"{100 * mode.damping_ratio:.3f} ± {100 * mode.damping_ratio_std:.3f}",
         )  # fmt: skip
+    worst = max(
+        abs(each.record.modes[0].damping_ratio - each.true_ratio)
+        / each.record.modes[0].damping_ratio_std
+        for each in found
+    )
+    gate.measured("whole record, first peak: worst damping ratio", worst)
+    gate.measured(
+        "Welch's first peak at a twentieth of the damping",
+        10 ** ((found[0].welch_peak[0] - found[0].true_peak[0]) / 20),
+    )
     return found
 
 
-def segment_trap() -> dict[int, FrequencyResponse]:
+def segment_trap(gate: Gate) -> dict[int, FrequencyResponse]:
     """Print what one sample of overlap less does to the estimate and to type VI."""
     made = session(PLANTS["uniform"])
-    noisy, estimates = made.noisy(0), {}
+    noisy, estimates, costs = made.noisy(0), {}, []
     near_hz = np.linspace(44, 46, 4001)
     truth = ResponseGrid(2j * np.pi * near_hz).evaluate(PLANTS["uniform"])[0]
     level_db = peak_of(near_hz, truth)[0]
@@ -211,39 +242,43 @@ def segment_trap() -> dict[int, FrequencyResponse]:
         third_db = 20 * np.log10(np.abs(made.h1(overlap).band(44, 46).response).max())
         print(f"  overlap {overlap}: {count} segments, third peak without noise {third_db:.2f} dB")
         for fit in fit_many(h1.frequency_hz, h1.response, LINK, [STRUCTURES["VI"]]):
+            costs.append(fit.cost)
             print(
                 f"    {fit.weighting:6} cost {fit.cost:8.3f} ",
                 "  ".join(f"{name} {value:.3g}" for name, value in fit.parameters.items()),
             )
+    gate.measured("cost of VI with a sample of overlap less", costs[2] / costs[0])
     return estimates
 
 
 def main() -> None:
     """Print the parts asked for, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--sessions", type=int, default=20, help="of each beam")
+    parser.add_argument("--sessions", type=int, default=3, help="of each beam")
     parser.add_argument("--part", choices=("table3", "record", "first_peak", "segments"))
     parser.add_argument("--figures", type=Path, help="folder for the page's figures")
-    given = parser.parse_args()
+    gate = Gate(ROWS, parser)
+    given = gate.given
     if given.part in (None, "table3"):
-        routes = table3(given.sessions)
+        routes = table3(given.sessions, gate)
         if given.figures:
             draw.weights(given.figures, routes["not uniform"].parameters, session(NOT_UNIFORM))
     if given.part in (None, "record"):
-        selections = record_method(given.sessions)
+        selections = record_method(given.sessions, gate)
         if given.figures:
             route = PaperRoute.of(session(NOT_UNIFORM), given.sessions)
             uniform = [fit.parameters["alpha"] for fit in _type_vi(selections)]
             modes_found = selections[0].headline.modes
             draw.order(given.figures, route.parameters, np.array(uniform), modes_found)
     if given.part in (None, "first_peak"):
-        peaks = first_peaks()
+        peaks = first_peaks(gate)
         if given.figures:
             draw.first_peak(given.figures, peaks)
     if given.part in (None, "segments"):
-        estimates = segment_trap()
+        estimates = segment_trap(gate)
         if given.figures:
             draw.segments(given.figures, estimates)
+    gate.finish(part=given.part is not None)
 
 
 if __name__ == "__main__":

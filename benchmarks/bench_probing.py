@@ -4,18 +4,18 @@
 profile's. A row of the Markdown table for each lie and friction: how the move ended, the true speed
 and the true angle that the shaft reached until it stood again, the ratios, and the verdict. Then N
 sound rigs, each with one quantity of the motor within 25 % and a friction of 0.02 to 0.1 N·m, and
-how many of them are refused. Exit code 1 if a lie beyond 50 % passes, a true limit is left or a
-sound rig is refused.
+how many of them are refused. A row is wrong if a lie beyond 50 % passes, one within is refused, or
+a true limit is left.
 """
 
 from __future__ import annotations
 
 import argparse
-import sys
 from dataclasses import dataclass, field, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
+from gate import Gate, Row, percent
 
 from rigd.engine import probed_rig
 from rigd.profile import load_profile
@@ -31,6 +31,11 @@ if TYPE_CHECKING:
 
 LONGEST_TICKS = 30_000
 COASTING_TICKS = 1000
+ROWS = (
+    Row("lies probed", least=46),
+    Row("rows that are wrong", most=0),
+    Row("sound rigs refused", most=0, unit="%"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -156,19 +161,21 @@ def _cell(ratio: float | None, std: float | None) -> str:
     return "–" if ratio is None or std is None else f"{ratio:.2f} ± {std:.2f}"
 
 
-def main() -> int:
-    """Print the table and the counts."""
+def main() -> None:
+    """Print the table and the counts, and judge them."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--sound", type=int, default=20)
     parser.add_argument("--frictions", type=float, nargs="*", default=[0.03, 0.1])
-    given = parser.parse_args()
+    gate = Gate(ROWS, parser)
+    given = gate.given
     profile = load_profile("antenna_can")
-    wrong = 0
+    wrong = probed = 0
     print("| lie | friction | end | true speed | true angle | coupling | torque | inertia | |")
     print("|---|---|---|---|---|---|---|---|---|")
     for coulomb_nm in given.frictions:
         for lie in lies():
             done = probe(profile, lie, coulomb_nm=coulomb_nm)
+            probed += 1
             estimate = done.estimate
             refused = bool(done.contradiction)
             limits = profile.limits
@@ -190,9 +197,12 @@ def main() -> int:
         bool(probe(profile, lie, coulomb_nm=coulomb_nm, seed=seed).contradiction)
         for seed, (lie, coulomb_nm) in enumerate(sound(given.sound))
     )
-    print(f"\nSound rigs refused: {alarms} of {given.sound}. Rows that are wrong: {wrong}.")
-    return 1 if wrong or alarms else 0
+    print()
+    gate.measured("lies probed", probed)
+    gate.measured("rows that are wrong", wrong)
+    gate.measured("sound rigs refused", percent(alarms, given.sound))
+    gate.finish()
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    main()

@@ -3,9 +3,8 @@
 ``bench_random_defects.py [--records N] [--first-seed S] [--jobs J]`` draws N rigs (see
 `random_defects`), writes the record of each as a session, judges it as ``analyze --json`` does and
 compares the document with the truth (see `defect_scores`). It prints what is wrong of each record,
-a table by kind, the coverage of the 95 % intervals, and the limits that are exceeded; the exit
-status is 1 if there are any. Seeds below 10000 serve development; figures that are published are of
-seeds from 100000 on.
+a table by kind, the coverage of the 95 % intervals, and the limits that are exceeded. Seeds below
+10000 serve development; figures that are published are of seeds from 100000 on.
 
 ``--file FILE`` appends a line for each record and does not judge again those already there;
 ``--kinds TEXT ...`` draws these kinds in turn instead of random ones; ``--command-line`` runs the
@@ -45,7 +44,9 @@ from defect_scores import (
     gate_passes,
     score_document,
     table,
+    totals,
 )
+from gate import Gate, Row, percent
 from random_defects import KINDS, draw
 from uniform_shift import headline_shift
 
@@ -64,6 +65,11 @@ _STATED = {
     "beam_bending_stiffness_n_m2": repr(STIFFNESS_N_M2),
 }
 """What the file states of the specimen, whatever is true."""
+ROWS = (
+    Row("limits of defect_scores.complaints exceeded", most=0),
+    # 93 % is required of many records; six have some 36 such intervals. Measured 89 % of three.
+    Row("95 % intervals of modes that hold the truth", least=80, unit="%"),
+)
 HEADLINE_UNIFORMITY = 1e-3
 """Tolerance of the geometry that the analyzer uses where nothing is stated."""
 
@@ -212,7 +218,8 @@ def main() -> None:
     parser.add_argument("--file", type=Path, help="one line a record; goes on where it ends")
     parser.add_argument("--command-line", action="store_true", help="run the program itself")
     parser.add_argument("--document", type=Path, help="folder for the documents and truths")
-    given = parser.parse_args()
+    gate = Gate(ROWS, parser)
+    given = gate.given
     if given.document is not None:
         given.document.mkdir(parents=True, exist_ok=True)
     last = given.first_seed + given.records
@@ -238,7 +245,11 @@ def main() -> None:
     print(f"\nLimits exceeded: {len(missed) or 'none'}")
     for line in missed:
         print(f"    {line}")
-    sys.exit(bool(missed))
+    print()
+    gate.measured("limits of defect_scores.complaints exceeded", len(missed))
+    its = totals(done)
+    gate.measured("95 % intervals of modes that hold the truth", percent(its.inside, its.intervals))
+    gate.finish()
 
 
 if __name__ == "__main__":

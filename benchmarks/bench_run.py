@@ -2,8 +2,10 @@
 
 Peer of the whole: an interpreter that imports numpy and pydantic, as every session must. Peer of
 the tick: the bare matrix product of the plant's step, without which nothing can be simulated.
+Best of five in turn.
 """
 
+import argparse
 import subprocess
 import sys
 import tempfile
@@ -11,7 +13,8 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
-from timing import least_s
+from gate import Gate, Row
+from timing import least_in_turn_s
 
 from rigd.control import PidController, design_pid
 from rigd.devices import open_devices
@@ -21,6 +24,12 @@ from rigd.profile import load_profile
 
 RIGD = Path(sys.executable).with_name("rigd")
 TICKS = 20_000
+ROWS = (
+    # Measured 20 to 22, 11 to 12 and 11 to 16.
+    Row("rigd run chirp --fast", most=35, unit="times an interpreter with numpy and pydantic"),
+    Row("rigd --help", most=20, unit="times a bare interpreter"),
+    Row("tick", most=24, unit="times the plant's matrix product"),
+)
 
 
 def run(*command: object) -> None:
@@ -69,21 +78,22 @@ def product() -> Callable[[], None]:
 
 
 def main() -> None:
-    """Print times and ratios."""
-    bare = least_s(lambda: run(sys.executable, "-c", "import numpy, pydantic"), 10)
-    whole = least_s(session, 10)
-    print(f"rigd run chirp --fast, 136 s of rig time, best of ten: {whole:.2f} s")
-    print(f"  peer, interpreter with numpy and pydantic: {bare:.2f} s, ratio {whole / bare:.1f}")
-    empty = least_s(lambda: run(sys.executable, "-c", "pass"), 10)
-    shown = least_s(lambda: run(RIGD, "--help"), 10)
-    print(f"rigd --help, best of ten: {shown:.3f} s")
-    print(f"  peer, bare interpreter: {empty:.3f} s, ratio {shown / empty:.1f}")
-    tick_us = least_s(cycle(), 10) / TICKS * 1e6
-    product_us = least_s(product(), 10) / TICKS * 1e6
-    print(f"one tick (plant, devices, limits, controller), best of ten: {tick_us:.2f} µs")
-    print(
-        f"  peer, the plant's matrix product: {product_us:.2f} µs, ratio {tick_us / product_us:.1f}"
+    """Print times and ratios, and judge them."""
+    gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
+    bare, whole, empty, shown = least_in_turn_s(
+        5,
+        lambda: run(sys.executable, "-c", "import numpy, pydantic"),
+        session,
+        lambda: run(sys.executable, "-c", "pass"),
+        lambda: run(RIGD, "--help"),
     )
+    print(f"rigd run chirp --fast, 136 s of rig time: {whole:.2f} s; rigd --help: {shown:.3f} s")
+    gate.measured("rigd run chirp --fast", whole / bare)
+    gate.measured("rigd --help", shown / empty)
+    tick, products = least_in_turn_s(10, cycle(), product())
+    print(f"one tick (plant, devices, limits, controller): {1e6 * tick / TICKS:.2f} µs")
+    gate.measured("tick", tick / products)
+    gate.finish()
 
 
 if __name__ == "__main__":

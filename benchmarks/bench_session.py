@@ -1,15 +1,18 @@
 """Session files: cost of writing a sample and of reading 120 000, against the plain packages.
 
 The peer writes and reads the same messages with the ``mcap`` package one by one, encoding and
-decoding them with ``protobuf`` objects. Best of ten runs of this package, best of two of the peer.
+decoding them with ``protobuf`` objects. Both begin with the values of the samples: packing (here
+into the ring's layout, by the peer into protobuf messages) counts for both. Best of two of the
+peer, in turn with five runs each of this package.
 """
 
+import argparse
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from gate import Gate, Row
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.descriptor_pool import DescriptorPool
 from google.protobuf.message import Message
@@ -17,6 +20,7 @@ from google.protobuf.message_factory import GetMessageClass
 from mcap.reader import make_reader
 from mcap.records import Schema
 from mcap.writer import CompressionType, Writer
+from timing import least_s
 
 from rigd.session import SessionWriter, read_session
 from rigd.session.layout import (
@@ -30,6 +34,14 @@ from rigd.session.layout import (
 SAMPLES = 120_000
 CONTROL_EVERY = 10
 BLOCK = 50
+CONTROLS = BLOCK // CONTROL_EVERY
+ROWS = (
+    # Measured 0.26 to 0.38, and 0.022 to 0.031.
+    Row("writing, packing included", most=0.6, unit="times mcap and protobuf"),
+    Row("reading to arrays", most=0.05, unit="times mcap and protobuf"),
+    # Measured 110.
+    Row("size of a sample in the file", most=130, unit="bytes"),
+)
 START_UTC_NS = 1_700_000_000_000_000_000
 
 
@@ -48,17 +60,20 @@ def rows() -> list[tuple[float, ...]]:
     return list(zip(*(column.tolist() for column in columns), strict=True))
 
 
-def write(path: Path, samples: memoryview, controls: memoryview) -> float:
-    """Record in blocks as they come from the ring; return the seconds from begin to closed."""
+def write(path: Path, table: list[tuple[float, ...]]) -> float:
+    """Pack and record in blocks as they come from the ring; return the seconds it takes."""
     started = time.perf_counter()
     writer = SessionWriter(path)
     writer.begin(START_UTC_NS, {"rate_hz": "1000.0"}, {}, {})
+    samples, controls = bytearray(BLOCK * SAMPLE_SIZE), bytearray(CONTROLS * CONTROL_SIZE)
     for first in range(0, SAMPLES, BLOCK):
-        end = first + BLOCK
-        writer.write_controls(
-            controls[first // CONTROL_EVERY * CONTROL_SIZE : end // CONTROL_EVERY * CONTROL_SIZE]
-        )
-        writer.write_samples(samples[first * SAMPLE_SIZE : end * SAMPLE_SIZE])
+        for place, row in enumerate(table[first : first + BLOCK]):
+            pack_sample_into(samples, place * SAMPLE_SIZE, *row)
+        for place in range(CONTROLS):
+            tick = first + CONTROL_EVERY * place
+            pack_control_into(controls, place * CONTROL_SIZE, tick * 10**6, tick, *table[tick][2:8])
+        writer.write_controls(memoryview(controls))
+        writer.write_samples(memoryview(samples))
     writer.close({"outcome": "complete"})
     return time.perf_counter() - started
 
@@ -110,45 +125,31 @@ def read_plainly(path: Path) -> float:
     return elapsed
 
 
-def timed(action: Callable[[], object]) -> float:
-    """Return the seconds that an action takes."""
-    started = time.perf_counter()
-    action()
-    return time.perf_counter() - started
-
-
 def main() -> None:
-    """Measure and print."""
+    """Measure, print and judge."""
+    gate = Gate(ROWS, argparse.ArgumentParser(description=__doc__))
     table = rows()
-    samples = bytearray(SAMPLES * SAMPLE_SIZE)
-    packing = timed(
-        lambda: [pack_sample_into(samples, i * SAMPLE_SIZE, *row) for i, row in enumerate(table)]
-    )
-    controls = bytearray(SAMPLES // CONTROL_EVERY * CONTROL_SIZE)
-    for i in range(SAMPLES // CONTROL_EVERY):
-        pack_control_into(controls, i * CONTROL_SIZE, i * 10**7, i * 10, *table[i][2:8])
+    writes, reads = [], []
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        write_s = min(
-            write(folder / f"{i}.mcap", memoryview(samples), memoryview(controls))
-            for i in range(10)
-        )
-        path = folder / "0.mcap"
-        read_s = min(timed(lambda: read_session(path)) for _ in range(10))
-        plain_write_s = min(write_plainly(folder / "plain.mcap", table, path) for _ in range(2))
-        plain_read_s = min(read_plainly(path) for _ in range(2))
-        size_mb = path.stat().st_size / 1e6
-    scale = 1e6 / SAMPLES
-    print(f"session file, {SAMPLES} samples, {size_mb:.1f} MB; best of 10 (peer: of 2)")
-    print(f"  pack   {packing * scale:7.2f} µs/sample")
-    print(
-        f"  write  {write_s * scale:7.2f} µs/sample, with controls, begin and close;  "
-        f"mcap + protobuf {plain_write_s * scale:.2f} ({plain_write_s / write_s:.1f} ×)"
-    )
-    print(
-        f"  read   {read_s * 1e3:7.1f} ms to numpy;  "
-        f"mcap + protobuf {plain_read_s * 1e3:.0f} ({plain_read_s / read_s:.1f} ×)"
-    )
+        path, plain = folder / "session.mcap", folder / "plain.mcap"
+        for _ in range(2):
+            for _ in range(5):
+                path.unlink(missing_ok=True)
+                writes.append(write(path, table))
+            read_s = least_s(lambda: read_session(path), 5)
+            plain_write_s = write_plainly(plain, table, path)
+            reads.append((read_s, read_plainly(plain), plain_write_s))
+        size = path.stat().st_size / SAMPLES
+    read_s, plain_read_s, plain_write_s = (min(times) for times in zip(*reads, strict=True))
+    write_s, scale = min(writes), 1e6 / SAMPLES
+    print(f"{SAMPLES} samples: writing {write_s * scale:.2f} µs a sample with begin, close and")
+    print(f"controls (of which the peer has none), the peer {plain_write_s * scale:.2f} µs;")
+    print(f"reading {read_s * 1e3:.1f} ms, the peer {plain_read_s * 1e3:.0f} ms")
+    gate.measured("writing, packing included", write_s / plain_write_s)
+    gate.measured("reading to arrays", read_s / plain_read_s)
+    gate.measured("size of a sample in the file", size)
+    gate.finish()
 
 
 if __name__ == "__main__":

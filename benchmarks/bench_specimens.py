@@ -2,20 +2,22 @@
 
 ``bench_specimens.py [--times N] [--records N] [--noise-nm NM] [--apart SHARE] [--first SEED]``
 writes session files of exact records (`independent_records.py`, alpha 0.996), each with a noise of
-its own: N campaigns of one beam, then one whose second half is of a beam with frequencies higher by
-a share. Each goes through `campaign`, as by `analyze FILES`. A line for each: what its sessions
-select by themselves, whether they are called a mixture, by what and in which groups, the least
-p-value, and the worst error of the pooled numbers in their own standard deviations.
+its own: N campaigns (1) of one beam, then one whose second half is of a beam with frequencies
+higher by a share. Each goes through `campaign`, as by `analyze FILES`. A line for each: what its
+sessions select by themselves, whether they are called a mixture, by what and in which groups, the
+least p-value, and the worst error of the pooled numbers in their own standard deviations.
 """
 
 from __future__ import annotations
 
 import argparse
+import math
 import tempfile
 import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from gate import Gate, Row, percent
 from independent_records import (
     AMPLITUDE_RAD,
     FIRST_HZ,
@@ -32,6 +34,13 @@ from analysis.campaigns import CampaignResult, campaign
 from rigd.runtime import use_one_thread
 from rigd.testing import Signals, write_session
 
+ROWS = (
+    # Measured 0 of 5, 1 of 1, and 2.3 at most: docs/validation/campaigns.md.
+    Row("campaigns of one beam called mixed", most=0, unit="%"),
+    Row("campaigns of two beams called mixed", least=100, unit="%"),
+    Row("worst error of pooled numbers", most=4, unit="standard deviations"),
+    Row("sessions left out", most=0),
+)
 BEAM = Truth(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)
 
 
@@ -100,13 +109,14 @@ def worst_error(case: Case, found: CampaignResult) -> float:
 def main() -> None:
     """Judge the campaigns asked for."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--times", type=int, default=5, help="campaigns of one beam")
-    parser.add_argument("--records", type=int, default=40, help="of each campaign")
+    parser.add_argument("--times", type=int, default=1, help="campaigns of one beam")
+    parser.add_argument("--records", type=int, default=8, help="of each campaign")
     parser.add_argument("--noise-nm", type=float, default=5e-3, help="of the torque")
     parser.add_argument("--apart", type=float, default=5e-4, help="share between two beams")
     parser.add_argument("--first", type=int, default=0, help="first seed")
     parser.add_argument("--jobs", type=int, default=1)
-    given = parser.parse_args()
+    gate = Gate(ROWS, parser)
+    given = gate.given
     use_one_thread()
     one = exact(BEAM)
     faster = BEAM.density_over_stiffness / (1 + given.apart) ** 2
@@ -117,12 +127,26 @@ def main() -> None:
     cases.append(Case(f"two beams, {given.apart:.2%} apart", two))
     print("| campaign | alone | called mixed | least p | worst error pooled | left out |")
     print("|---|---|---|---|---|---|")
+    results: list[CampaignResult] = []
     for number, case in enumerate(cases):
         with tempfile.TemporaryDirectory() as name:
             paths = written(case, given.noise_nm, given.first + number * given.records, Path(name))
             begun = time.perf_counter()
             found = campaign(paths, jobs=given.jobs)
         print(line(case, found), f"{time.perf_counter() - begun:.0f} s", flush=True)
+        results.append(found)
+    *ones, mixed = (each.homogeneity.mixed for each in results)
+    gate.measured("campaigns of one beam called mixed", percent(sum(ones), len(ones)))
+    gate.measured("campaigns of two beams called mixed", percent(mixed, 1))
+    worst = [
+        worst_error(case, each)
+        for case, each in zip(cases, results, strict=True)
+        if not each.homogeneity.mixed
+    ]
+    gate.measured("worst error of pooled numbers", max(worst, default=math.nan))
+    lost = sum(len(each.failures) + len(each.lost_trials) for each in results)
+    gate.measured("sessions left out", lost)
+    gate.finish()
 
 
 if __name__ == "__main__":

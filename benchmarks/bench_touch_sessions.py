@@ -23,10 +23,20 @@ from typing import Any
 
 import numpy as np
 from bench_until import Rig, profile_of
+from gate import Gate, Row, percent
+from numpy.typing import NDArray
 
 BIN = Path(sys.executable).parent
 NOISE_NM = 5e-3
 """As in the profile."""
+ROWS = (
+    # Measured 0 of 600, 1 and 4 of 600, 0.54 mm, 96.3 %, 0: docs/validation/touch.md.
+    Row("touches that failed", most=0, unit="%"),
+    Row("touches with a point", least=80, unit="%"),
+    Row("median error", most=1.5, unit="mm"),
+    Row("95 % intervals that hold the point", least=70, unit="%"),
+    Row("beyond 4 standard deviations", most=0, unit="%"),
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -107,27 +117,35 @@ def meet(rig: Rig, number: int, profile: Path, model: Path, folder: Path) -> dic
     return {**result, "outcome": session["outcome"], "touches": session["touches"]}
 
 
+def points(results: list[dict[str, Any]]) -> NDArray[np.float64]:
+    """Return rows of place, error, standard deviation and whether the interval holds the place."""
+    rows = []
+    for each in results:
+        if not each.get("touches"):
+            continue
+        first = each["touches"][0]
+        place = first.get("x_m")
+        # Of what it cannot tell, it says the neighbourhood at most.
+        if first.get("kind") == "unknown" or place is None or place["std"] is None:
+            continue
+        low, high = place["interval_95"]
+        error = place["value"] - each["x_m"]
+        rows.append((each["x_m"], error, place["std"], low <= each["x_m"] <= high))
+    return np.array(rows, dtype=np.float64).reshape(-1, 4)
+
+
 def table(results: list[dict[str, Any]]) -> Iterator[str]:
     """Write errors, coverage and kinds, at all places and between 0.1 and 0.95 m."""
     failed = [each for each in results if "failed" in each]
     missed = [each for each in results if "failed" not in each and not each["touches"]]
     told = [each for each in results if each.get("touches")]
     yield f"{len(results)} touches: {len(failed)} failed, {len(missed)} not detected"
-    rows, kinds = [], Counter[str]()
-    for each in told:
-        first = each["touches"][0]
-        kind = first.get("kind", "not told")
-        kinds[kind] += 1
-        place = first.get("x_m")
-        # Of what it cannot tell, it says the neighbourhood at most.
-        if kind == "unknown" or place is None or place["std"] is None:
-            continue
-        low, high = place["interval_95"]
-        error = place["value"] - each["x_m"]
-        rows.append((each["x_m"], error, place["std"], low <= each["x_m"] <= high))
-    found = np.array(rows)
+    kinds = Counter(each["touches"][0].get("kind", "not told") for each in told)
+    found = points(results)
     inner = (found[:, 0] > 0.1) & (found[:, 0] < 0.95)
     for name, chosen in (("0.05 to 0.97 m", found), ("0.1 to 0.95 m", found[inner])):
+        if not len(chosen):
+            continue
         error_mm = 1e3 * np.abs(chosen[:, 1])
         beyond = np.abs(chosen[:, 1]) > 4 * chosen[:, 2]
         yield (
@@ -148,7 +166,8 @@ def main() -> None:
     parser.add_argument("--noise", type=float, default=1.0, help="times that of the profile")
     parser.add_argument("--jsonl", type=Path, help="where each result is added")
     parser.add_argument("--table", type=Path, help="show what is there, run nothing")
-    given = parser.parse_args()
+    gate = Gate(ROWS, parser)
+    given = gate.given
     results = []
     if given.table:
         results = [json.loads(line) for line in given.table.read_text("utf-8").splitlines()]
@@ -166,6 +185,17 @@ def main() -> None:
                         with given.jsonl.open("a", encoding="utf-8") as file:
                             file.write(json.dumps(result) + "\n")
     print("\n".join(table(results)))
+    found = points(results)
+    error_m = np.abs(found[:, 1])
+    failed = sum("failed" in each for each in results)
+    gate.measured("touches that failed", percent(failed, len(results)))
+    gate.measured("touches with a point", percent(len(found), len(results)))
+    gate.measured("median error", 1e3 * np.median(error_m) if len(found) else np.nan)
+    held = percent(found[:, 3].sum(), len(found))
+    gate.measured("95 % intervals that hold the point", held)
+    far = percent(np.sum(error_m > 4 * found[:, 2]), len(found))
+    gate.measured("beyond 4 standard deviations", far)
+    gate.finish()
 
 
 if __name__ == "__main__":

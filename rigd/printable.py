@@ -168,6 +168,7 @@ def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
     from rich.theme import Theme
 
     console = Console(stderr=True, highlight=False, theme=Theme(_BAR_STYLES))
+    # The remaining time follows from the steps of the last hour: one may take minutes.
     return Progress(
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -176,5 +177,6 @@ def progress_bar(*texts: str, auto_refresh: bool = True) -> "Progress":
         console=console,
         transient=True,
         auto_refresh=auto_refresh,
+        speed_estimate_period=3600.0,
         disable=not console.is_terminal,
     )

@@ -2,7 +2,7 @@
 
 import pytest
 
-from rigd.printable import counts_text, readable_errors, readable_message
+from rigd.printable import counts_text, progress_bar, readable_errors, readable_message
 
 
 def test_counts_that_nobody_could_read_are_unknown():
@@ -34,3 +34,14 @@ def test_a_usage_error_is_made_readable_and_no_other():
             raise error
         assert len(getattr(error, "message", "")) < 2100
     assert len(str(error)) == 10_000
+
+
+def test_the_remaining_time_is_known_where_a_step_takes_minutes():
+    bar = progress_bar()
+    now_s = [0.0]
+    bar.get_time = lambda: now_s[-1]
+    task = bar.add_task("sessions", total=10)
+    for time_s in (100.0, 220.0, 340.0):
+        now_s.append(time_s)
+        bar.update(task, advance=1)
+    assert bar.tasks[0].time_remaining == 840.0

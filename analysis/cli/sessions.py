@@ -200,14 +200,33 @@ def _print_tables(
     console: Console, record_results: Sequence[RecordResult], *, single: bool, verbose: bool
 ) -> None:
     """Print the tables of a single file, or a summary of several files."""
-    from analysis.report import result_text, summary_table
+    from analysis.report import (
+        FileWarnings,
+        result_text,
+        shared_warnings,
+        shown_warnings,
+        summary_table,
+        warning_lines,
+    )
 
     welch_results = [
         record_result for record_result in record_results if record_result.welch is not None
     ]
-    if single or not welch_results:
+    if single:
         for record_result in record_results:
             console.print(result_text(record_result, verbose=verbose))
+    elif not welch_results:
+        for record_result in record_results:
+            console.print(result_text(record_result, verbose=verbose, with_warnings=False))
+        for line in warning_lines(
+            shared_warnings(
+                [
+                    FileWarnings(each.name, each.record.path, shown_warnings(each))
+                    for each in record_results
+                ]
+            )
+        ):
+            console.print(line)
     else:
         console.print(summary_table(welch_results))
         console.print("")
@@ -220,12 +239,16 @@ def _analyse_all(
     rerun_file: Path | None,
     outputs: Outputs,
 ) -> tuple[list[RecordResult], dict[str, str], int]:
-    """Analyse and report each file; return results, error messages by file, and exit code."""
+    """Analyse and report each file; return results, error messages by file, and exit code.
+
+    Warnings of several files are printed after the last one, each once.
+    """
     from numpy.linalg import LinAlgError
 
     from analysis.identify import MeasurementError
     from analysis.paper import FrequencyResponseError, SettingsError
     from analysis.record import RecordError
+    from analysis.report import FileWarnings, shared_warnings
     from analysis.report.folder import OutputError
     from rigd.printable import progress_bar
     from rigd.session import SessionError
@@ -233,8 +256,13 @@ def _analyse_all(
     record_results: list[RecordResult] = []
     error_messages: dict[str, str] = {}
     exit_code = 0
+    file_warnings: list[list[str]] = [[] for _ in files]
     with progress_bar() as file_progress:
         print_message = partial(print_readable, file_progress.console)
+
+        def warn_now(warning_text: str) -> None:
+            print_message(f"Warning: {warning_text}")
+
         step_count = _count_steps(routes, rerun_file)
         progress_task = file_progress.add_task("", total=len(files) * step_count)
         for file_number, (session_file, report_folder) in enumerate(
@@ -255,7 +283,7 @@ def _analyse_all(
                         routes,
                         rerun_file,
                         on_step,
-                        print_message,
+                        file_warnings[file_number - 1].append if len(files) > 1 else warn_now,
                         overwrite=outputs.overwrite,
                     )
                 )
@@ -267,6 +295,13 @@ def _analyse_all(
                 error_messages[str(session_file)] = error_text = _error_message(session_file, error)
                 file_progress.update(progress_task, completed=file_number * step_count)
                 print_message(f"Error: {error_text}")
+        for line in shared_warnings(
+            [
+                FileWarnings(str(session_file), session_file, warning_texts)
+                for session_file, warning_texts in zip(files, file_warnings, strict=True)
+            ]
+        ):
+            print_message(f"Warning: {line}")
     return record_results, error_messages, exit_code
 
 
@@ -302,7 +337,7 @@ def _analyse_file(
     routes: Routes,
     rerun_file: Path | None,
     on_step: Callable[[str], None],
-    print_message: Callable[[str], None],
+    warn: Callable[[str], None],
     *,
     overwrite: bool,
 ) -> RecordResult:
@@ -311,10 +346,7 @@ def _analyse_file(
     from analysis.report.record_report import write_report
     from analysis.results import record_result
 
-    file_result = record_result(
-        session_file, routes, on_step=on_step,
-        warn=lambda warning_text: print_message(f"Warning: {warning_text}"),
-    )  # fmt: skip
+    file_result = record_result(session_file, routes, on_step=on_step, warn=warn)
     with new_folder(report_folder, overwrite=overwrite) as partial_folder:
         write_report(file_result, partial_folder, on_step, formats=routes.figures)
     if rerun_file is not None:

@@ -12,6 +12,10 @@ from ._record_figures import FIGURES as FIGURES
 from ._record_figures import illustrations as illustrations
 from ._rerun_file import check_rerun_file as check_rerun_file
 from ._rerun_file import write_rerun_file as write_rerun_file
+from ._shared_warnings import FileWarnings as FileWarnings
+from ._shared_warnings import shared_warnings as shared_warnings
 from ._shown_model import ShownModel as ShownModel
 from ._text import result_text as result_text
+from ._text import shown_warnings as shown_warnings
 from ._text import summary_table as summary_table
+from ._text import warning_lines as warning_lines

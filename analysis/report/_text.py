@@ -39,7 +39,9 @@ def as_text(renderable: RenderableType) -> str:
     return console_capture.get()
 
 
-def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
+def result_text(
+    result: RecordResult, *, verbose: bool, with_warnings: bool = True
+) -> RenderableType:
     """Return the results of one record for the terminal: verdict, tables and warnings.
 
     Parameters
@@ -49,6 +51,8 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
     verbose : bool
         Whether all tables are included. Otherwise the text contains the verdict, the modes and the
         parameters of damping and beam, or without a whole-record fit the Welch fits.
+    with_warnings : bool
+        Whether the text ends with the warnings (`shown_warnings`).
     """
     whole_record, welch_analysis = result.whole, result.welch
     text_parts: list[RenderableType] = []
@@ -56,19 +60,30 @@ def result_text(result: RecordResult, *, verbose: bool) -> RenderableType:
         text_parts.append(record_text(whole_record) if verbose else _main_results(whole_record))
     if welch_analysis is not None and verbose:
         text_parts.append(analysis_tables(result))
-    elif welch_analysis is not None:
-        if whole_record is None:
-            text_parts.append(Text(result.validity.sentence))
-            text_parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
-        text_parts += _warning_lines(result.warnings)
-    else:
-        # The reason for missing Welch fits was reported before.
-        text_parts += _warning_lines(
-            warning_text
-            for warning_text in result.warnings
-            if not warning_text.startswith(WELCH_OMITTED_TEXT)
-        )
+    elif welch_analysis is not None and whole_record is None:
+        text_parts.append(Text(result.validity.sentence))
+        text_parts += with_empty_lines((fit_tables.welch_fits_table(welch_analysis),))
+    if with_warnings and (welch_analysis is None or not verbose):
+        text_parts += warning_lines(shown_warnings(result))
     return Group(*text_parts)
+
+
+def shown_warnings(result: RecordResult) -> list[str]:
+    """Return the warnings of a record that are printed with its results.
+
+    Parameters
+    ----------
+    result : RecordResult
+        Results of one record.
+    """
+    if result.welch is not None:
+        return list(result.warnings)
+    # The reason for missing Welch fits was reported before.
+    return [
+        warning_text
+        for warning_text in result.warnings
+        if not warning_text.startswith(WELCH_OMITTED_TEXT)
+    ]
 
 
 _RIG_PARAMETERS: Final = ("delay_s", "tool_inertia_kg_m2")
@@ -113,8 +128,14 @@ def _with_mark_notes_only(table: Table, caption: str = "") -> Table:
     return replace(table, caption=caption, notes=mark_notes)
 
 
-def _warning_lines(sentences: Iterable[str]) -> list[Text]:
-    """Return warning sentences as yellow lines of text."""
+def warning_lines(sentences: Iterable[str]) -> list[Text]:
+    """Return warning sentences as yellow lines of text.
+
+    Parameters
+    ----------
+    sentences : iterable of str
+        Warnings.
+    """
     return [Text(f"Warning: {sentence}", style="yellow") for sentence in sentences]
 
 
@@ -144,7 +165,7 @@ def analysis_tables(result: RecordResult) -> RenderableType:
                 *(() if mode_table is None else (mode_table,)),
             )
         ),
-        *_warning_lines(result.warnings),
+        *warning_lines(result.warnings),
     )
 
 

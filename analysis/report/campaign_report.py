@@ -16,7 +16,8 @@ from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
 from analysis.report._document import document_text
 from analysis.report._paper_tables import paper_tables, welch_method_text
-from analysis.report._text import as_text, with_empty_lines
+from analysis.report._shared_warnings import FileWarnings, shared_warnings
+from analysis.report._text import as_text, warning_lines, with_empty_lines
 from analysis.report.folder import write_new
 from analysis.report.table import csv_text
 from analysis.results import DEFAULT_FORMATS
@@ -90,12 +91,18 @@ def campaign_tables(
     text_parts += with_empty_lines(shown_tables(campaign) if verbose else main_tables(campaign))
     if verbose or with_paper or campaign.headline is None:
         text_parts += with_empty_lines(paper_tables(campaign, with_paper=with_paper))
-    text_parts += [
-        Text(f"Warning: {session.name}: {warning_text}", style="yellow")
-        for session in campaign.sessions
-        for warning_text in session.warnings
-    ]
+    text_parts += warning_lines(_session_warnings(campaign))
     return Group(*text_parts)
+
+
+def _session_warnings(campaign: CampaignResult) -> list[str]:
+    """Return the sessions' own warnings, those that several sessions share once."""
+    return shared_warnings(
+        [
+            FileWarnings(session.name, session.path, session.warnings)
+            for session in campaign.sessions
+        ]
+    )
 
 
 def campaign_text(campaign: CampaignResult, *, with_paper: bool = False) -> str:
@@ -171,11 +178,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
             f"Not predicted from the others: {lost_trial.path}: {lost_trial.reason}"
             for lost_trial in campaign.lost_trials
         ),
-        *(
-            f"{session.name}: {warning_text}"
-            for session in campaign.sessions
-            for warning_text in session.warnings
-        ),
+        *_session_warnings(campaign),
     ]
 
 

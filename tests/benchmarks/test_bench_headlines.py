@@ -45,9 +45,13 @@ def judge(monkeypatch: pytest.MonkeyPatch) -> list[tuple[str, int]]:
     return asked
 
 
-def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> None:
+def run(monkeypatch: pytest.MonkeyPatch, *options: object) -> int:
     monkeypatch.setattr(sys, "argv", ["bench_headlines.py", *map(str, options)])
-    main()
+    try:
+        main()
+    except SystemExit as end:
+        return int(end.code or 0)
+    return 0
 
 
 def test_every_cell_that_is_asked_for_is_there():
@@ -98,7 +102,7 @@ def test_it_goes_on_where_it_ended(
 ):
     file = tmp_path / "scores.jsonl"
     options = ("--cells", f"ringing, {NAME}", "--file", file, "--first", 5)
-    run(monkeypatch, *options, "--count", 2)
+    assert run(monkeypatch, *options, "--count", 2) == 0
     assert judge == [(f"ringing, {NAME}", 5), (f"ringing, {NAME}", 6)]
     run(monkeypatch, *options, "--count", 4)
     assert [seed for _, seed in judge] == [5, 6, 7, 8]
@@ -118,7 +122,8 @@ def test_a_record_that_cannot_be_judged_is_told_and_stops_nothing(
     capsys: pytest.CaptureFixture[str],
 ):
     file = tmp_path / "scores.jsonl"
-    run(monkeypatch, "--cells", f"one mode, {NAME}", "--file", file, "--first", 13, "--count", 2)
+    options = ("--cells", f"one mode, {NAME}", "--file", file, "--first", 13, "--count", 2)
+    assert run(monkeypatch, *options) == 1
     assert len(judge) == 2
     assert len(file.read_text().splitlines()) == 1
     told = capsys.readouterr()

@@ -55,6 +55,14 @@ def test_the_folder_has_no_table_or_figure_of_the_paper(found, tmp_path):
     json.loads((tmp_path / "campaign.json").read_text())
 
 
+def test_a_warning_that_sessions_share_is_told_once(found):
+    text = " ".join(campaign_text(found).split())
+    assert text.count("Welch fits left out") == 1
+    assert "Warning: all 2 files: Welch fits left out: a multisine" in text
+    page = campaign_page(found, (), datetime(2026, 1, 1, tzinfo=UTC), with_paper=False)
+    assert page.count("Welch fits left out") == 1
+
+
 def test_sessions_are_listed_with_what_their_files_say(found):
     line = next(each for each in campaign_text(found).splitlines() if each.startswith("0.mcap "))
     for said in ("A", "Eve", "[clamp] <b>new</b>", "yes"):

@@ -70,3 +70,22 @@ def test_warnings_are_told_where_welch_s_fits_are_not_made(
         result = CliRunner().invoke(app, ["a.mcap", "--method", method, "--report", method, *brief])
     assert result.stdout.count("Warning: The session is a touch") == 1
     assert result.output.count("Welch fits left out") == (method == "all")
+
+
+def test_a_warning_that_files_share_is_printed_once(
+    write_session, make_signals, tmp_path, monkeypatch, without_drawing
+):
+    monkeypatch.chdir(tmp_path)
+    signals = make_signals(rest_s=0.2, sweep_s=5.0, ring_down_s=0.3)
+    for name in ("a.mcap", "b.mcap"):
+        write_session(name, signals, metadata={"excitation": "touch"})
+    options = ("--each", "--band", "1,20", "--figures", "png", "--report", "r", "--json", "r.json")
+    with without_drawing():
+        result = CliRunner().invoke(app, ["a.mcap", "b.mcap", *options])
+    assert result.exit_code == 0, result.stderr
+    (line,) = result.stderr.splitlines()
+    assert line.startswith("Warning: all 2 files: Welch fits left out")
+    assert result.stdout.count("Warning: ") == 1
+    assert "Warning: all 2 files: The session is a touch" in result.stdout
+    files = json.loads((tmp_path / "r.json").read_text())["files"]
+    assert all(any("left out" in text for text in file["warnings"]) for file in files)

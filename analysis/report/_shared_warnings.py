@@ -1,0 +1,67 @@
+"""Warnings of several files: one that files share is reported once, with their names."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Final, NamedTuple
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+    from pathlib import Path
+
+_MOST_NAMES: Final = 3
+"""Number of files that a shared warning names."""
+
+
+class FileWarnings(NamedTuple):
+    """Warnings of one file.
+
+    Attributes
+    ----------
+    name : str
+        Name of the file in the report.
+    path : Path
+        Path of the file, which its warnings may contain.
+    warnings : sequence of str
+        Sentences.
+    """
+
+    name: str
+    path: Path
+    warnings: Sequence[str]
+
+
+def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
+    """Return the warnings of files, each once, in the order of their first occurrence.
+
+    Parameters
+    ----------
+    files : sequence of FileWarnings
+        All files, also those without a warning.
+
+    Returns
+    -------
+    list of str
+        Sentences that begin with the name of the file, or with the number of files that share the
+        warning and a few of their names.
+    """
+    names_by_text: dict[str, dict[int, str]] = {}
+    for index, file in enumerate(files):
+        for sentence in file.warnings:
+            # What differs by the path of the file alone is the same warning.
+            text = sentence.replace(f"{file.path}: ", "")
+            names_by_text.setdefault(text, {})[index] = file.name
+    return [
+        f"{_files_text(list(names.values()), len(files))}: {text}"
+        for text, names in names_by_text.items()
+    ]
+
+
+def _files_text(names: Sequence[str], file_count: int) -> str:
+    """Return a text on the files that share a warning: their number and a few names."""
+    if len(names) == 1:
+        return names[0]
+    if len(names) == file_count:
+        return f"all {file_count} files"
+    shown = ", ".join(names[:_MOST_NAMES])
+    more = len(names) - _MOST_NAMES
+    return f"{len(names)} of {file_count} files ({shown}{f' and {more} more' if more > 0 else ''})"
