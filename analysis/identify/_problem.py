@@ -78,10 +78,6 @@ class Projected:
 _MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
-_MOST_BINS_OF_TWO_POINTS: Final = 65_536
-"""Maximum number of bins with which the results at two points are cached, and not at one: the
-results of all structures of a record of 30 minutes take 0.3 GB."""
-
 _UNKNOWNS_TOLERANCE: Final = 1e-6
 """Change of the unknowns below which the filling of unknown torques has converged."""
 
@@ -114,15 +110,17 @@ class Objective:
         self.comparison = comparison
         self.unknowns = unknowns
         self.columns = no_columns if effect_spectra is None else effect_spectra
-        is_large = comparison.frequency_hz.size > _MOST_BINS_OF_TWO_POINTS
-        self._recent: RecentValues[Linearisation] = RecentValues(1 if is_large else 2)
+        self._recent: RecentValues[Linearisation] = (
+            comparison.shared_values if comparison.is_long else RecentValues()
+        )
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return the torque residual and its derivatives for the unknowns `x`.
 
         The results at the last points are cached.
         """
-        return self._recent.at(x, self._linearise)
+        owner = self if self.comparison.is_long else None
+        return self._recent.at(x, self._linearise, owner)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return torque residual and derivatives for the unknowns `x`, without the cache."""
