@@ -47,7 +47,7 @@ _MAX_INCOHERENT_FRACTION: Final = 0.3
 """Largest fraction of the power of the motor's speed that may be incoherent with the reference. If
 it is larger, the motor followed another reference, and the whole angle is used."""
 
-_MAX_BINS_OF_STORED_RESULTS: Final = 65_536
+MAX_BINS_OF_STORED_RESULTS: Final = 65_536
 """Maximum number of bins with which every objective caches its results: the results of all
 structures of a record of 30 minutes take 0.3 GB."""
 
@@ -258,7 +258,7 @@ class Comparison:
     @property
     def is_long(self) -> bool:
         """Return whether the record has so many bins that few results of them may be stored."""
-        return self.frequency_hz.size > _MAX_BINS_OF_STORED_RESULTS
+        return self.frequency_hz.size > MAX_BINS_OF_STORED_RESULTS
 
     @property
     def samples(self) -> int:
