@@ -389,3 +389,7 @@ class RecentValues(Generic[_Value]):
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self._values.clear()

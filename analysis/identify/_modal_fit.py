@@ -130,7 +130,7 @@ class ModalFit(ModalEstimate):
     effect_stds: tuple[float, ...]
 
     def cost_reduction_by_spectrum(
-        self, torque_spectra: NDArray[np.complex128]
+        self, torque_spectra: Sequence[NDArray[np.complex128]]
     ) -> NDArray[np.float64]:
         """Return by how much each of c additional torque spectra would reduce the cost, shape (c,).
 
@@ -139,13 +139,26 @@ class ModalFit(ModalEstimate):
 
         Parameters
         ----------
-        torque_spectra : ndarray of complex, shape (c, K)
+        torque_spectra : sequence of ndarray of complex, shape (K,)
             Torque spectra in N·m, not whitened.
         """
-        whitened = self.outside_span(self._whiten(torque_spectra))
-        projections = whitened @ self.residual.view(np.float64)
-        squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
-        cost_reductions: NDArray[np.float64] = projections**2 / squares
+        span, residual = self.derivatives.rows(), self.residual.view(np.float64)
+
+        def whitened(columns: slice) -> NDArray[np.float64]:
+            bins = slice(columns.start // 2, columns.stop // 2)
+            spectra = np.array([spectrum[bins] for spectrum in torque_spectra])
+            return np.ascontiguousarray(spectra * self.noise.weight[bins]).view(np.float64)
+
+        blocks = list(_column_blocks(residual.size))
+        coefficients = sum(whitened(columns) @ span[:, columns].T for columns in blocks)
+        projections, squares = np.zeros((2, len(torque_spectra)))
+        for columns in blocks:
+            outside_span = whitened(columns) - coefficients @ span[:, columns]
+            projections += outside_span @ residual[columns]
+            squares += np.einsum("ij,ij->i", outside_span, outside_span)
+        cost_reductions: NDArray[np.float64] = projections**2 / np.maximum(
+            squares, np.finfo(float).tiny
+        )
         return cost_reductions
 
     def _whiten(self, torque_spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -384,6 +397,7 @@ class _ModalSearch:
             )
             if mean_log_change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
                 break
+        del problem  # which stores spectra, as the next one does
         return search.descend_to_minimum()
 
     def span(self) -> NDArray[np.float64]:
@@ -565,17 +579,16 @@ class _DerivativeSpan:
         return rows
 
 
-_COLUMNS_AT_ONCE: Final = 1 << 16
-"""Number of columns of the rows that are made orthonormal at once; more need copies of all rows."""
-
-_COLUMNS_OF_A_SUM: Final = 2 * MAX_BINS_OF_STORED_RESULTS
-"""Number of columns whose products are summed at once."""
+_COLUMNS_AT_ONCE: Final = 1 << 14
+"""Number of columns of the rows of a long record that are processed at once."""
 
 
-def _column_blocks(column_count: int, block_columns: int) -> Iterator[slice]:
-    """Yield the ranges of columns that are processed at once."""
+def _column_blocks(column_count: int) -> Iterator[slice]:
+    """Yield the ranges of columns that are processed at once: all, unless the record is long."""
+    is_long = column_count > 2 * MAX_BINS_OF_STORED_RESULTS
+    block_columns = _COLUMNS_AT_ONCE if is_long else max(column_count, 1)
     for first_column in range(0, column_count, block_columns):
-        yield slice(first_column, first_column + block_columns)
+        yield slice(first_column, min(first_column + block_columns, column_count))
 
 
 def _scaled_gram(
@@ -587,7 +600,7 @@ def _scaled_gram(
     """
     row_count = sum(len(matrix) for matrix in matrices)
     row_squares, gram = np.zeros(row_count), np.zeros((row_count, row_count))
-    blocks = list(_column_blocks(matrices[0].shape[1], _COLUMNS_OF_A_SUM))
+    blocks = list(_column_blocks(matrices[0].shape[1]))
     for columns in blocks:
         row_squares += np.concatenate(
             [np.einsum("ij,ij->i", matrix[:, columns], matrix[:, columns]) for matrix in matrices]
@@ -609,12 +622,19 @@ def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
     triangular_factor = np.linalg.cholesky(gram)
-    for columns in _column_blocks(rows.shape[1], _COLUMNS_AT_ONCE):
+    for columns in _column_blocks(rows.shape[1]):
         rows[:, columns] = np.linalg.solve(
             triangular_factor, rows[:, columns] / row_lengths[:, None]
         )
     restoring_matrix: NDArray[np.float64] = triangular_factor * row_lengths[:, None]
     return restoring_matrix
+
+
+def _remove_span(rows: NDArray[np.float64], span: NDArray[np.float64]) -> None:
+    """Subtract from rows, in place, their part in the span of orthonormal rows."""
+    coefficients = rows @ span.T
+    for columns in _column_blocks(rows.shape[1]):
+        rows[:, columns] -= coefficients @ span[:, columns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -651,7 +671,7 @@ def _ln_damping_by_torque(
     """Return the derivative of each ln(eta) at a minimum `x` by the whitened torque, (n, 2 K)."""
     gram, row_lengths = _scaled_gram(jacobian, regularization=1e-14)
     derivatives = np.empty((x.size // 2, jacobian.shape[1]))
-    for columns in _column_blocks(jacobian.shape[1], _COLUMNS_OF_A_SUM):
+    for columns in _column_blocks(jacobian.shape[1]):
         # The residual is predicted minus measured: the torque enters it with the opposite sign.
         unit_rows = jacobian[:, columns] / row_lengths[:, None]
         x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
@@ -682,7 +702,9 @@ class _ModalProblem:
         effect_spectra: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent = self._new_cache(comparison)
+        self._recent: RecentValues[_LinearSolution] = (
+            comparison.shared_values if comparison.is_long else RecentValues()
+        )
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -697,15 +719,12 @@ class _ModalProblem:
         )
         self._background = self._predicted_spectra(background_responses)
 
-    @staticmethod
-    def _new_cache(comparison: Comparison) -> RecentValues[_LinearSolution]:
-        """Return a cache of the solutions at the last two points, or one of a long record."""
-        return RecentValues(1 if comparison.is_long else 2)
-
     def for_modes(self, numbers: tuple[int, ...]) -> _ModalProblem:
         """Return the problem of other modes of the same record."""
         problem = copy(self)
-        problem._numbers, problem._recent = numbers, self._new_cache(self._comparison)
+        problem._numbers = numbers
+        if not self._comparison.is_long:
+            problem._recent = RecentValues()
         return problem
 
     def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
@@ -781,7 +800,7 @@ class _ModalProblem:
 
         The solutions at the last points are cached.
         """
-        return self._recent.at(x, self._solve_at)
+        return self._recent.at(x, self._solve_at, self if self._comparison.is_long else None)
 
     def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at a point `x`, computed without the cache."""
@@ -789,11 +808,13 @@ class _ModalProblem:
         residual, linear_parameters = self._solve(x, span)
         jacobian = np.empty((x.size, residual.size))
         self._write_jacobian(x, linear_parameters, jacobian)
-        jacobian -= (jacobian @ span.T) @ span
+        _remove_span(jacobian, span)
         return _LinearSolution(residual, linear_parameters, jacobian)
 
     def best_fit(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the whitened residual and the best linear parameters at a point `x`."""
+        if self._comparison.is_long:
+            self._recent.clear()
         return self._solve(x, self._linear_spectra(x))
 
     def cost(self, x: NDArray[np.float64]) -> float:
@@ -805,6 +826,8 @@ class _ModalProblem:
         self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]
     ) -> _Uncertainty:
         """Return covariance and derivatives at a minimum `x` with its linear parameters."""
+        if self._comparison.is_long:
+            self._recent.clear()
         rows = self._linear_spectra(x, x.size)
         spectra, jacobian = rows[: -x.size], rows[-x.size :]
         self._write_jacobian(x, linear_parameters, jacobian)
@@ -812,7 +835,7 @@ class _ModalProblem:
         covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
         # From here on in place: the rows of a long record take much memory.
         _orthonormalise(spectra)
-        jacobian -= (jacobian @ spectra.T) @ spectra
+        _remove_span(jacobian, spectra)
         ln_damping_by_torque = _ln_damping_by_torque(jacobian, x)
         _orthonormalise(jacobian)
         return _Uncertainty(covariance, rows, ln_damping_by_torque)
@@ -869,7 +892,10 @@ class _ModalProblem:
             jacobian[:] = self._whiten(self._drag_change(poles)[1:])
         if poles:
             nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
-            jacobian += self._whiten(self._comparison.decay_gradient(poles, nuisance_amplitudes))
+            decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
+            for k, derivative in enumerate(decay_gradient):
+                jacobian[k] += self._whiten(derivative)
+            del decay_gradient
         for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
             q, inverse_denominator, numerators = self._numerators(log_omega, eta)
             derivative_rows: list[NDArray[np.complex128]] = []
