@@ -127,7 +127,9 @@ class Objective:
         comparison, unknowns = self.comparison, self.unknowns
         gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        predicted_nm, torque_gradient = comparison.prediction.torque(plant, gradient_names)
+        # One row after another: time series and their transforms take much memory.
+        predicted_rows = comparison.prediction.torque_rows(plant, gradient_names)
+        predicted_nm = next(predicted_rows)
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
@@ -135,9 +137,10 @@ class Objective:
             for plant_pole in comparison.poles(plant, gradient_names)
         )
         residual = comparison.spectrum(predicted_nm - comparison.torque_nm[comparison.retained])
-        jacobian = (
-            parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(torque_gradient))
-        ).view(np.complex128)
+        derivatives = np.empty((len(gradient_names), residual.size), dtype=np.complex128)
+        for derivative_spectrum, derivative_nm in zip(derivatives, predicted_rows, strict=True):
+            derivative_spectrum[:] = comparison.spectrum(derivative_nm)
+        jacobian = (parameters_by_unknowns.T @ _as_real_rows(derivatives)).view(np.complex128)
         if comparison.drag is not None:
             drag_change, drag_derivatives = comparison.drag.change_to(
                 plant, poles, unknowns.names, parameters_by_unknowns
