@@ -37,7 +37,7 @@ from analysis.optimizer import Box, NormalEquations, RecentValues, descend
 from rigd.beam import Pole
 
 if TYPE_CHECKING:
-    from collections.abc import Iterator, Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -130,7 +130,7 @@ class ModalFit(ModalEstimate):
     effect_stds: tuple[float, ...]
 
     def cost_reduction_by_spectrum(
-        self, torque_spectra: Sequence[NDArray[np.complex128]]
+        self, torque_spectra: Iterable[NDArray[np.complex128]]
     ) -> NDArray[np.float64]:
         """Return by how much each of c additional torque spectra would reduce the cost, shape (c,).
 
@@ -139,9 +139,10 @@ class ModalFit(ModalEstimate):
 
         Parameters
         ----------
-        torque_spectra : sequence of ndarray of complex, shape (K,)
+        torque_spectra : iterable of ndarray of complex, shape (K,)
             Torque spectra in N·m, not whitened.
         """
+        torque_spectra = list(torque_spectra)
         span, residual = self.derivatives.rows(), self.residual.view(np.float64)
 
         def whitened(columns: slice) -> NDArray[np.float64]:
@@ -877,7 +878,8 @@ class _ModalProblem:
             measured_torque = measured_torque - self._whiten(self._drag_change(self._poles(x))[0])
         projections = spectra @ measured_torque
         residual = projections @ spectra - measured_torque
-        return residual, np.linalg.solve(triangular_factor.T, projections)
+        linear_parameters: NDArray[np.float64] = np.linalg.solve(triangular_factor.T, projections)
+        return residual, linear_parameters
 
     def _write_jacobian(
         self,

@@ -61,7 +61,7 @@ def write_reference(
     reserve(fd, reference_bytes)
     with mmap.mmap(fd, reference_bytes) as shared_memory:
         # Without a copy: that of an hour would take 30 MB.
-        shared_memory[:] = memoryview(reference_rad.astype("float64", "C", copy=False)).cast("B")
+        shared_memory[:] = reference_rad.astype("float64", "C", copy=False).data.cast("B")
     return ReferenceSpec(fd, reference_rad.size, planned_ticks)
 
 
