@@ -381,7 +381,7 @@ class RecentValues(Generic[_Value]):
         compute : callable
             Function that returns the value at a point.
         owner : object, optional
-            Object whose function it is, if several share the cache.
+            Object whose function it is, if the cache is that of several.
         """
         key = owner, x.tobytes()
         if key not in self._values:

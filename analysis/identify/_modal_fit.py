@@ -877,9 +877,9 @@ class _ModalProblem:
         if self._comparison.drag is not None:
             measured_torque = measured_torque - self._whiten(self._drag_change(self._poles(x))[0])
         projections = spectra @ measured_torque
-        residual = projections @ spectra - measured_torque
-        linear_parameters: NDArray[np.float64] = np.linalg.solve(triangular_factor.T, projections)
-        return residual, linear_parameters
+        residual: NDArray[np.float64] = projections @ spectra - measured_torque
+        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
+        return residual, linear_parameters.astype(np.float64, copy=False)
 
     def _write_jacobian(
         self,
