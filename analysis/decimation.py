@@ -105,7 +105,8 @@ def _interpolation_weights(
 
 def runs_of_true(mask: NDArray[np.bool_]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     """Return the start index of each run of True in a mask, and the index after its end."""
-    run_edges = np.diff(np.concatenate(([0], mask.astype(np.int8), [0])))
+    outside = np.zeros(1, np.int8)  # of the mask's own size: a long record has many values
+    run_edges = np.diff(np.concatenate((outside, mask.astype(np.int8), outside)))
     return np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
 
 

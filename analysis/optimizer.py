@@ -364,10 +364,13 @@ class RecentValues(Generic[_Value]):
 
     def __init__(self, points: int = 2) -> None:
         self._points = points
-        self._values: dict[bytes, _Value] = {}
+        self._values: dict[tuple[object, bytes], _Value] = {}
 
     def at(
-        self, x: NDArray[np.float64], compute: Callable[[NDArray[np.float64]], _Value]
+        self,
+        x: NDArray[np.float64],
+        compute: Callable[[NDArray[np.float64]], _Value],
+        owner: object = None,
     ) -> _Value:
         """Return the value at `x` from the cache, or compute and store it.
 
@@ -377,10 +380,16 @@ class RecentValues(Generic[_Value]):
             Point at which the function is evaluated.
         compute : callable
             Function that returns the value at a point.
+        owner : object, optional
+            Object whose function it is, if the cache is that of several.
         """
-        key = x.tobytes()
+        key = owner, x.tobytes()
         if key not in self._values:
             if len(self._values) == self._points:
                 del self._values[next(iter(self._values))]
             self._values[key] = compute(x)
         return self._values[key]
+
+    def clear(self) -> None:
+        """Forget all values."""
+        self._values.clear()

@@ -6,7 +6,7 @@ incomplete sweep. This module interpolates such samples within limits, counts an
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -274,6 +274,8 @@ def load_record(
         path, fields=_TICK_FIELDS, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS
     )
     grid, covered_s = _grid_of(session, part_s)
+    # The grid replaces the ticks, of which a long record has many.
+    session = replace(session, samples=session.samples[:0].copy())
     rest_angles_rad: list[NDArray[np.float64]] = []
     collector = _collector_of_signals(grid, highest_hz, longest_samples)
 
@@ -281,12 +283,7 @@ def load_record(
         rest_angles_rad.append(_rest_angles_rad(session, samples))
         collector.add(samples)
 
-    read_session(
-        path,
-        fields=("t_ns", "tick"),
-        max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
-        on_samples=add_samples,
-    )
+    read_session(path, max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS, on_samples=add_samples)
     return _record(session, grid, collector.finish(), covered_s, _median_rad(rest_angles_rad))
 
 

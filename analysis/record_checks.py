@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.decimation import runs_of_true
 from rigd.beam import Beam
 from rigd.session.limits import MAX_SAMPLES
 from rigd.units import unit_of
@@ -515,8 +516,7 @@ def longest_run(run_mask: NDArray[np.bool_]) -> tuple[int, int]:
     >>> longest_run(np.array([True, False, True, True]))
     (2, 2)
     """
-    run_edges = np.diff(np.concatenate(([0], run_mask.astype(np.int8), [0])))
-    run_starts, run_ends = np.flatnonzero(run_edges == 1), np.flatnonzero(run_edges == -1)
+    run_starts, run_ends = runs_of_true(run_mask)
     if run_starts.size == 0:
         return 0, 0
     longest_index = int(np.argmax(run_ends - run_starts))

@@ -5,7 +5,7 @@ The grid needs no signals, so that a long record can be checked before its signa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -85,16 +85,14 @@ class TickGrid:
     Attributes
     ----------
     session : Session
-        Session or part with the samples.
+        Session or part of it, without its samples.
     rate_hz : float
         Ticks per second.
     first_tick : int
         Number of the first tick.
-    indices : ndarray of int, shape (n,)
-        Index of each sample in the grid.
     count : int
         Number of ticks.
-    status_bits : ndarray of uint32, shape (count,)
+    status_bits : ndarray of uint16, shape (count,)
         Bits of `Status`; 0 where a tick is missing.
     is_missing : ndarray of bool, shape (count,)
         Whether a tick has no sample.
@@ -107,9 +105,8 @@ class TickGrid:
     session: Session
     rate_hz: float
     first_tick: int
-    indices: NDArray[np.int64]
     count: int
-    status_bits: NDArray[np.uint32]
+    status_bits: NDArray[np.uint16]
     is_missing: NDArray[np.bool_]
     sweep: slice
     unrecorded_ticks: int
@@ -131,20 +128,21 @@ class TickGrid:
             The ticks or the time stamps cannot be used, or too many samples are missing.
         """
         path, samples = session.path, session.samples
-        ticks = samples["tick"].astype(np.int64)
+        ticks = samples["tick"]
         check_span(path, ticks)
         check_clock(path, ticks, samples["t_ns"], rate_hz)
         first_tick = int(ticks[0])
-        tick_indices = ticks - first_tick
+        tick_indices = ticks - ticks[0]
         tick_count = int(tick_indices[-1]) + 1
         sweep, unrecorded_ticks = _sweep_range(session, first_tick, tick_count)
-        status_bits = np.zeros(tick_count, dtype=np.uint32)
+        # A long record has many ticks: no flag needs more than 16 bits, and the samples are let go.
+        status_bits = np.zeros(tick_count, dtype=np.uint16)
         status_bits[tick_indices] = samples["status"]
         is_missing = np.ones(tick_count, dtype=bool)
         is_missing[tick_indices] = False
         grid = cls(
-            session, rate_hz, first_tick, tick_indices, tick_count, status_bits, is_missing, sweep,
-            unrecorded_ticks,
+            replace(session, samples=samples[:0].copy()), rate_hz, first_tick, tick_count,
+            status_bits, is_missing, sweep, unrecorded_ticks,
         )  # fmt: skip
         for channel_name, is_unknown in (
             ("angle", grid.is_angle_unknown),

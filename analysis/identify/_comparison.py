@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 
@@ -18,6 +18,7 @@ from analysis.identify._predictor import TorquePredictor
 from analysis.identify.drag_torque import DragExpansion, DragResponse
 from analysis.identify.free_decay import DecaySpectra, LaterDecaySpectra, count_decay_spectra
 from analysis.models import LARGEST_FRACTION_OF_RATE
+from analysis.optimizer import RecentValues
 from rigd.beam import undamped_frequencies_rad_s
 
 if TYPE_CHECKING:
@@ -45,6 +46,10 @@ follows the reference."""
 _MAX_INCOHERENT_FRACTION: Final = 0.3
 """Largest fraction of the power of the motor's speed that may be incoherent with the reference. If
 it is larger, the motor followed another reference, and the whole angle is used."""
+
+MAX_BINS_OF_STORED_RESULTS: Final = 65_536
+"""Maximum number of bins with which every objective caches its results: the results of all
+structures of a record of 30 minutes take 0.3 GB."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +96,9 @@ class Comparison:
         Spectra of the torque by impacts with unknown amplitudes, in addition to the removed torque.
     last_poles_rad_s : list of complex
         Poles of the last plant, from which the search for the poles of the next plant starts.
+    shared_values : RecentValues
+        Cache of one result for all objectives of a long record, of which one for each would take
+        too much memory.
     """
 
     measurement: Measurement
@@ -113,6 +121,7 @@ class Comparison:
     drag: DragExpansion | None = None
     impact_spectra: NDArray[np.complex128] | None = None
     last_poles_rad_s: list[complex] = field(default_factory=list)
+    shared_values: RecentValues[Any] = field(default_factory=lambda: RecentValues(1))
 
     @classmethod
     def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
@@ -245,6 +254,11 @@ class Comparison:
     def first_s(self) -> float:
         """Return the time in seconds from the record's first tick to the first compared sample."""
         return float(self.retained.start - self.decimation.reach) / self.decimation.rate_hz
+
+    @property
+    def is_long(self) -> bool:
+        """Return whether the record has so many bins that few results of them may be stored."""
+        return self.frequency_hz.size > MAX_BINS_OF_STORED_RESULTS
 
     @property
     def samples(self) -> int:

@@ -17,11 +17,13 @@ G. H. Golub and V. Pereyra, Separable nonlinear least squares, Inverse Problems 
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final
 
 import numpy as np
 
+from analysis.identify._comparison import MAX_BINS_OF_STORED_RESULTS
 from analysis.identify._estimates import Ringing
 from analysis.identify._modal_model import (
     BACKGROUND_COEFFICIENTS,
@@ -35,7 +37,7 @@ from analysis.optimizer import Box, NormalEquations, RecentValues, descend
 from rigd.beam import Pole
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterable, Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -107,9 +109,8 @@ class ModalFit(ModalEstimate):
         Test of whether the residual depends linearly on the motor angle.
     ringing : Ringing
         Free decay at the beginning of the record.
-    span : ndarray, shape (r, 2 K)
-        Orthonormal rows that span all derivatives of the whitened residual, with real and imaginary
-        parts interleaved.
+    derivatives : _DerivativeSpan
+        Span of all derivatives of the whitened residual.
     ln_damping_by_torque : ndarray, shape (n, 2 K)
         Derivative of the logarithm of each estimated damping ratio by the whitened torque.
     effect_sizes, effect_stds : tuple of float
@@ -123,13 +124,13 @@ class ModalFit(ModalEstimate):
     whiteness: Whiteness
     input_relation: InputRelation
     ringing: Ringing
-    span: NDArray[np.float64]
+    derivatives: _DerivativeSpan
     ln_damping_by_torque: NDArray[np.float64]
     effect_sizes: tuple[float, ...]
     effect_stds: tuple[float, ...]
 
     def cost_reduction_by_spectrum(
-        self, torque_spectra: NDArray[np.complex128]
+        self, torque_spectra: Iterable[NDArray[np.complex128]]
     ) -> NDArray[np.float64]:
         """Return by how much each of c additional torque spectra would reduce the cost, shape (c,).
 
@@ -138,22 +139,43 @@ class ModalFit(ModalEstimate):
 
         Parameters
         ----------
-        torque_spectra : ndarray of complex, shape (c, K)
+        torque_spectra : iterable of ndarray of complex, shape (K,)
             Torque spectra in N·m, not whitened.
         """
-        whitened = self._outside_span(self._whiten(torque_spectra))
-        projections = whitened @ self.residual.view(np.float64)
-        squares = np.maximum(np.einsum("ij,ij->i", whitened, whitened), np.finfo(float).tiny)
-        cost_reductions: NDArray[np.float64] = projections**2 / squares
+        torque_spectra = list(torque_spectra)
+        span, residual = self.derivatives.rows(), self.residual.view(np.float64)
+
+        def whitened(columns: slice) -> NDArray[np.float64]:
+            bins = slice(columns.start // 2, columns.stop // 2)
+            spectra = np.array([spectrum[bins] for spectrum in torque_spectra])
+            return np.ascontiguousarray(spectra * self.noise.weight[bins]).view(np.float64)
+
+        blocks = list(_column_blocks(residual.size))
+        coefficients = sum(whitened(columns) @ span[:, columns].T for columns in blocks)
+        projections, squares = np.zeros((2, len(torque_spectra)))
+        for columns in blocks:
+            outside_span = whitened(columns) - coefficients @ span[:, columns]
+            projections += outside_span @ residual[columns]
+            squares += np.einsum("ij,ij->i", outside_span, outside_span)
+        cost_reductions: NDArray[np.float64] = projections**2 / np.maximum(
+            squares, np.finfo(float).tiny
+        )
         return cost_reductions
 
     def _whiten(self, torque_spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
         return np.ascontiguousarray(torque_spectra * self.noise.weight).view(np.float64)
 
-    def _outside_span(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Return the part of whitened spectra that no parameter of the fit can imitate."""
-        outside_span: NDArray[np.float64] = whitened - (whitened @ self.span.T) @ self.span
+    def outside_span(self, whitened: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Return the part of whitened spectra that no parameter of the fit can imitate.
+
+        Parameters
+        ----------
+        whitened : ndarray, shape (..., 2 K)
+            Whitened spectra with real and imaginary parts interleaved.
+        """
+        span = self.derivatives.rows()
+        outside_span: NDArray[np.float64] = whitened - (whitened @ span.T) @ span
         return outside_span
 
     def effect_std(self, torque_spectrum: NDArray[np.complex128]) -> float:
@@ -164,7 +186,7 @@ class ModalFit(ModalEstimate):
         torque_spectrum : ndarray of complex, shape (K,)
             Torque spectrum of the effect in N·m per unit of its size, not whitened.
         """
-        remainder = self._outside_span(self._whiten(torque_spectrum))
+        remainder = self.outside_span(self._whiten(torque_spectrum))
         return 1 / math.sqrt(max(float(remainder @ remainder), np.finfo(float).tiny))
 
     def damping_std_ratios(
@@ -328,6 +350,10 @@ class _ModalSearch:
 
     def descend_to_minimum(self) -> _ModalSearch:
         """Return the search moved to the minimum of the cost under its noise estimate."""
+        return self._descend(self.problem())
+
+    def _descend(self, problem: _ModalProblem) -> _ModalSearch:
+        """Return the search moved to the minimum of the cost of its problem."""
         lower_bounds = np.column_stack(
             [self.x[::2] - _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MIN_LOSS_FACTOR)]
         )
@@ -335,7 +361,7 @@ class _ModalSearch:
             [self.x[::2] + _MAX_LOG_FREQUENCY_CHANGE, np.full(len(self.numbers), _MAX_LOSS_FACTOR)]
         )
         minimum = descend(
-            self.problem().normal_equations,
+            problem.normal_equations,
             self.x,
             Box(lower_bounds.ravel(), upper_bounds.ravel()),
             relative_tolerance=_RELATIVE_TOLERANCE,
@@ -347,10 +373,11 @@ class _ModalSearch:
         """Return the search after descents, noise and unknown torque have converged together."""
         search = self
         for _ in range(_MAX_NOISE_ESTIMATES):
-            search = search.descend_to_minimum()
             problem = search.problem()
-            modal_model = problem.model(search.x)
-            residual_spectrum = problem.residual(search.x, modal_model)
+            search = search._descend(problem)
+            linear_parameters = problem.solution_at(search.x).linear_parameters
+            modal_model = problem.model(search.x, linear_parameters)
+            residual_spectrum = problem.residual(search.x, linear_parameters, modal_model)
             comparison = search.comparison
             # A torque that the modal model lacks would change which part of the angle follows it.
             if not (len(search.effect_spectra) or comparison.drag):
@@ -371,7 +398,13 @@ class _ModalSearch:
             )
             if mean_log_change < _NOISE_LOG_TOLERANCE and comparison.measurement.torque_known.all():
                 break
+        del problem  # which stores spectra, as the next one does
         return search.descend_to_minimum()
+
+    def span(self) -> NDArray[np.float64]:
+        """Return orthonormal rows that span all derivatives of the residual, shape (r, 2 K)."""
+        problem = self.problem()
+        return problem.uncertainty(self.x, problem.best_fit(self.x)[1]).span
 
     def is_near_mode(self, *, within_resonance: bool = False) -> NDArray[np.bool_]:
         """Return a mask of the bins in which the residual may belong to a mode, shape (K,).
@@ -393,8 +426,7 @@ class _ModalSearch:
 
     def cost(self) -> float:
         """Return the cost at the current point: the sum of the squared whitened residual."""
-        residual = self.problem().solution_at(self.x).residual
-        return float(residual @ residual)
+        return self.problem().cost(self.x)
 
     def add_resonances(self) -> _ModalSearch:
         """Return the search with a resonance added where the residual depends on the motor angle.
@@ -404,7 +436,7 @@ class _ModalSearch:
         search = self
         for _ in range(_MAX_ADDITIONAL_RESONANCES):
             input_dependence = search.residual_dependence_on_angle(
-                search.problem().solution_at(search.x)
+                search.problem().best_fit(search.x)[0]
             )
             if not input_dependence.related:
                 break
@@ -459,12 +491,16 @@ class _ModalSearch:
 
     def evidence(self) -> NDArray[np.float64]:
         """Return the cost increase by the removal of each mode alone, without a descent, (n,)."""
-        full_cost = self.cost()
-        return np.array([self._remove_mode(i).cost() - full_cost for i in range(len(self.numbers))])
+        problem = self.problem()
+        full_cost = problem.cost(self.x)
+        without_mode = [self._remove_mode(i) for i in range(len(self.numbers))]
+        return np.array(
+            [problem.for_modes(each.numbers).cost(each.x) - full_cost for each in without_mode]
+        )
 
-    def residual_dependence_on_angle(self, solution: _LinearSolution) -> InputRelation:
-        """Return the result of a test whether the residual depends linearly on the motor angle."""
-        residual = solution.residual.view(np.complex128)
+    def residual_dependence_on_angle(self, whitened: NDArray[np.float64]) -> InputRelation:
+        """Return the result of a test whether a residual depends linearly on the motor angle."""
+        residual = whitened.view(np.complex128)
         angle_spectrum = self.comparison.spectrum(
             self.comparison.angle_rad[self.comparison.retained]
         )
@@ -495,15 +531,16 @@ class _ModalSearch:
             return None
         x, numbers = search.x, search.numbers
         problem = search.problem()
-        solution, basis = problem.solve_at(x)
-        joint_covariance = problem.covariance(basis)
-        constants, covariance = problem.constants(solution, x, joint_covariance)
-        residual_spectrum = solution.residual.view(np.complex128)
+        residual, linear_parameters = problem.best_fit(x)
+        uncertainty = problem.uncertainty(x, linear_parameters)
+        joint_covariance = uncertainty.covariance
+        constants, covariance = problem.constants(linear_parameters, x, joint_covariance)
+        residual_spectrum = residual.view(np.complex128)
         used_bins = search.noise.counts
         effect_count = len(search.effect_spectra)
         effect_variances = np.diag(joint_covariance)[joint_covariance.shape[0] - effect_count :]
         return ModalFit(
-            model=problem.model(x),
+            model=problem.model(x, linear_parameters),
             numbers=numbers,
             constants=constants,
             joint_covariance=covariance,
@@ -513,49 +550,92 @@ class _ModalSearch:
             whiteness=whiteness(
                 residual_spectrum[used_bins], search.comparison.frequency_hz[used_bins]
             ),
-            input_relation=search.residual_dependence_on_angle(solution),
-            ringing=problem.ringing(solution, joint_covariance),
-            span=np.concatenate([basis.span, _orthonormal_rows(solution.jacobian)[0]]),
-            ln_damping_by_torque=problem.ln_damping_by_torque(solution, x),
-            effect_sizes=tuple(
-                solution.linear_parameters[
-                    solution.linear_parameters.size - effect_count :
-                ].tolist()
-            ),
+            input_relation=search.residual_dependence_on_angle(residual),
+            ringing=problem.ringing(linear_parameters, joint_covariance),
+            derivatives=_DerivativeSpan(search, uncertainty.span),
+            ln_damping_by_torque=uncertainty.ln_damping_by_torque,
+            effect_sizes=tuple(linear_parameters[linear_parameters.size - effect_count :].tolist()),
             effect_stds=tuple(np.sqrt(effect_variances).tolist()),
         )
 
 
+class _DerivativeSpan:
+    """Orthonormal rows that span all derivatives of the whitened residual of a modal fit.
+
+    Those of a long record take too much memory to be stored with each fit.
+    """
+
+    def __init__(self, search: _ModalSearch, rows: NDArray[np.float64]) -> None:
+        self._search = search
+        self._rows = None if search.comparison.is_long else rows
+
+    def rows(self) -> NDArray[np.float64]:
+        """Return the rows, shape (r, 2 K), with real and imaginary parts interleaved."""
+        if self._rows is not None:
+            return self._rows
+        search = self._search
+        rows: NDArray[np.float64] = search.comparison.shared_values.at(
+            search.x, lambda _x: search.span(), self
+        )
+        return rows
+
+
+_COLUMNS_AT_ONCE: Final = 1 << 14
+"""Number of columns of the rows of a long record that are processed at once."""
+
+
+def _column_blocks(column_count: int) -> Iterator[slice]:
+    """Yield the ranges of columns that are processed at once: all, unless the record is long."""
+    is_long = column_count > 2 * MAX_BINS_OF_STORED_RESULTS
+    block_columns = _COLUMNS_AT_ONCE if is_long else max(column_count, 1)
+    for first_column in range(0, column_count, block_columns):
+        yield slice(first_column, min(first_column + block_columns, column_count))
+
+
 def _scaled_gram(
-    rows: NDArray[np.float64], regularization: float
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return the rows of a matrix scaled to length 1, their Gram matrix and former lengths.
+    *matrices: NDArray[np.float64], regularization: float
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Return the Gram matrix of all rows of matrices, scaled to length 1, and their lengths.
 
     `regularization` is added to the diagonal of the Gram matrix.
     """
-    row_lengths = np.sqrt(np.einsum("ij,ij->i", rows, rows))
+    row_count = sum(len(matrix) for matrix in matrices)
+    row_squares, gram = np.zeros(row_count), np.zeros((row_count, row_count))
+    blocks = list(_column_blocks(matrices[0].shape[1]))
+    for columns in blocks:
+        row_squares += np.concatenate(
+            [np.einsum("ij,ij->i", matrix[:, columns], matrix[:, columns]) for matrix in matrices]
+        )
+    row_lengths = np.sqrt(row_squares)
     row_lengths[row_lengths == 0] = 1.0  # the spectrum of a decay that ends at once
-    unit_rows = rows / row_lengths[:, None]
-    gram = unit_rows @ unit_rows.T
+    for columns in blocks:
+        unit_rows = np.concatenate([matrix[:, columns] for matrix in matrices])
+        unit_rows /= row_lengths[:, None]
+        gram += unit_rows @ unit_rows.T
     gram[np.diag_indices_from(gram)] += regularization
-    return unit_rows, gram, row_lengths
+    return gram, row_lengths
 
 
-_COLUMNS_AT_ONCE: Final = 1 << 16
-"""Number of columns of the rows that are made orthonormal at once; more need copies of all rows."""
+def _orthonormalise(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Replace rows by orthonormal rows with the same span.
 
-
-def _orthonormal_rows(rows: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return orthonormal rows with the same span as given rows.
-
-    Return also the matrix whose product with them restores the given rows.
+    Return the matrix whose product with them restores the given rows.
     """
-    unit_rows, gram, row_lengths = _scaled_gram(rows, 1e-13)
+    gram, row_lengths = _scaled_gram(rows, regularization=1e-13)
     triangular_factor = np.linalg.cholesky(gram)
-    for first_column in range(0, unit_rows.shape[1], _COLUMNS_AT_ONCE):
-        columns = slice(first_column, first_column + _COLUMNS_AT_ONCE)
-        unit_rows[:, columns] = np.linalg.solve(triangular_factor, unit_rows[:, columns])
-    return unit_rows, triangular_factor * row_lengths[:, None]
+    for columns in _column_blocks(rows.shape[1]):
+        rows[:, columns] = np.linalg.solve(
+            triangular_factor, rows[:, columns] / row_lengths[:, None]
+        )
+    restoring_matrix: NDArray[np.float64] = triangular_factor * row_lengths[:, None]
+    return restoring_matrix
+
+
+def _remove_span(rows: NDArray[np.float64], span: NDArray[np.float64]) -> None:
+    """Subtract from rows, in place, their part in the span of orthonormal rows."""
+    coefficients = rows @ span.T
+    for columns in _column_blocks(rows.shape[1]):
+        rows[:, columns] -= coefficients @ span[:, columns]
 
 
 @dataclass(frozen=True, slots=True)
@@ -573,16 +653,31 @@ class _LinearSolution:
 
 
 @dataclass(frozen=True, slots=True)
-class _LinearBasis:
-    """Spectra from which a `_LinearSolution` was computed; too large to be stored with it.
+class _Uncertainty:
+    """Uncertainty of the modal model at a minimum.
 
-    `columns` are the whitened spectra that the linear parameters multiply, `span` is an orthonormal
-    basis of these, and `full_jacobian` are the derivatives of the residual.
+    `covariance` is the joint one of frequencies, damping and linear parameters, `span` are
+    orthonormal rows that span all derivatives of the residual, and `ln_damping_by_torque`, shape
+    (n, 2 K), is the derivative of the logarithm of each eta by the whitened torque.
     """
 
-    columns: NDArray[np.float64]
+    covariance: NDArray[np.float64]
     span: NDArray[np.float64]
-    full_jacobian: NDArray[np.float64]
+    ln_damping_by_torque: NDArray[np.float64]
+
+
+def _ln_damping_by_torque(
+    jacobian: NDArray[np.float64], x: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the derivative of each ln(eta) at a minimum `x` by the whitened torque, (n, 2 K)."""
+    gram, row_lengths = _scaled_gram(jacobian, regularization=1e-14)
+    derivatives = np.empty((x.size // 2, jacobian.shape[1]))
+    for columns in _column_blocks(jacobian.shape[1]):
+        # The residual is predicted minus measured: the torque enters it with the opposite sign.
+        unit_rows = jacobian[:, columns] / row_lengths[:, None]
+        x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
+        derivatives[:, columns] = x_by_torque[1::2] / x[1::2, None]
+    return derivatives
 
 
 def _relative_pole(eta: float) -> complex:
@@ -608,7 +703,9 @@ class _ModalProblem:
         effect_spectra: NDArray[np.complex128],
         numbers: tuple[int, ...],
     ) -> None:
-        self._recent: RecentValues[_LinearSolution] = RecentValues()
+        self._recent: RecentValues[_LinearSolution] = (
+            comparison.shared_values if comparison.is_long else RecentValues()
+        )
         self._numbers = numbers
         self._comparison = comparison
         self._weight = weight
@@ -622,6 +719,14 @@ class _ModalProblem:
             [(self._s / self.scale_rad_s) ** n for n in range(BACKGROUND_COEFFICIENTS)]
         )
         self._background = self._predicted_spectra(background_responses)
+
+    def for_modes(self, numbers: tuple[int, ...]) -> _ModalProblem:
+        """Return the problem of other modes of the same record."""
+        problem = copy(self)
+        problem._numbers = numbers
+        if not self._comparison.is_long:
+            problem._recent = RecentValues()
+        return problem
 
     def _whiten(self, spectra: NDArray[np.complex128]) -> NDArray[np.float64]:
         """Return whitened spectra with real and imaginary parts interleaved, shape (..., 2 K)."""
@@ -694,21 +799,107 @@ class _ModalProblem:
     def solution_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at ``x = (ln omega_1, eta_1, ln omega_2, …)``.
 
-        The solutions at the last two points are cached.
+        The solutions at the last points are cached.
         """
-        return self._recent.at(x, lambda point: self.solve_at(point)[0])
+        return self._recent.at(x, self._solve_at, self if self._comparison.is_long else None)
 
-    def solve_at(self, x: NDArray[np.float64]) -> tuple[_LinearSolution, _LinearBasis]:
+    def _solve_at(self, x: NDArray[np.float64]) -> _LinearSolution:
         """Return the best linear parameters at a point `x`, computed without the cache."""
-        mode_points = x.reshape(-1, 2)
-        numerator_count = 2 * len(mode_points)
-        spectra = np.empty((3 * numerator_count, 2 * self._weight.size))
-        for k, (log_omega, eta) in enumerate(mode_points):
-            omega_rad_s = math.exp(log_omega)
-            q = self._s / omega_rad_s
-            inverse_denominator = 1 / (1 + eta * q + q * q)
-            numerators = (q * q * inverse_denominator, q**3 * inverse_denominator)
-            spectra[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
+        span = self._linear_spectra(x)
+        residual, linear_parameters = self._solve(x, span)
+        jacobian = np.empty((x.size, residual.size))
+        self._write_jacobian(x, linear_parameters, jacobian)
+        _remove_span(jacobian, span)
+        return _LinearSolution(residual, linear_parameters, jacobian)
+
+    def best_fit(self, x: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the whitened residual and the best linear parameters at a point `x`."""
+        if self._comparison.is_long:
+            self._recent.clear()
+        return self._solve(x, self._linear_spectra(x))
+
+    def cost(self, x: NDArray[np.float64]) -> float:
+        """Return the sum of the squared whitened residual at a point `x`."""
+        residual, _ = self.best_fit(x)
+        return float(residual @ residual)
+
+    def uncertainty(
+        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]
+    ) -> _Uncertainty:
+        """Return covariance and derivatives at a minimum `x` with its linear parameters."""
+        if self._comparison.is_long:
+            self._recent.clear()
+        rows = self._linear_spectra(x, x.size)
+        spectra, jacobian = rows[: -x.size], rows[-x.size :]
+        self._write_jacobian(x, linear_parameters, jacobian)
+        gram, row_lengths = _scaled_gram(jacobian, spectra, regularization=1e-14)
+        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
+        # From here on in place: the rows of a long record take much memory.
+        _orthonormalise(spectra)
+        _remove_span(jacobian, spectra)
+        ln_damping_by_torque = _ln_damping_by_torque(jacobian, x)
+        _orthonormalise(jacobian)
+        return _Uncertainty(covariance, rows, ln_damping_by_torque)
+
+    def _linear_spectra(self, x: NDArray[np.float64], further_rows: int = 0) -> NDArray[np.float64]:
+        """Return the whitened spectra that the linear parameters multiply, shape (m, 2 K).
+
+        They are those of the numerators of the modes, of the background and of the nuisances, in
+        this order. `further_rows` is the number of rows that are added without values.
+        """
+        nuisance_spectra = self._nuisance_spectra(self._poles(x))
+        nuisance_start = x.size + BACKGROUND_COEFFICIENTS
+        nuisance_end = nuisance_start + len(nuisance_spectra)
+        rows = np.empty((nuisance_end + further_rows, 2 * self._weight.size))
+        for row, spectrum in zip(rows[nuisance_start:nuisance_end], nuisance_spectra, strict=True):
+            row[:] = self._whiten(spectrum)
+        del nuisance_spectra
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            _, _, numerators = self._numerators(log_omega, eta)
+            rows[2 * k : 2 * k + 2] = self._predicted_spectra(numerators)
+        rows[x.size : nuisance_start] = self._background
+        return rows
+
+    def _numerators(
+        self, log_omega: float, eta: float
+    ) -> tuple[NDArray[np.complex128], NDArray[np.complex128], tuple[NDArray[np.complex128], ...]]:
+        """Return q, one over the denominator, and both numerators over it, of a mode."""
+        q = self._s / math.exp(log_omega)
+        inverse_denominator = 1 / (1 + eta * q + q * q)
+        return q, inverse_denominator, (q * q * inverse_denominator, q**3 * inverse_denominator)
+
+    def _solve(
+        self, x: NDArray[np.float64], spectra: NDArray[np.float64]
+    ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Return the residual and linear parameters; make their spectra at `x` orthonormal."""
+        triangular_factor = _orthonormalise(spectra)
+        measured_torque = self._measured_torque
+        if self._comparison.drag is not None:
+            measured_torque = measured_torque - self._whiten(self._drag_change(self._poles(x))[0])
+        projections = spectra @ measured_torque
+        residual: NDArray[np.float64] = projections @ spectra - measured_torque
+        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
+        return residual, linear_parameters.astype(np.float64, copy=False)
+
+    def _write_jacobian(
+        self,
+        x: NDArray[np.float64],
+        linear_parameters: NDArray[np.float64],
+        jacobian: NDArray[np.float64],
+    ) -> None:
+        """Write the derivatives of the whitened residual by `x` into an array, shape (k, 2 K)."""
+        poles = self._poles(x)
+        jacobian[:] = 0.0
+        if self._comparison.drag is not None:
+            jacobian[:] = self._whiten(self._drag_change(poles)[1:])
+        if poles:
+            nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
+            decay_gradient = self._comparison.decay_gradient(poles, nuisance_amplitudes)
+            for k, derivative in enumerate(decay_gradient):
+                jacobian[k] += self._whiten(derivative)
+            del decay_gradient
+        for k, (log_omega, eta) in enumerate(x.reshape(-1, 2)):
+            q, inverse_denominator, numerators = self._numerators(log_omega, eta)
             derivative_rows: list[NDArray[np.complex128]] = []
             # Derivatives by ln omega and eta of either numerator over the denominator
             for numerator_power, row in zip((2, 3), numerators, strict=True):
@@ -716,39 +907,13 @@ class _ModalProblem:
                     row * ((eta * q + 2 * q * q) * inverse_denominator - numerator_power)
                 )
                 derivative_rows.append(-row * q * inverse_denominator)
-            derivative_start = numerator_count + 4 * k
-            spectra[derivative_start : derivative_start + 4] = self._predicted_spectra(
-                derivative_rows
-            )
-        poles = self._poles(x)
-        nuisance_spectra = self._whiten(self._nuisance_spectra(poles))
-        drag_spectrum, *drag_jacobian = self._whiten(self._drag_change(poles))
-        linear_spectra = np.concatenate(
-            [spectra[:numerator_count], self._background, nuisance_spectra]
-        )
-        span, triangular_factor = _orthonormal_rows(linear_spectra)
-        measured_torque = self._measured_torque - drag_spectrum
-        projections = span @ measured_torque
-        residual = projections @ span - measured_torque
-        linear_parameters = np.linalg.solve(triangular_factor.T, projections)
-        nuisance_amplitudes = linear_parameters[numerator_count + BACKGROUND_COEFFICIENTS :]
-        jacobian = np.array(drag_jacobian).reshape(x.size, residual.size)
-        if poles:
-            jacobian += self._whiten(self._comparison.decay_gradient(poles, nuisance_amplitudes))
-        for k in range(len(mode_points)):
+            derivatives = self._predicted_spectra(derivative_rows)
             a, b = linear_parameters[2 * k : 2 * k + 2]
-            mode_derivatives = spectra[numerator_count + 4 * k : numerator_count + 4 * k + 4]
-            jacobian[2 * k] += a * mode_derivatives[0] + b * mode_derivatives[2]
-            jacobian[2 * k + 1] += a * mode_derivatives[1] + b * mode_derivatives[3]
-        projected_jacobian = jacobian - (jacobian @ span.T) @ span
-        return (
-            _LinearSolution(residual, linear_parameters, projected_jacobian),
-            _LinearBasis(linear_spectra, span, jacobian),
-        )
+            jacobian[2 * k] += a * derivatives[0] + b * derivatives[2]
+            jacobian[2 * k + 1] += a * derivatives[1] + b * derivatives[3]
 
-    def model(self, x: NDArray[np.float64]) -> ModalModel:
-        """Return the modal model with given frequencies and damping `x` and the best residues."""
-        linear_parameters = self.solution_at(x).linear_parameters
+    def model(self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64]) -> ModalModel:
+        """Return the modal model with given frequencies, damping and linear parameters."""
         mode_points = x.reshape(-1, 2)
         poles, residues = [], []
         background_start = 2 * len(mode_points)
@@ -765,10 +930,11 @@ class _ModalProblem:
             background_coefficients[1] += b / omega_rad_s
         return ModalModel(tuple(poles), tuple(residues), tuple(background_coefficients.tolist()))
 
-    def residual(self, x: NDArray[np.float64], model: ModalModel) -> NDArray[np.complex128]:
+    def residual(
+        self, x: NDArray[np.float64], linear_parameters: NDArray[np.float64], model: ModalModel
+    ) -> NDArray[np.complex128]:
         """Return the residual spectrum of a model at a point in N·m, not whitened, shape (K,)."""
-        nuisance_start = 2 * len(self._numbers) + BACKGROUND_COEFFICIENTS
-        nuisance_amplitudes = self.solution_at(x).linear_parameters[nuisance_start:]
+        nuisance_amplitudes = linear_parameters[x.size + BACKGROUND_COEFFICIENTS :]
         poles = self._poles(x)
         comparison = self._comparison
         predicted_nm = comparison.prediction.torque(model)[0]
@@ -778,32 +944,16 @@ class _ModalProblem:
         drag_change: NDArray[np.complex128] = self._drag_change(poles)[0]
         return drag_change + modal_residual + nuisance_amplitudes @ self._nuisance_spectra(poles)
 
-    def covariance(self, basis: _LinearBasis) -> NDArray[np.float64]:
-        """Return the joint covariance of frequencies, damping and the linear parameters."""
-        _, gram, row_lengths = _scaled_gram(
-            np.concatenate([basis.full_jacobian, basis.columns]), 1e-14
-        )
-        covariance: NDArray[np.float64] = np.linalg.inv(gram) / np.outer(row_lengths, row_lengths)
-        return covariance
-
-    def ln_damping_by_torque(
-        self, solution: _LinearSolution, x: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """Return the derivative of each ln(eta) at the minimum by the whitened torque, (n, 2 K)."""
-        unit_rows, gram, row_lengths = _scaled_gram(solution.jacobian, 1e-14)
-        # The residual is predicted minus measured: the torque enters it with the opposite sign.
-        x_by_torque = np.linalg.solve(gram, unit_rows) / row_lengths[:, None]
-        derivatives: NDArray[np.float64] = x_by_torque[1::2] / x[1::2, None]
-        return derivatives
-
-    def ringing(self, solution: _LinearSolution, covariance: NDArray[np.float64]) -> Ringing:
+    def ringing(
+        self, linear_parameters: NDArray[np.float64], covariance: NDArray[np.float64]
+    ) -> Ringing:
         """Return amplitudes and chi-square of the free decay at the beginning of the record.
 
         The decay of each mode has two amplitudes, which are free linear parameters of the fit.
         """
         mode_count = len(self._numbers)
         decay_start = 2 * mode_count + BACKGROUND_COEFFICIENTS
-        decay_amplitudes = solution.linear_parameters[decay_start : decay_start + 2 * mode_count]
+        decay_amplitudes = linear_parameters[decay_start : decay_start + 2 * mode_count]
         decay_rows = slice(
             2 * mode_count + decay_start, 2 * mode_count + decay_start + 2 * mode_count
         )
@@ -817,7 +967,10 @@ class _ModalProblem:
         )
 
     def constants(
-        self, solution: _LinearSolution, x: NDArray[np.float64], covariance: NDArray[np.float64]
+        self,
+        linear_parameters: NDArray[np.float64],
+        x: NDArray[np.float64],
+        covariance: NDArray[np.float64],
     ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Return the constants of all modes, and their covariance with the background coefficients.
 
@@ -835,7 +988,7 @@ class _ModalProblem:
         )
         for k in range(mode_count):
             log_omega, eta = x[2 * k : 2 * k + 2]
-            a, b = solution.linear_parameters[2 * k : 2 * k + 2]
+            a, b = linear_parameters[2 * k : 2 * k + 2]
             q = _relative_pole(eta)
             residue_numerator = a + b * q
             # ln of the residue over j: ln omega + ln (a + b q) + 2 ln q - ln(2 Im q) + j pi

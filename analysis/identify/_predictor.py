@@ -21,7 +21,7 @@ from rigd.beam import (
 )
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Iterator, Sequence
 
     from numpy.typing import NDArray
 
@@ -105,6 +105,19 @@ class TorquePredictor:
         torque_spectra = self._torque_spectra(plant, wrt)
         torque_and_derivatives = self._transform.inverse(torque_spectra, self._retained)
         return torque_and_derivatives[0], torque_and_derivatives[1:]
+
+    def torque_rows(
+        self, plant: Plant | ModalModel, wrt: Sequence[str]
+    ) -> Iterator[NDArray[np.float64]]:
+        """Yield the predicted torque in N·m at the retained samples, then its derivatives, (m,).
+
+        Parameters
+        ----------
+        plant, wrt
+            As for `torque`.
+        """
+        for torque_spectrum in self._torque_spectra(plant, wrt):
+            yield self._transform.inverse(torque_spectrum, self._retained)
 
     def _torque_spectra(
         self, plant: Plant | ModalModel, wrt: Sequence[str]

@@ -78,10 +78,6 @@ class Projected:
 _MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
-_MOST_BINS_OF_TWO_POINTS: Final = 65_536
-"""Maximum number of bins with which the results at two points are cached, and not at one: the
-results of all structures of a record of 30 minutes take 0.3 GB."""
-
 _UNKNOWNS_TOLERANCE: Final = 1e-6
 """Change of the unknowns below which the filling of unknown torques has converged."""
 
@@ -114,22 +110,26 @@ class Objective:
         self.comparison = comparison
         self.unknowns = unknowns
         self.columns = no_columns if effect_spectra is None else effect_spectra
-        is_large = comparison.frequency_hz.size > _MOST_BINS_OF_TWO_POINTS
-        self._recent: RecentValues[Linearisation] = RecentValues(1 if is_large else 2)
+        self._recent: RecentValues[Linearisation] = (
+            comparison.shared_values if comparison.is_long else RecentValues()
+        )
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return the torque residual and its derivatives for the unknowns `x`.
 
         The results at the last points are cached.
         """
-        return self._recent.at(x, self._linearise)
+        owner = self if self.comparison.is_long else None
+        return self._recent.at(x, self._linearise, owner)
 
     def _linearise(self, x: NDArray[np.float64]) -> Linearisation:
         """Return torque residual and derivatives for the unknowns `x`, without the cache."""
         comparison, unknowns = self.comparison, self.unknowns
         gradient_names = unknowns.gradient_names
         plant, parameters_by_unknowns = unknowns.plant_and_gradient(x)
-        predicted_nm, torque_gradient = comparison.prediction.torque(plant, gradient_names)
+        # One row after another: time series and their transforms take much memory.
+        predicted_rows = comparison.prediction.torque_rows(plant, gradient_names)
+        predicted_nm = next(predicted_rows)
         poles = tuple(
             Pole(
                 plant_pole.mode, plant_pole.at_rad_s, plant_pole.derivative @ parameters_by_unknowns
@@ -137,9 +137,10 @@ class Objective:
             for plant_pole in comparison.poles(plant, gradient_names)
         )
         residual = comparison.spectrum(predicted_nm - comparison.torque_nm[comparison.retained])
-        jacobian = (
-            parameters_by_unknowns.T @ _as_real_rows(comparison.spectrum(torque_gradient))
-        ).view(np.complex128)
+        derivatives = np.empty((len(gradient_names), residual.size), dtype=np.complex128)
+        for derivative_spectrum, derivative_nm in zip(derivatives, predicted_rows, strict=True):
+            derivative_spectrum[:] = comparison.spectrum(derivative_nm)
+        jacobian = (parameters_by_unknowns.T @ _as_real_rows(derivatives)).view(np.complex128)
         if comparison.drag is not None:
             drag_change, drag_derivatives = comparison.drag.change_to(
                 plant, poles, unknowns.names, parameters_by_unknowns

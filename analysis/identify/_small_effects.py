@@ -112,7 +112,7 @@ def small_effect(
         ("air drag", "Air drag", drag_spectrum),
     ]
     cost_reductions = modal.cost_reduction_by_spectrum(
-        np.array([torque_spectrum for _, _, torque_spectrum in possible_effects])
+        [torque_spectrum for _, _, torque_spectrum in possible_effects]
     )
     best_index = int(np.argmax(cost_reductions))
     if cost_reductions[best_index] < MIN_DEVIANCE_REDUCTION:

@@ -89,7 +89,7 @@ def best_stiffness_step(comparison: Comparison, fit: ModalFit) -> StiffnessStep:
             [step_torque.spectrum(int(sample_index)) for sample_index in sample_indices]
         )
         whitened_spectra = np.ascontiguousarray(step_spectra * fit.noise.weight).view(np.float64)
-        whitened_spectra = whitened_spectra - (whitened_spectra @ fit.span.T) @ fit.span
+        whitened_spectra = fit.outside_span(whitened_spectra)
         spectrum_squares = np.einsum("ij,ij->i", whitened_spectra, whitened_spectra)
         spectrum_squares[spectrum_squares == 0] = np.inf
         correlation = -(whitened_spectra @ real_residual)  # the residual is model less measurement

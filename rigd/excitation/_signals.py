@@ -1,9 +1,9 @@
 """Reference signals: chirp, hold, step and multisine, and the segments of every excitation."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from math import isfinite, pi
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Final
 
 import numpy as np
 from annotated_types import doc
@@ -27,6 +27,9 @@ a sine any more."""
 LIMIT_FRACTION = 0.9
 """Largest fraction of each of the rig's limits that the predicted motion may use. The remainder is
 for a beam that differs from the predicted beam."""
+
+_BLOCK_TICKS: Final = 1 << 16
+"""Number of ticks of a sweep that are computed at once."""
 
 
 class ExcitationError(UserError, ValueError):
@@ -333,20 +336,25 @@ def chirp(
         segment_ticks = lay_out_segments(rate_hz, rest_s, 2.0 * duration_s, ring_down_s)
         back_ticks = there_ticks[1], segment_ticks["sweep"][1]
         segment_ticks |= {"there": there_ticks, "back": back_ticks}
-    t = _sweep_times_s(segment_ticks, rate_hz)
-    # Time on the way there and on the way back, where the phase goes on from the turn.
-    outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
-    phase_rad = (
-        2.0 * pi * (start_hz * outward_s + (stop_hz - start_hz) * outward_s**2 / (2.0 * duration_s))
-    )
-    phase_rad += (
-        2.0 * pi * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
-    )
-    sweep_rad = (
-        amplitude_rad
-        * np.sin(phase_rad)
-        * _taper_factors(t, (1 + there_and_back) * duration_s, taper_s)
-    )
+
+    def angle_at(t: FloatArray) -> FloatArray:
+        # Time on the way there and on the way back, where the phase goes on from the turn.
+        outward_s, return_s = np.minimum(t, duration_s), np.maximum(t - duration_s, 0.0)
+        phase_rad = (
+            2.0
+            * pi
+            * (start_hz * outward_s + (stop_hz - start_hz) * outward_s**2 / (2.0 * duration_s))
+        )
+        phase_rad += (
+            2.0
+            * pi
+            * (stop_hz * return_s - (stop_hz - start_hz) * return_s**2 / (2.0 * duration_s))
+        )
+        taper_factors = _taper_factors(t, (1 + there_and_back) * duration_s, taper_s)
+        angle_rad: FloatArray = amplitude_rad * np.sin(phase_rad) * taper_factors
+        return angle_rad
+
+    sweep_rad = _sweep_in_blocks(segment_ticks, rate_hz, angle_at)
     parameters = {
         "amplitude_rad": amplitude_rad,
         "start_hz": start_hz,
@@ -539,6 +547,24 @@ def _sweep_times_s(segments: Mapping[str, tuple[int, int]], rate_hz: float) -> F
     """Return the time in s of each tick of the sweep, from its first tick on."""
     sweep_begin, sweep_end = segments["sweep"]
     return np.arange(sweep_end - sweep_begin) / rate_hz
+
+
+def _sweep_in_blocks(
+    segments: Mapping[str, tuple[int, int]],
+    rate_hz: float,
+    angle_at: Callable[[FloatArray], FloatArray],
+) -> FloatArray:
+    """Return the angles in rad at all ticks of the sweep, from a function of times in s.
+
+    The function is called for blocks of ticks, because its intermediate results would take several
+    times the memory of a long sweep.
+    """
+    sweep_begin, sweep_end = segments["sweep"]
+    sweep_rad = np.empty(sweep_end - sweep_begin)
+    for first_tick in range(0, sweep_rad.size, _BLOCK_TICKS):
+        block_rad = sweep_rad[first_tick : first_tick + _BLOCK_TICKS]
+        block_rad[:] = angle_at(np.arange(first_tick, first_tick + block_rad.size) / rate_hz)
+    return sweep_rad
 
 
 def _taper_factors(t: FloatArray, duration_s: float, taper_s: float) -> FloatArray | float:

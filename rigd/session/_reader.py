@@ -29,7 +29,6 @@ from rigd.session._message_decoder import (
 )
 from rigd.session._schema import EVENT_LEVELS, EVENT_TOPIC, FORMAT_VERSION, SAMPLE_TOPIC
 from rigd.session._writer import is_being_written
-from rigd.session.layout import to_native
 from rigd.units import unit_of
 
 if TYPE_CHECKING:
@@ -140,7 +139,8 @@ def read_session(
     path : path of a complete file, whose format docs/session_format.md defines
     fields : sample fields to store, which must include ``tick`` and ``t_ns``; None for all
     max_samples : maximum number of samples, each of which takes up to 112 bytes of memory
-    on_samples : called with each block of samples, with all fields, while the file is read
+    on_samples : called with each block of samples, with all fields, while the file is read; the
+        session then has no samples
 
     Raises
     ------
@@ -159,7 +159,16 @@ def read_session(
     """
     path = Path(path)
     undecoded_log = _UndecodedLog()
-    sample_buffer = TopicBuffer(path, SAMPLES, fields, max_samples, on_samples)
+    sample_order = _SampleOrder(path)
+
+    def pass_on(samples: npt.NDArray[np.void]) -> None:
+        assert on_samples is not None
+        sample_order.add(samples)
+        on_samples(samples)
+
+    sample_buffer = TopicBuffer(
+        path, SAMPLES, fields, max_samples, None if on_samples is None else pass_on
+    )
 
     def add_block(mcap_contents: McapContents, block: MessageBlock) -> None:
         sample_buffer.decoder.add_block(mcap_contents, block)
@@ -174,8 +183,10 @@ def read_session(
             f"program reads version {FORMAT_VERSION}. Use a newer version of it."
         )
     sample_array = sample_buffer.finish(mcap_contents)
-    _check_ticks(path, sample_array)
-    start_utc_ns = _start_utc_ns(path, metadata, undecoded_log.first_log_time, sample_array)
+    sample_order.add(sample_array)
+    start_utc_ns = _start_utc_ns(
+        path, metadata, undecoded_log.first_log_time, sample_order.first_t_ns
+    )
     return Session(
         path=path,
         samples=sample_array,
@@ -251,7 +262,7 @@ class TopicBuffer:
     layout : layout of the messages
     fields : names of the fields to store; None for all
     max_messages : maximum number of messages; more of them raise an error
-    on_messages : called with each block of messages, with all fields
+    on_messages : called with each block of messages, with all fields, which are not stored then
     """
 
     def __init__(
@@ -268,7 +279,9 @@ class TopicBuffer:
         self._max_messages = max_messages
         self._on_messages = on_messages
         # Unused memory of the array is never allocated, and most files need no more.
-        expected_messages = min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
+        expected_messages = (
+            0 if on_messages else min(_file_size(path) // _MIN_SAMPLE_BYTES, max_messages)
+        )
         self._array = np.empty(expected_messages, layout.dtype_of(fields))
         self._message_count = 0
 
@@ -283,23 +296,19 @@ class TopicBuffer:
                 f"{self._path} holds more than the {self._max_messages} messages of {self._topic} "
                 "that fit into the memory that reading a session may take. Give a shorter session."
             )
+        if self._on_messages is not None:
+            return np.empty(count, self.decoder.dtype)
         if end > len(self._array):
             # Resized without a copy, by a small fraction: two arrays would take too much memory.
             new_length = max(end, len(self._array) + max(_MIN_ARRAY_GROWTH, len(self._array) // 8))
             self._array.resize(min(new_length, self._max_messages), refcheck=False)
-        if self._on_messages is not None:
-            return np.empty(count, self.decoder.dtype)
         return self._array[self._message_count : end]
 
     def store(self, messages: npt.NDArray[np.void]) -> None:
-        """Include the decoded messages in the array, after passing them to `on_messages`."""
-        end = self._message_count + len(messages)
+        """Include the decoded messages, which are in the array, or pass them to `on_messages`."""
         if self._on_messages is not None:
             self._on_messages(messages)
-            to_native(
-                messages, self._array.dtype.names or (), self._array[self._message_count : end]
-            )
-        self._message_count = end
+        self._message_count += len(messages)
 
     def finish(self, contents: McapContents) -> npt.NDArray[np.void]:
         """Decode the remaining messages, and return all of them as an array (n,).
@@ -307,7 +316,8 @@ class TopicBuffer:
         Raises SessionError if the messages violate the format, or if there are too many.
         """
         self.decoder.finish(contents)
-        self._array.resize(self._message_count, refcheck=False)
+        if self._on_messages is None:
+            self._array.resize(self._message_count, refcheck=False)
         return self._array
 
 
@@ -442,26 +452,45 @@ def merged_metadata(contents: McapContents, record_name: str) -> dict[str, str] 
     )
 
 
-def _check_ticks(path: Path, samples: npt.NDArray[np.void]) -> None:
-    """Raise if the ticks do not increase from each sample to the next."""
-    ticks = samples["tick"]
-    backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
-    if len(backward_indices):
-        first_backward_index = int(backward_indices[0])
-        raise SessionError(
-            f"{path}: tick {ticks[first_backward_index + 1]} follows tick "
-            f"{ticks[first_backward_index]} in {SAMPLE_TOPIC}, but "
+class _SampleOrder:
+    """Check that ticks increase from each sample to the next, also from block to block."""
+
+    def __init__(self, path: Path) -> None:
+        self.first_t_ns: int | None = None
+        """Time of the first sample in nanoseconds since the session start."""
+        self._path = path
+        self._last_tick: int | None = None
+
+    def add(self, samples: npt.NDArray[np.void]) -> None:
+        """Check the next samples; raise SessionError if their ticks do not increase."""
+        ticks = samples["tick"]
+        if not len(ticks):
+            return
+        if self.first_t_ns is None:
+            self.first_t_ns = int(samples["t_ns"][0])
+        if self._last_tick is not None and ticks[0] <= self._last_tick:
+            raise self._error(self._last_tick, int(ticks[0]))
+        self._last_tick = int(ticks[-1])
+        backward_indices = np.flatnonzero(ticks[1:] <= ticks[:-1])
+        if len(backward_indices):
+            raise self._error(*ticks[backward_indices[0] :][:2].tolist())
+
+    def _error(self, tick: int, next_tick: int) -> SessionError:
+        """Return the error for a tick that follows one that is not less."""
+        return SessionError(
+            f"{self._path}: tick {next_tick} follows tick {tick} in {SAMPLE_TOPIC}, but "
             "ticks must increase from sample to sample. Those that do are saved with `rigd recover "
-            f"{shlex.quote(str(path))}`."
+            f"{shlex.quote(str(self._path))}`."
         )
 
 
 def _start_utc_ns(
-    path: Path, metadata: dict[str, str], log_time: int | None, samples: npt.NDArray[np.void]
+    path: Path, metadata: dict[str, str], log_time: int | None, first_t_ns: int | None
 ) -> int:
     """Return the wall-clock time of tick 0 in nanoseconds since the Unix epoch, or 0 if unknown.
 
-    It is taken from the metadata, or from `log_time`, the log time of the first sample.
+    It is taken from the metadata, or from `log_time`, the log time of the first sample, whose time
+    since the session's start is `first_t_ns`.
     """
     start_time_text = metadata.get("start_utc_ns")
     if start_time_text is not None:
@@ -472,8 +501,8 @@ def _start_utc_ns(
             f"{quoted_excerpt(start_time_text)}. The "
             "writing program must state it as a whole number of ns since 1970, or leave it out."
         )
-    if log_time is not None and len(samples):
-        return log_time - int(samples["t_ns"][0])
+    if log_time is not None and first_t_ns is not None:
+        return log_time - first_t_ns
     return 0
 
 

@@ -189,7 +189,6 @@ def recover(
         try:
             read_session(
                 temporary_path,
-                fields=ORDER_AND_FLAG_FIELDS,
                 max_samples=limits.MAX_SAMPLES_WITHOUT_SIGNALS,
                 on_samples=read_back_digest.add,
             )

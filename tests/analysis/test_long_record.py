@@ -7,9 +7,10 @@ import pytest
 
 from analysis import api
 from analysis.decimation import Decimation
-from analysis.identify import Measurement
+from analysis.identify import BAND_HZ, Measurement, fit_freest_alone
 from analysis.record import RecordError, load_record
 from rigd.session.layout import Status
+from rigd.testing import chirp_signals
 
 LONGEST = 100_000
 FACTOR, REACH = 8, 33
@@ -131,3 +132,23 @@ def test_a_torque_that_never_changes_is_no_data_of_a_sensor(paper_signals, write
     path = write_session(tmp_path / "silent.mcap", silent)
     with pytest.raises(RecordError, match="delivered no data"):
         load_record(path, longest_samples=LONGEST)
+
+
+@pytest.mark.fit
+def test_a_fit_in_blocks_of_bins_finds_the_same(monkeypatch, write_session, tmp_path):
+    path = write_session(tmp_path / "a.mcap", chirp_signals(sweep_s=15.0))
+    measurement = Measurement.of_record(load_record(path))
+    whole = fit_freest_alone(measurement, BAND_HZ)[0]
+    for module, name, most in (
+        ("_comparison", "MAX_BINS_OF_STORED_RESULTS", 300),
+        ("_modal_fit", "MAX_BINS_OF_STORED_RESULTS", 300),
+        ("_modal_fit", "_COLUMNS_AT_ONCE", 500),
+    ):
+        monkeypatch.setattr(f"analysis.identify.{module}.{name}", most)
+    in_blocks = fit_freest_alone(measurement, BAND_HZ)[0]
+    assert len(whole.modes) == 3
+    for expected, found in zip(whole.modes, in_blocks.modes, strict=True):
+        for name in ("frequency_hz", "damping_ratio"):
+            value, other = getattr(expected, name), getattr(found, name)
+            assert other.value == pytest.approx(value.value, abs=0.01 * value.std)
+            assert other.std == pytest.approx(value.std, rel=0.01)

@@ -2,6 +2,7 @@
 
 import threading
 import time
+import tracemalloc
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ from rigd.engine.reference import (
     write_reference,
 )
 from rigd.engine.shared_state import SharedState, StateField, Stop
+from rigd.excitation import chirp
 
 UNIT_RAD = 1e-7
 """Unit of the angles here: pieces begin and end at rest."""
@@ -33,6 +35,23 @@ class InUnits:
         self.append = lambda angles: writer.append(angles * UNIT_RAD)
         self.at = lambda tick: round(reader.reference_at(tick) / UNIT_RAD)
         self.waits, self.over = reader.must_wait, reader.is_after_end
+
+
+def test_a_long_chirp_is_planned_and_shared_without_copies():
+    tracemalloc.start()
+    try:
+        reference_rad = chirp(rate_hz=1000, duration_s=1000.0).reference_rad
+        planning_bytes = tracemalloc.get_traced_memory()[1]
+        fd = shared_memory_fd()
+        tracemalloc.reset_peak()
+        before_bytes = tracemalloc.get_traced_memory()[0]
+        reference = write_reference(fd, reference_rad)
+        sharing_bytes = tracemalloc.get_traced_memory()[1] - before_bytes
+    finally:
+        tracemalloc.stop()
+    assert np.array_equal(map_reference(reference), reference_rad)
+    assert planning_bytes < 3 * reference_rad.nbytes
+    assert sharing_bytes < 0.1 * reference_rad.nbytes
 
 
 def growing(planned=3, room=40):

@@ -52,6 +52,14 @@ def test_a_recorded_session_is_read_back(kit, recorded):
     assert session.number("angle_delay_s", 0.0) == 0.0
 
 
+def test_samples_that_are_passed_on_are_not_stored(recorded):
+    blocks = []
+    session = read_session(recorded.path, on_samples=lambda block: blocks.append(block.copy()))
+    assert session == dataclasses.replace(read_session(recorded.path), samples=session.samples)
+    assert len(session.samples) == 0
+    np.testing.assert_array_equal(np.concatenate(blocks), recorded.samples)
+
+
 def test_many_small_chunks_share_one_decompressor(kit, tmp_path, monkeypatch):
     """Making one takes 28 µs, a small chunk one: a file of them would take seven times as long."""
     made = []
