@@ -116,6 +116,8 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
                 f"server {server.percent:.1f} %, {resident_mb(server.pid):.0f} MB; "
                 f"{result.live_dropped} samples not shown"
             )
+        if result.outcome != "complete" or result.path is None:
+            raise SystemExit(f"The session was not completed: {result.reason}")
         samples = read_session(result.path).samples
     found = record_measurement(
         WITH if live else WITHOUT,

@@ -19,7 +19,7 @@ import tempfile
 from pathlib import Path
 
 import numpy as np
-from bench_moves import left_nm
+from bench_moves import WIDE, left_nm
 from gate import Gate, Row, percent
 
 from rigd.errors import UserError
@@ -31,8 +31,6 @@ from rigd.testing import write_profile
 
 ANGLES_RAD = (0.1, 0.4, 0.8)
 SILENT = {"simulation.torque_noise_nm": 0.0, "simulation.force_noise_n": 0.0}
-WIDE = {"limits.tip_slope_rad": 1.5}
-"""A move of 0.8 rad bends the beam by more than a linear model is exact for."""
 RIGS: dict[str, dict[str, float]] = {
     "uniform": {},
     "friction 0.02": {"motor.coulomb_nm": 0.02},

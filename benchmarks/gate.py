@@ -100,6 +100,11 @@ class Gate:
         if self.given.json is not None:
             found = {
                 "benchmark": Path(sys.argv[0]).stem.removeprefix("bench_"),
+                "options": {
+                    name: value
+                    for name, value in vars(self.given).items()
+                    if name not in ("report", "json") and isinstance(value, str | int | float)
+                },
                 "seconds": round(time.monotonic() - self._start_s, 1),
                 "rows": [row.as_dict() for row in rows],
             }

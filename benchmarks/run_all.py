@@ -4,8 +4,8 @@
     python benchmarks/run_all.py --release
 
 Each runs at its own default size, which together take at most half an hour on an idle computer of
-two cores. The rows of all go to ``build/bench.json``. The exit code is 1 if a row is beyond its
-limit, or if a benchmark ended without a result.
+two cores. The rows of all, with options and seconds, go to ``build/bench.json``. The exit code is 1
+if a row is beyond its limit, or if a benchmark ended without a result.
 
 ``--release`` runs nothing: it appends the values of ``build/bench.json`` to
 ``docs/validation/benchmarks.json``, which has the last releases, and writes the page

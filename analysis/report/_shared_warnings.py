@@ -1,4 +1,4 @@
-"""Warnings of several files: one that files share is reported once, with their names."""
+"""Warnings of several files: one of several files is reported once, with their names."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
     Returns
     -------
     list of str
-        Sentences that begin with the name of the file, or with the number of files that share the
+        Sentences that begin with the name of the file, or with the number of files that have the
         warning and a few of their names.
     """
     names_by_text: dict[str, dict[int, str]] = {}
@@ -57,7 +57,7 @@ def shared_warnings(files: Sequence[FileWarnings]) -> list[str]:
 
 
 def _files_text(names: Sequence[str], file_count: int) -> str:
-    """Return a text on the files that share a warning: their number and a few names."""
+    """Return a text on the files with a warning: their number and a few names."""
     if len(names) == 1:
         return names[0]
     if len(names) == file_count:

@@ -96,7 +96,7 @@ def campaign_tables(
 
 
 def _session_warnings(campaign: CampaignResult) -> list[str]:
-    """Return the sessions' own warnings, those that several sessions share once."""
+    """Return the sessions' own warnings, each once."""
     return shared_warnings(
         [
             FileWarnings(session.name, session.path, session.warnings)
