@@ -51,7 +51,8 @@ mark("the paper's route")
 selection = analysis.identify.select(Measurement.of_record(record))
 mark("whole record")
 from analysis.results import RecordResult, WholeRecord
-from analysis.report import frf_figure, illustrations, write_report
+from analysis.report import frf_figure, illustrations
+from analysis.report.record_report import write_report
 mark("imports of matplotlib")
 result = RecordResult(record, WholeRecord(record, selection, BAND_HZ), welch)
 write_report(result, Path(sys.argv[2]), mark)
