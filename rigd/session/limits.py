@@ -8,7 +8,7 @@ from typing import Final
 MAX_SAMPLES: Final = 4_000_000
 """Maximum number of samples of a record that is planned, recorded, imported, analysed, exported or
 replayed: an hour at 1 kHz, with rest and ring-down. The samples take 0.45 GB of memory. An
-analysis, which decimates a long record while it is read, takes 0.6 GB with the default band."""
+analysis, which decimates a long record while it is read, takes 0.65 GB with the default band."""
 MAX_SAMPLES_WITHOUT_SIGNALS: Final = 7_200_000
 """Maximum number of samples if only times, ticks and flags are read, or a part of the signals: two
 hours at 1 kHz, the longest recording of an earlier version."""
