@@ -121,6 +121,8 @@ class Record:
     angle_rad: Real
     torque_nm: Real
     known: NDArray[np.bool_] | None = None
+    frequencies_change: bool = False
+    """Whether the frequency of a mode is that of the moment at which the sweep passes it."""
 
     def measurement(self) -> Measurement:
         """As the analyzer is given it: ideal channels, the beam as it is."""
@@ -273,7 +275,8 @@ def stiffness_changes(share: float, rig: Rig, seed: int) -> Record:
     def force(i: int, r: float, w: float, _v: float, k: float) -> float:
         return ramp[i] * k * (r + rig.zeta * w)
 
-    return _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
+    changing = _with_forces(record(rig, seed), {1: force, 2: force, 3: force})
+    return replace(changing, frequencies_change=True)
 
 
 def stiffens(shares: dict[int, float], power: int, rig: Rig, seed: int) -> Record:
