@@ -31,7 +31,7 @@ from analysis.campaigns._statistics import (
     parameter_statistics,
     ranked_structures,
 )
-from analysis.campaigns._validation import FEWEST_SESSIONS, LeftOutError, LostTrial, validate
+from analysis.campaigns._validation import MIN_SESSIONS, LeftOutError, LostTrial, validate
 from analysis.campaigns._verdict import CampaignVerdict, campaign_verdict
 from analysis.campaigns._welch_bias import WelchBias, welch_biases
 from analysis.campaigns.pooling import PooledEstimate, PooledMode, freest_estimate, pooled_estimates
@@ -124,7 +124,7 @@ class CampaignResult:
     @property
     def trials(self) -> int:
         """Number of sessions whose torque was to be predicted by models of the other sessions."""
-        return len(self.sessions) if len(self.sessions) >= FEWEST_SESSIONS else 0
+        return len(self.sessions) if len(self.sessions) >= MIN_SESSIONS else 0
 
 
 def campaign(
@@ -224,7 +224,7 @@ def campaign(
             )
         validation: tuple[LeftOutError, ...] = ()
         lost_sessions: tuple[LostTrial, ...] = ()
-        if len(sessions) >= FEWEST_SESSIONS:
+        if len(sessions) >= MIN_SESSIONS:
             total_steps = len(paths) + len(sessions)
             session_names = [session.path.name for session in sessions]
             validation, lost_sessions = validate(

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.pooling import RandomEffects
 
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _COMMON_MODE_FRACTION: Final = 0.9
 """Fraction of the sessions that must show a mode for it to be pooled."""
@@ -129,7 +129,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
         for session in modal_sessions
         if session.modal and set(common_modes) <= set(session.modal.visible)
     ]
-    if not common_modes or len(used_sessions) < _FEWEST_SESSIONS:
+    if not common_modes or len(used_sessions) < _MIN_SESSIONS:
         return None
     pooled_constants = _pooled_constants(
         [session.modal for session in used_sessions if session.modal is not None], common_modes
@@ -182,7 +182,7 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     Such a mode is visible in at least 90 % of the sessions, and in at least two.
     """
     mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
-    fewest_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _FEWEST_SESSIONS)
+    fewest_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _MIN_SESSIONS)
     return tuple(
         sorted(
             mode_number
@@ -340,7 +340,7 @@ def _pool_groups(
 ) -> Iterable[tuple[NDArray[np.float64], NDArray[np.float64]]]:
     """Yield pooled constants and background of each group of estimates, with their covariance."""
     for group_estimates in groups:
-        if len(group_estimates) < _FEWEST_SESSIONS:
+        if len(group_estimates) < _MIN_SESSIONS:
             yield _constants_and_background(group_estimates[0], modes)
         else:
             pooled_effects = _pooled_constants(group_estimates, modes)

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._session import SessionAnalysis
     from analysis.campaigns.workers import Workers
 
-FEWEST_SESSIONS: Final = 3
+MIN_SESSIONS: Final = 3
 """Smallest number of sessions for which each can be predicted from the others, as pooling needs
 two."""
 

@@ -206,7 +206,7 @@ def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, flo
 
 # Structures
 
-_FEWEST_SESSIONS: Final = 2
+_MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
 _DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, Order], ...]] = (
     ("internal", "zeta", "alpha"),
@@ -359,7 +359,7 @@ def pool_estimates(estimates: Sequence[RecordEstimate]) -> PooledEstimate | None
     not in the common covariance. The pooled plant has the unweighted mean of such a parameter.
     """
     used_estimates = list(filter(determines_damping, estimates))
-    if len(used_estimates) < _FEWEST_SESSIONS:
+    if len(used_estimates) < _MIN_SESSIONS:
         return None
     determined_names = [
         parameter_name
@@ -416,7 +416,7 @@ def pooled_bic(estimates: Sequence[RecordEstimate]) -> float:
         if all(parameter_name in e.determined for e in estimates)
     ]
     common_deviance = sum(e.deviance for e in estimates)
-    if common_names and len(estimates) >= _FEWEST_SESSIONS:
+    if common_names and len(estimates) >= _MIN_SESSIONS:
         common_deviance += random_effects(*_stack_estimates(estimates, common_names)).deviance
     separate_cost = (len(damping_parameters) - len(common_names)) * sum(
         math.log(e.values) for e in estimates

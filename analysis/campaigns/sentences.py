@@ -119,7 +119,7 @@ MIXTURE_NOTE: Final = (
     "mixture, which may be valid for none of them."
 )
 """Footnote that explains `MIXTURE_MARK`."""
-_MOST_FILES_LISTED: Final = 5
+_MAX_FILES_LISTED: Final = 5
 """Largest number of file names that a sentence lists."""
 _SLIGHT_FREQUENCY_SCATTER: Final = 2e-3
 """Relative scatter of a frequency that one beam may show: ten kelvin change the stiffness of steel
@@ -271,9 +271,9 @@ def _mean_text(session_values: Sequence[float], scatter: Heterogeneity) -> str:
 
 def _list_files(file_names: Sequence[str]) -> str:
     """Return the number of files and the names of the first few."""
-    listed_names = ", ".join(file_names[:_MOST_FILES_LISTED]) + (
-        f" and {len(file_names) - _MOST_FILES_LISTED} more"
-        if len(file_names) > _MOST_FILES_LISTED
+    listed_names = ", ".join(file_names[:_MAX_FILES_LISTED]) + (
+        f" and {len(file_names) - _MAX_FILES_LISTED} more"
+        if len(file_names) > _MAX_FILES_LISTED
         else ""
     )
     return f"{len(file_names)} file{'' if len(file_names) == 1 else 's'} ({listed_names})"
@@ -670,11 +670,11 @@ def describe_dissent(
     if not sessions:
         return []
     session_texts = ", ".join(
-        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MOST_FILES_LISTED]
+        f"{file_name} (type {structure})" for file_name, structure in sessions[:_MAX_FILES_LISTED]
     )
     more_text = (
-        f" and {len(sessions) - _MOST_FILES_LISTED} more"
-        if len(sessions) > _MOST_FILES_LISTED
+        f" and {len(sessions) - _MAX_FILES_LISTED} more"
+        if len(sessions) > _MAX_FILES_LISTED
         else ""
     )
     return [
@@ -773,11 +773,11 @@ def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]
         return []
     reasons_text = "; ".join(
         f"{lost_trial.path.name}: {lost_trial.reason}"
-        for lost_trial in lost_sessions[:_MOST_FILES_LISTED]
+        for lost_trial in lost_sessions[:_MAX_FILES_LISTED]
     )
     more_text = (
-        f"; and {len(lost_sessions) - _MOST_FILES_LISTED} more"
-        if len(lost_sessions) > _MOST_FILES_LISTED
+        f"; and {len(lost_sessions) - _MAX_FILES_LISTED} more"
+        if len(lost_sessions) > _MAX_FILES_LISTED
         else ""
     )
     return [

@@ -38,7 +38,7 @@ Result = TypeVar("Result")
 _PRESENCE_CHECK_INTERVAL_S: Final = 2.0
 """Interval in seconds at which the presence of worker processes is checked."""
 
-_FEWEST_LOST_TASKS: Final = 2
+_MIN_LOST_TASKS: Final = 2
 """Number of lost tasks, with none finished, from which the workers and not the tasks are at
 fault."""
 
@@ -148,7 +148,7 @@ class Workers:
                 if (
                     self._no_workers_message
                     and not any_finished
-                    and (len(task_results) >= _FEWEST_LOST_TASKS or not task_queue)
+                    and (len(task_results) >= _MIN_LOST_TASKS or not task_queue)
                 ):
                     raise CampaignError(self._no_workers_message)
                 self._replace_executor()

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 _DEFAULT_NAME: Final = "campaign"
 """Default name of a campaign, for its report folder."""
-_MOST_FIGURES: Final = 8
+_MAX_FIGURES: Final = 8
 """Largest number of figures, for the progress bar; each takes about half as long as a session."""
 
 
@@ -126,11 +126,11 @@ def _analyse_and_write(
     from rigd.printable import progress_bar
 
     with progress_bar("{task.completed:.0f}/{task.total:.0f}") as progress:
-        bar = progress.add_task("starting", total=2 * file_count + _MOST_FIGURES)
+        bar = progress.add_task("starting", total=2 * file_count + _MAX_FIGURES)
 
         def on_progress(done_steps: int, total_steps: int, file_name: str) -> None:
             progress.update(
-                bar, completed=done_steps, total=total_steps + _MOST_FIGURES, description=file_name
+                bar, completed=done_steps, total=total_steps + _MAX_FIGURES, description=file_name
             )
 
         with new_folder(report_folder, overwrite=outputs.overwrite) as partial_folder:

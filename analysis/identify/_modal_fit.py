@@ -64,7 +64,7 @@ _MODE_REACH_HALF_WIDTHS: Final = 3.0
 """Distance from a mode, in half-widths of its resonance, within which the noise has no narrow peak.
 """
 
-_LEAST_RELATIVE_MODE_REACH: Final = 0.02
+_MIN_RELATIVE_MODE_REACH: Final = 0.02
 """Minimum distance from a mode, relative to its frequency, within which the noise has no narrow
 peak."""
 
@@ -383,7 +383,7 @@ class _ModalSearch:
         mode_hz, eta = np.exp(self.x[::2]) / (2 * np.pi), self.x[1::2]
         margin_hz = _MODE_REACH_MARGIN_BINS * float(hz[1, 0] - hz[0, 0])
         reach_hz = (
-            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _LEAST_RELATIVE_MODE_REACH) * mode_hz
+            np.maximum(_MODE_REACH_HALF_WIDTHS * eta / 2, _MIN_RELATIVE_MODE_REACH) * mode_hz
             + margin_hz
         )
         if within_resonance:

@@ -78,7 +78,7 @@ class Projected:
 _MAX_TORQUE_FILLINGS: Final = 8
 """Maximum number of times that a descent is repeated with unknown torques filled again."""
 
-_MOST_BINS_OF_TWO_POINTS: Final = 65_536
+_MAX_BINS_OF_TWO_POINTS: Final = 65_536
 """Maximum number of bins with which the results at two points are cached, and not at one: the
 results of all structures of a record of 30 minutes take 0.3 GB."""
 
@@ -114,7 +114,7 @@ class Objective:
         self.comparison = comparison
         self.unknowns = unknowns
         self.columns = no_columns if effect_spectra is None else effect_spectra
-        is_large = comparison.frequency_hz.size > _MOST_BINS_OF_TWO_POINTS
+        is_large = comparison.frequency_hz.size > _MAX_BINS_OF_TWO_POINTS
         self._recent: RecentValues[Linearisation] = RecentValues(1 if is_large else 2)
 
     def linearise(self, x: NDArray[np.float64]) -> Linearisation:

@@ -416,7 +416,7 @@ _START_GRID: Final[dict[str, tuple[float, ...]]] = {
 }
 """Values of the unknowns in the coarse grid. A coefficient is the logarithm of the damping relative
 to stiffness or inertia at a mode, about twice a damping ratio."""
-_MOST_STARTS: Final = 8
+_MAX_STARTS: Final = 8
 """Largest number of descents for each structure."""
 
 
@@ -443,7 +443,7 @@ def starting_points(
         is_minimum &= np.pad(cost_differences, pad_start) <= 0
     minimum_indices = np.flatnonzero(is_minimum)
     sorted_minima = minimum_indices[np.argsort(grid_costs.ravel()[minimum_indices])]
-    return [grid_points[i] for i in sorted_minima[:_MOST_STARTS]]
+    return [grid_points[i] for i in sorted_minima[:_MAX_STARTS]]
 
 
 # Covariance

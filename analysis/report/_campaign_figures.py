@@ -225,7 +225,7 @@ _PANEL_COLUMNS: Final = 500
 """Number of columns into which a response is decimated in a small panel."""
 _WIDE_COLUMNS: Final = 1500
 """Number of columns into which a response is decimated in a wide panel."""
-_MOST_DRAWN_SESSIONS: Final = 40
+_MAX_DRAWN_SESSIONS: Final = 40
 """Largest number of sessions whose responses are drawn: more would not be distinguishable."""
 SESSION_COLOR: Final = "#A8A8A8"
 """Colour of a single session's response."""
@@ -302,7 +302,7 @@ def _new_response_figure(
     """Return an empty figure whose title states the sessions and the response estimator."""
     session_count = len(campaign.sessions)
     drawn_sessions_text = (
-        "" if session_count <= _MOST_DRAWN_SESSIONS else f", {_MOST_DRAWN_SESSIONS} of them drawn"
+        "" if session_count <= _MAX_DRAWN_SESSIONS else f", {_MAX_DRAWN_SESSIONS} of them drawn"
     )
     return style.new_figure(
         width_in, height_in, f"{session_count} sessions — {figure_heading}",
@@ -349,9 +349,7 @@ def _draw_responses(
 def shown_sessions(campaign: CampaignResult) -> list[SessionAnalysis]:
     """Return the sessions to draw together, evenly spread over the campaign."""
     last_index = len(campaign.sessions) - 1
-    session_indices = np.unique(
-        np.linspace(0, last_index, _MOST_DRAWN_SESSIONS).round().astype(int)
-    )
+    session_indices = np.unique(np.linspace(0, last_index, _MAX_DRAWN_SESSIONS).round().astype(int))
     return [campaign.sessions[session_index] for session_index in session_indices]
 
 

@@ -34,9 +34,9 @@ if TYPE_CHECKING:
 
 _PERIODS_SHOWN: Final = 12
 """Number of a mode's periods that its enlarged panel shows."""
-_LEAST_DETAIL_S: Final = 0.3
+_MIN_DETAIL_S: Final = 0.3
 """Least duration that an enlarged panel shows, in seconds."""
-_MOST_DETAIL_FRACTION: Final = 1 / 8
+_MAX_DETAIL_FRACTION: Final = 1 / 8
 """Largest duration that an enlarged panel shows, as a fraction of the record."""
 
 
@@ -71,8 +71,8 @@ def resonance_intervals(record: Record, mode_count: int) -> tuple[RecordInterval
         interval_centre_s = largest_oscillation_time_s(
             record.torque_nm, record.rate_hz, frequency_hz
         )
-        interval_length_s = min(_PERIODS_SHOWN / frequency_hz, _MOST_DETAIL_FRACTION * duration_s)
-        interval_length_s = max(interval_length_s, _LEAST_DETAIL_S)
+        interval_length_s = min(_PERIODS_SHOWN / frequency_hz, _MAX_DETAIL_FRACTION * duration_s)
+        interval_length_s = max(interval_length_s, _MIN_DETAIL_S)
         sample_count = min(round(interval_length_s * record.rate_hz), len(record.time_s))
         first_sample = round((interval_centre_s - interval_length_s / 2) * record.rate_hz)
         first_sample = min(max(first_sample, 0), len(record.time_s) - sample_count)

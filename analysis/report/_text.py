@@ -208,7 +208,7 @@ def with_empty_lines(tables_to_show: Iterable[Table]) -> Iterator[RenderableType
 
 # Damping in sentences
 
-_LEAST_PLAIN_VALUE: Final = 1e-3
+_MIN_PLAIN_VALUE: Final = 1e-3
 """Value below which a damping is written with the power of ten that zeta has in the paper."""
 
 _DAMPING_SYMBOLS: Final = {
@@ -283,7 +283,7 @@ def _size_text(loss_factor: ReportedLossFactor) -> str:
     coefficient_symbol, unit_text, *_names = _DAMPING_SYMBOLS[loss_factor.damping]
     damping_size = loss_factor.size
     display_factor, power_of_ten = (
-        (1e5, " · 10⁻⁵") if damping_size.value < _LEAST_PLAIN_VALUE else (1.0, "")
+        (1e5, " · 10⁻⁵") if damping_size.value < _MIN_PLAIN_VALUE else (1.0, "")
     )
     value_cell, lower_cell, upper_cell = estimate_cells(
         (damping_size.value, *(damping_size.interval_95 or (None, None))),

@@ -23,11 +23,11 @@ _SHOWN_BEFORE_MS: Final = 25.0
 """Time that is shown before a touch, in milliseconds."""
 _SHOWN_AFTER_MS: Final = 100.0
 """Time that is shown after a touch, in milliseconds."""
-_LEAST_LOG_LIKELIHOOD_RANGE: Final = 40.0
+_MIN_LOG_LIKELIHOOD_RANGE: Final = 40.0
 """Least range of the log-likelihood's axis."""
 _LINEAR_RANGE_STD: Final = 5.0
 """Number of standard deviations up to which the axis of innovations is linear."""
-_MOST_DETAIL_FRACTION: Final = 0.25
+_MAX_DETAIL_FRACTION: Final = 0.25
 """Largest extent of the contact points, relative to the antenna, for an enlarged map of them."""
 _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE, style.ORANGE)
 """Colours of the sessions in the map."""
@@ -95,7 +95,7 @@ def _draw_likelihood(axes: Axes, estimate: TouchEstimate) -> None:
         axes.axvline(estimate.x_m.value, color=style.VERMILION, linewidth=0.9)
     axes.set_xlim(0.0, float(estimate.positions_m[-1]))
     axes.set_ylim(
-        -max(_LEAST_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
+        -max(_MIN_LOG_LIKELIHOOD_RANGE, float(np.quantile(-relative_log_likelihood, 0.75))), 2.0
     )
     axes.set_title("Point of contact")
     axes.set_ylabel("Relative log-likelihood")
@@ -162,7 +162,7 @@ def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
     )
     length_m = max(session.model.plant.beam.length_m for session in touched_sessions)
     spread_m = float(np.ptp(contact_points_m, axis=0).max())
-    has_detail = spread_m < _MOST_DETAIL_FRACTION * length_m
+    has_detail = spread_m < _MAX_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
     grid = figure.add_gridspec(
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22

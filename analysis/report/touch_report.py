@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from analysis.touch import Touch, TouchedSession
     from rigd.touch import Estimated
 
-_MOST_INTERVAL_ASYMMETRY = 0.25
+_MAX_INTERVAL_ASYMMETRY = 0.25
 """Asymmetry of an interval above which its ends are shown instead of value and half-width.
 
 It is the distance of the value from the middle, relative to the interval's length."""
@@ -101,7 +101,7 @@ def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) 
     lower_limit, upper_limit = (
         interval_limit + display_offset for interval_limit in estimated_quantity.interval_95
     )
-    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MOST_INTERVAL_ASYMMETRY * (
+    if abs(shown_value - (lower_limit + upper_limit) / 2) > _MAX_INTERVAL_ASYMMETRY * (
         upper_limit - lower_limit
     ):
         decimal_digits = decimals((upper_limit - lower_limit) / 2)

@@ -59,13 +59,13 @@ if TYPE_CHECKING:
 
 # Closed loop
 
-LEAST_TORQUE_GAIN_FACTOR = 1.2
+MIN_TORQUE_GAIN_FACTOR = 1.2
 """Smallest gain margin at torque command and torque reading, as a factor up and down."""
-LEAST_ANGLE_GAIN_FACTOR = 2.0
+MIN_ANGLE_GAIN_FACTOR = 2.0
 """Smallest gain margin at the angle reading, as a factor up and down."""
-LEAST_PHASE_MARGIN_RAD = radians(20.0)
+MIN_PHASE_MARGIN_RAD = radians(20.0)
 """Smallest phase margin in rad without a warning."""
-LEAST_DELAY_MARGIN_PERIODS = 1.0
+MIN_DELAY_MARGIN_PERIODS = 1.0
 """Smallest delay margin without a warning, in periods of the loop."""
 
 
@@ -125,13 +125,9 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
     period_s = 1.0 / profile.rig.rate_hz
     for cut_margins in loop_margins(closed_loop):
         least_gain_factor = (
-            LEAST_ANGLE_GAIN_FACTOR
-            if cut_margins.cut == "angle reading"
-            else LEAST_TORQUE_GAIN_FACTOR
+            MIN_ANGLE_GAIN_FACTOR if cut_margins.cut == "angle reading" else MIN_TORQUE_GAIN_FACTOR
         )
-        yield from _margin_rows(
-            cut_margins, least_gain_factor, LEAST_DELAY_MARGIN_PERIODS * period_s
-        )
+        yield from _margin_rows(cut_margins, least_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s)
 
 
 def _margin_rows(
@@ -163,8 +159,8 @@ def _margin_rows(
         row_group,
         "phase margin",
         _with_frequency(f"{degrees(margins.phase_rad):.1f}°", margins.phase_hz),
-        f"{degrees(LEAST_PHASE_MARGIN_RAD):.0f}°",
-        grade(fail=False, warn=margins.phase_rad < LEAST_PHASE_MARGIN_RAD),
+        f"{degrees(MIN_PHASE_MARGIN_RAD):.0f}°",
+        grade(fail=False, warn=margins.phase_rad < MIN_PHASE_MARGIN_RAD),
     )
     yield CheckRow(
         row_group,

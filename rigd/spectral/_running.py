@@ -32,7 +32,7 @@ from rigd.spectral._window import WINDOW
 Real = NDArray[np.float64]
 """Array of real numbers."""
 
-LEAST_SEGMENT_FRACTION: Final = 0.25
+MIN_SEGMENT_FRACTION: Final = 0.25
 """Least fraction of a segment from which a response is estimated.
 
 Shorter segments have too little resolution."""
@@ -158,7 +158,7 @@ class RunningResponse:
         """Return whether the newest samples count as a segment in addition to the whole ones."""
         if self._segments.end == self._summed_up_to or (is_final and self._sums.segments):
             return False
-        return newest_count >= LEAST_SEGMENT_FRACTION * self._length
+        return newest_count >= MIN_SEGMENT_FRACTION * self._length
 
     def _add(
         self,

@@ -25,7 +25,7 @@ from rigd.text_table._cells import (
 from rigd.text_table._encoding import encodings
 from rigd.text_table._errors import TableError
 from rigd.text_table._layout import (
-    MOST_HEAD_LINES,
+    MAX_HEAD_LINES,
     TableLayout,
     comma_in_single_message,
     find_layout,
@@ -38,14 +38,14 @@ from rigd.text_table._layout import (
 from rigd.text_table._stamps import StampReader, is_stamp
 from rigd.text_table.titles import is_title_of_times, stated_unit_of, time_unit_s
 
-MOST_LINE_CHARACTERS: Final = 65_536
+MAX_LINE_CHARACTERS: Final = 65_536
 """Largest number of characters in a line; a longer line is an error.
 
 It is enough for hundreds of columns."""
 
 _ENCODING_BYTES: Final = 4
 """Number of bytes from which the encoding is detected."""
-_MOST_HEAD_CHARACTERS: Final = 1_000_000
+_MAX_HEAD_CHARACTERS: Final = 1_000_000
 """Number of characters after which no further lines are read to detect the layout."""
 _TIME_DIMENSIONS: Final = ("", "time", "zeit")
 """Values of the key X_Dimension for samples over time, in LabVIEW's files."""
@@ -192,10 +192,10 @@ def _first_lines(lines: Iterator[str]) -> list[str]:
     """Return the first lines of a file, from which the layout is detected."""
     first_lines: list[str] = []
     character_count = 0
-    for text_line in islice(lines, MOST_HEAD_LINES):
+    for text_line in islice(lines, MAX_HEAD_LINES):
         first_lines.append(text_line)
         character_count += len(text_line)
-        if character_count > _MOST_HEAD_CHARACTERS:
+        if character_count > _MAX_HEAD_CHARACTERS:
             break
     return first_lines
 
@@ -218,11 +218,11 @@ def _open_lines(stream: BinaryIO, encoding: str) -> Iterator[Iterator[str]]:
 def _lines_of_bounded_length(text_stream: TextIOWrapper) -> Iterator[str]:
     """Yield the lines of a text, and raise TableError for a line that is too long."""
     line_number = 0
-    while text_line := text_stream.readline(MOST_LINE_CHARACTERS + 1):
+    while text_line := text_stream.readline(MAX_LINE_CHARACTERS + 1):
         line_number += 1
-        if len(text_line) > MOST_LINE_CHARACTERS:
+        if len(text_line) > MAX_LINE_CHARACTERS:
             raise TableError(
-                f"line {line_number}: a line of more than {MOST_LINE_CHARACTERS} characters; a "
+                f"line {line_number}: a line of more than {MAX_LINE_CHARACTERS} characters; a "
                 "table has one line per sample and few channels. Export the session's channels "
                 "alone."
             )

@@ -115,7 +115,7 @@ HEALTH: Final = (
     ),
 )
 """Plots of the tab Health."""
-_LEAST_PLOTS_FOR_TWO_COLUMNS: Final = 4
+_MIN_PLOTS_FOR_TWO_COLUMNS: Final = 4
 """Least number of plots in the tab Health for which they are arranged in two columns."""
 TIME_VIEWS: Final = (*OVERVIEW_PLOTS, *SIGNALS, *HEALTH)
 """All plots over time of the window, without those of the tab Fit."""
@@ -244,7 +244,7 @@ def _health(absent_components: Collection[str]) -> "rrb.Container":
     return rrb.Horizontal(
         rrb.Grid(
             *map(_plot, shown_views),
-            grid_columns=1 if len(shown_views) < _LEAST_PLOTS_FOR_TWO_COLUMNS else 2,
+            grid_columns=1 if len(shown_views) < _MIN_PLOTS_FOR_TWO_COLUMNS else 2,
         ),
         _summary(),
         column_shares=[7, 2],
@@ -404,7 +404,7 @@ def _log() -> "rrb.TextLogView":
 
 # Axis labels
 
-LEAST_LABEL_SPACING_PT: Final = 24.0
+MIN_LABEL_SPACING_PT: Final = 24.0
 """Least distance between axis labels, in points.
 
 Rerun omits labels nearer than 20 points, and fades those at 21."""
@@ -414,9 +414,9 @@ AXIS_TO_RANGE_RATIO: Final = 1.1
 
 _EXTREMES_INTERVAL_NS: Final = 100_000_000
 """Length of the intervals, in nanoseconds, over which the extremes of the values are computed."""
-_MOST_VALUE_TO_AXIS_RATIO: Final = 1e9
+_MAX_VALUE_TO_AXIS_RATIO: Final = 1e9
 """Ratio of the largest value to the least axis length above which Rerun alone chooses the axis."""
-_LEAST_LABEL_SPACING, _MOST_LABEL_SPACING = 1e-300, 1e300
+_MIN_LABEL_SPACING, _MAX_LABEL_SPACING = 1e-300, 1e300
 """Smallest and largest distance between axis labels, in the unit of the values, for which points
 are added.
 
@@ -583,7 +583,7 @@ def missing_ticks(
     """
     if (
         0.0 <= highest_value - lowest_value < least_span
-        and max(-lowest_value, highest_value) < _MOST_VALUE_TO_AXIS_RATIO * least_span
+        and max(-lowest_value, highest_value) < _MAX_VALUE_TO_AXIS_RATIO * least_span
     ):
         # The ends are multiples of a step, so that noise does not move the axis.
         tick_step = least_span / 2
@@ -613,10 +613,10 @@ def missing_ticks(
             value_above if value_above > highest_value else None,
         )
     label_spacing = (
-        AXIS_TO_RANGE_RATIO * (highest_value - lowest_value) / height_pt * LEAST_LABEL_SPACING_PT
+        AXIS_TO_RANGE_RATIO * (highest_value - lowest_value) / height_pt * MIN_LABEL_SPACING_PT
     )
     # Rerun shows a single value with one unit on either side.
-    if not _LEAST_LABEL_SPACING < label_spacing < _MOST_LABEL_SPACING:
+    if not _MIN_LABEL_SPACING < label_spacing < _MAX_LABEL_SPACING:
         return None, None
     tick_step = 10.0 ** math.ceil(math.log10(label_spacing))
     first_multiple, last_multiple = (

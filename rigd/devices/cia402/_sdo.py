@@ -44,7 +44,7 @@ _SDO_ATTEMPTS = 2
 """Number of attempts of one SDO transfer."""
 _HURRIED_TIMEOUT_S = 0.05
 """Time in seconds to wait for an SDO reply while the torque has to be switched off quickly."""
-_MOST_LATE_REPLIES = 3
+_MAX_LATE_REPLIES = 3
 """Most replies to earlier, abandoned requests that may arrive before the awaited reply."""
 _LATE_REPLY_SILENCE_S = 0.25
 """Silence in seconds after which all replies to abandoned requests have arrived."""
@@ -360,7 +360,7 @@ def _transfer_skipping_late_replies(
     client: SdoClient, variable: SdoVariable, value: int | None
 ) -> object:
     """Read or write a value by SDO, and skip late replies to abandoned requests."""
-    for attempts_left in reversed(range(_MOST_LATE_REPLIES + 1)):
+    for attempts_left in reversed(range(_MAX_LATE_REPLIES + 1)):
         try:
             if value is None:
                 return variable.raw

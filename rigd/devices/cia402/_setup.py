@@ -56,7 +56,7 @@ _RATED_TORQUE_TOLERANCE = 0.02
 _SCALE_TOLERANCE = 0.02
 """Largest difference, relative, between gear ratio or encoder step of the drive and of the
 profile."""
-_MOST_HEARTBEAT_CONSUMERS = 127
+_MAX_HEARTBEAT_CONSUMERS = 127
 """Largest number of heartbeat consumer entries in object 1016."""
 
 
@@ -546,7 +546,7 @@ class _DriveConfiguration:
         present_value = sdo.read_or_none(index, 1)
         if present_value != required_value:
             # A second entry for one node is refused (0x06040043): clear stored entries first.
-            for sub in range(2, min(sdo.read_or_none(index) or 0, _MOST_HEARTBEAT_CONSUMERS) + 1):
+            for sub in range(2, min(sdo.read_or_none(index) or 0, _MAX_HEARTBEAT_CONSUMERS) + 1):
                 stored_value = sdo.read_or_none(index, sub)
                 if stored_value is not None and stored_value >> 16 & 0x7F == host_id:
                     sdo.configure(index, sub, 0)
@@ -642,7 +642,7 @@ def _is_ratio_equal(drive_value: float, profile_value: float) -> bool:
 
 def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
     """Disable all PDOs of the drive except the first, which the rig uses."""
-    for pdo_offset in range(1, objects.MOST_PDO_COUNT):
+    for pdo_offset in range(1, objects.MAX_PDO_COUNT):
         cob_id = sdo.read_or_none(communication + pdo_offset, 1)
         if cob_id is None:
             # Above the PDOs that CiA 301 predefines, indices are used without gaps.

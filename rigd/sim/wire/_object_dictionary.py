@@ -17,7 +17,7 @@ INTEGER_LETTERS = "bBhHiIqQ"
 """Letters of :mod:`struct` for the integer types."""
 _INTEGER_LAYOUTS = {kind: Struct("<" + kind) for kind in INTEGER_LETTERS}
 """Binary layout of each integer type, by its letter."""
-_MOST_TEXT_BYTES = 1024
+_MAX_TEXT_BYTES = 1024
 """Largest number of bytes that can be written to a text of variable length."""
 
 
@@ -183,9 +183,7 @@ class Entry:
         if self.kind != "s":
             return 8 * byte_count == self.bits
         return (
-            byte_count == len(self.text)
-            if self.has_fixed_length
-            else byte_count <= _MOST_TEXT_BYTES
+            byte_count == len(self.text) if self.has_fixed_length else byte_count <= _MAX_TEXT_BYTES
         )
 
     @property
@@ -193,7 +191,7 @@ class Entry:
         """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
-        return len(self.text) if self.has_fixed_length else _MOST_TEXT_BYTES
+        return len(self.text) if self.has_fixed_length else _MAX_TEXT_BYTES
 
     def get(self) -> int:
         """Return the present value of an integer entry."""
