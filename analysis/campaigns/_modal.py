@@ -182,12 +182,12 @@ def _common_modes(estimates: Sequence[ModalEstimate]) -> tuple[int, ...]:
     Such a mode is visible in at least 90 % of the sessions, and in at least two.
     """
     mode_counts = Counter(mode_number for estimate in estimates for mode_number in estimate.visible)
-    fewest_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _MIN_SESSIONS)
+    min_sessions = max(_COMMON_MODE_FRACTION * len(estimates), _MIN_SESSIONS)
     return tuple(
         sorted(
             mode_number
             for mode_number, session_count in mode_counts.items()
-            if session_count >= fewest_sessions
+            if session_count >= min_sessions
         )
     )
 

@@ -83,7 +83,7 @@ class Workers:
 
     _process_end_error: type[Exception] = BrokenExecutor
     """Exception by which the executor reports that the process of a task ended."""
-    _most_in_progress: int | None = None
+    _max_in_progress: int | None = None
     """Most tasks in progress at once; the fewer, the fewer have to run again after a process
     ended."""
     _lost_task_reason: str
@@ -170,7 +170,7 @@ class Workers:
         last_seen_s = time.monotonic()
         while in_progress or (task_queue and not interrupted_tasks):
             while (
-                task_queue and not interrupted_tasks and len(in_progress) != self._most_in_progress
+                task_queue and not interrupted_tasks and len(in_progress) != self._max_in_progress
             ):
                 try:
                     in_progress[submit_task(task_queue[0])] = task_queue[0]
@@ -250,12 +250,12 @@ class _LocalWorkers(Workers):
 
     def __init__(self, jobs: int) -> None:
         super().__init__(_spawn_pool(jobs))
-        self._most_in_progress = jobs
+        self._max_in_progress = jobs
 
     def _replace_executor(self, *, alone: bool = False) -> None:
         """Start a new pool after a worker process ended, with a single process if `alone`."""
         self.close()
-        self._executor = _spawn_pool(1 if alone else self._most_in_progress)
+        self._executor = _spawn_pool(1 if alone else self._max_in_progress)
 
     def close(self, *, wait: bool = True) -> None:
         """Start no more tasks, and end the processes after their present tasks."""

@@ -217,7 +217,7 @@ def damping_size(
     parameter_values: dict[str, float],
     determined_names: Sequence[str],
     covariance: NDArray[np.float64],
-    least_omega_rad_s: float,
+    min_omega_rad_s: float,
 ) -> DampingSize | None:
     """Return the loss factor of a damping at its pivot frequency, or None if undetermined.
 
@@ -258,7 +258,7 @@ def damping_size(
     # At this derivative of ln loss by the order, ln loss and order are uncorrelated:
     pivot_slope = -float(ln_loss_gradient @ covariance[:, j]) / covariance[j, j]
     phase_term = math.pi / 2 / math.tan(order_phase_rad)
-    ln_omega = max(pivot_slope - phase_term, math.log(least_omega_rad_s))
+    ln_omega = max(pivot_slope - phase_term, math.log(min_omega_rad_s))
     if abs(ln_omega) > _MAX_LN_PIVOT_FREQUENCY:
         return None  # an almost undetermined order has no pivot frequency
     ln_loss_gradient[j] = ln_omega + phase_term

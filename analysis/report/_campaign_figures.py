@@ -359,7 +359,7 @@ def draw_session(
     frequency_hz: NDArray[np.float64],
     response: NDArray[np.complex128],
     decimation_columns: int,
-    most_dots: int,
+    max_dots: int,
     opacity: float = 1.0,
 ) -> Line2D:
     """Draw one session's response in the background and return the line of its magnitude."""
@@ -368,7 +368,7 @@ def draw_session(
         color=SESSION_COLOR,
         linewidth=0.5, alpha=opacity, rasterized=True,
     )  # fmt: skip
-    point_indices = style.log_spaced_indices(frequency_hz, most_dots)
+    point_indices = style.log_spaced_indices(frequency_hz, max_dots)
     # Dots, because a line would jump wherever noise wraps the phase.
     phase_axes.plot(
         frequency_hz[point_indices], phase_deg(response[point_indices]), ".", markersize=0.8,

@@ -385,8 +385,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
     A mode far from that of the undamped beam is marked. An overdamped mode is a dash.
     """
     fitted_models = analysis.models
-    most_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
-    if not most_modes:
+    max_modes = max((len(fitted_model.modes) for fitted_model in fitted_models), default=0)
+    if not max_modes:
         return None
 
     def cells(
@@ -402,7 +402,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
             if cell.value is not None and not is_followed:
                 cell = grey_cell(replace(cell, text=cell.text + _FAR_MODE_MARK))
             mode_cells.append(cell)
-        return mode_cells or [number_cell(None)] * most_modes
+        return mode_cells or [number_cell(None)] * max_modes
 
     mode_pairs = [
         mode_pair
@@ -424,8 +424,8 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         "Modes of the fits to Welch's estimate",
         (
             *_NAME_COLUMNS,
-            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, most_modes + 1)),
-            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, most_modes + 1)),
+            *(Column(f"f{n} (Hz)", f"frequency_{n}_hz") for n in range(1, max_modes + 1)),
+            *(Column(f"ξ{n} (%)", f"damping_ratio_{n}") for n in range(1, max_modes + 1)),
         ),
         (
             (

@@ -124,14 +124,14 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
         return
     period_s = 1.0 / profile.rig.rate_hz
     for cut_margins in loop_margins(closed_loop):
-        least_gain_factor = (
+        min_gain_factor = (
             MIN_ANGLE_GAIN_FACTOR if cut_margins.cut == "angle reading" else MIN_TORQUE_GAIN_FACTOR
         )
-        yield from _margin_rows(cut_margins, least_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s)
+        yield from _margin_rows(cut_margins, min_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s)
 
 
 def _margin_rows(
-    margins: "Margins", least_gain_factor: float, least_delay_s: float
+    margins: "Margins", min_gain_factor: float, min_delay_s: float
 ) -> Iterator[CheckRow]:
     """Yield check results on the stability margins at one signal of the loop."""
     row_group = f"loop, {margins.cut}"
@@ -149,10 +149,10 @@ def _margin_rows(
         row_group,
         "gain margin",
         f"{gain_down_text} / {gain_up_text}",
-        f"{_decibels(1 / least_gain_factor)} / {_decibels(least_gain_factor)}",
+        f"{_decibels(1 / min_gain_factor)} / {_decibels(min_gain_factor)}",
         grade(
             fail=False,
-            warn=margins.gain_up < least_gain_factor or margins.gain_down > 1 / least_gain_factor,
+            warn=margins.gain_up < min_gain_factor or margins.gain_down > 1 / min_gain_factor,
         ),
     )
     yield CheckRow(
@@ -168,8 +168,8 @@ def _margin_rows(
         "any"
         if margins.delay_s == inf
         else _with_frequency(f"{margins.delay_s * 1e3:.2f} ms", margins.delay_hz),
-        f"{least_delay_s * 1e3:.2f} ms",
-        grade(fail=False, warn=margins.delay_s < least_delay_s),
+        f"{min_delay_s * 1e3:.2f} ms",
+        grade(fail=False, warn=margins.delay_s < min_delay_s),
     )
     yield CheckRow(
         row_group,

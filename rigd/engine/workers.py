@@ -18,9 +18,9 @@ class MemoryLimit:
 
     fraction: float
     """Fraction of the available memory that the worker may use."""
-    least_bytes: int
+    min_bytes: int
     """Memory in bytes that the worker may use in any case."""
-    largest_bytes: int
+    max_bytes: int
     """Maximum memory in bytes, however much is available."""
 
     def bytes_now(self, meminfo: Path = Path("/proc/meminfo")) -> int:
@@ -33,7 +33,7 @@ class MemoryLimit:
         """
         available_text = meminfo.read_text().partition("MemAvailable:")[2].split()[0]
         allowed_bytes = int(self.fraction * int(available_text) * 1024)
-        return min(max(allowed_bytes, self.least_bytes), self.largest_bytes)
+        return min(max(allowed_bytes, self.min_bytes), self.max_bytes)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -173,7 +173,7 @@ PREDICTION: Final = Worker(
     niceness=19,  # it may run during a session
     # Apart from the control process of a session, the memory of no process is locked. A session of
     # two minutes needs 180 MiB, of which 120 MiB are the program.
-    memory=MemoryLimit(fraction=0.25, least_bytes=256 << 20, largest_bytes=4 << 30),
+    memory=MemoryLimit(fraction=0.25, min_bytes=256 << 20, max_bytes=4 << 30),
     ended_for_memory=True,
     errors_hidden=True,
 )

@@ -257,12 +257,12 @@ class Segments:
                     block_start, sample_block[:, block_start - first_tick : end_tick - first_tick]
                 )
 
-    def newest(self, most_samples: int) -> Real:
-        """Return the newest samples without a gap, shape (channels, n), at most `most_samples`.
+    def newest(self, max_samples: int) -> Real:
+        """Return the newest samples without a gap, shape (channels, n), at most `max_samples`.
 
         The array is a view of the internal array.
         """
-        return self._buffer[:, self._used - min(most_samples, self._available) : self._used]
+        return self._buffer[:, self._used - min(max_samples, self._available) : self._used]
 
     def _add_block(self, first_tick: int, sample_block: Real) -> Iterator[tuple[int, Real]]:
         """Add samples without gaps; yield the first tick and the data of each complete segment."""
@@ -367,7 +367,7 @@ def excited_bins(reference_power: NDArray[np.float64], resolution_bins: int) -> 
     if not largest_power > 0.0:
         return np.zeros(reference_power.shape, dtype=np.bool_)
     without_dips = _is_near_marked(
-        reference_power > WINDOW.least_relative_power * largest_power, resolution_bins
+        reference_power > WINDOW.min_relative_power * largest_power, resolution_bins
     )
     return ~_is_near_marked(~without_dips, 2 * resolution_bins)
 
@@ -446,15 +446,15 @@ class LowBins:
         return low
 
 
-def _fast_length(least_length: int) -> int:
-    """Return the smallest length from `least_length` on without a prime factor above 5."""
-    best_length = 1 << (least_length - 1).bit_length()
+def _fast_length(min_length: int) -> int:
+    """Return the smallest length from `min_length` on without a prime factor above 5."""
+    best_length = 1 << (min_length - 1).bit_length()
     power_of_five = 1
     while power_of_five < best_length:
         odd_factor = power_of_five
         while odd_factor < best_length:
             best_length = min(
-                best_length, odd_factor << (-(-least_length // odd_factor) - 1).bit_length()
+                best_length, odd_factor << (-(-min_length // odd_factor) - 1).bit_length()
             )
             odd_factor *= 3
         power_of_five *= 5

@@ -698,10 +698,10 @@ def _missing_title_error(
 
 def _no_numbers_error(rows: Sequence[TextRow], requested_names: Sequence[str]) -> TableError:
     """Return the error for a table that has no row with numbers in the requested columns."""
-    most_cells = max(len(row.cells) for row in rows)
+    max_cells = max(len(row.cells) for row in rows)
     for column_name in requested_names:
-        if (_column_number(column_name) or 0) > most_cells:
-            return MissingColumnError(column_name, [f"#{n}" for n in range(1, most_cells + 1)], 0)
+        if (_column_number(column_name) or 0) > max_cells:
+            return MissingColumnError(column_name, [f"#{n}" for n in range(1, max_cells + 1)], 0)
     return TableError(
         f"has 0 samples: none of its first {len(rows)} lines has numbers in all of the columns "
         f"{', '.join(requested_names)}."

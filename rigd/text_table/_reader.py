@@ -120,7 +120,7 @@ class TextTable:
     remark: str = ""
 
 
-def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: int) -> TextTable:
+def read_table(stream: BinaryIO, requested_names: Sequence[str], *, max_rows: int) -> TextTable:
     r"""Read some columns of a table of numbers in a text file.
 
     The separator is a tab, a semicolon, a comma, a bar or blanks. The decimal sign is a point or a
@@ -150,7 +150,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
     --------
     >>> from io import BytesIO
     >>> from rigd.text_table import read_table
-    >>> table = read_table(BytesIO(b"t;angle\ns;rad\n0;0,5\n1;0,7\n"), ["angle"], most_rows=10)
+    >>> table = read_table(BytesIO(b"t;angle\ns;rad\n0;0,5\n1;0,7\n"), ["angle"], max_rows=10)
     >>> table.columns["angle"].values.tolist(), table.columns["angle"].unit
     ([0.5, 0.7], 'rad')
     """
@@ -159,7 +159,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
     last_decoding_error: UnicodeError | None = None
     for possible_encoding in encodings(first_bytes):
         try:
-            return _read(stream, possible_encoding, requested_names, most_rows)
+            return _read(stream, possible_encoding, requested_names, max_rows)
         except UnicodeError as found:
             last_decoding_error = last_decoding_error or found
         except csv.Error as found:
@@ -170,7 +170,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, most_rows: i
 
 
 def _read(
-    stream: BinaryIO, encoding: str, requested_names: Sequence[str], most_rows: int
+    stream: BinaryIO, encoding: str, requested_names: Sequence[str], max_rows: int
 ) -> TextTable:
     """Read columns of a text with a given encoding."""
     with _open_lines(stream, encoding) as text_lines:
@@ -181,11 +181,11 @@ def _read(
     )
     try:
         return _read_columns(
-            stream, encoding, table_layout, requested_names, most_rows, decimal_sign
+            stream, encoding, table_layout, requested_names, max_rows, decimal_sign
         )
     except _DecimalCommaError:
         # Read again from the start: a point in earlier lines may not be a decimal point.
-        return _read_columns(stream, encoding, table_layout, requested_names, most_rows, COMMA)
+        return _read_columns(stream, encoding, table_layout, requested_names, max_rows, COMMA)
 
 
 def _first_lines(lines: Iterator[str]) -> list[str]:
@@ -368,7 +368,7 @@ def _read_columns(
     encoding: str,
     layout: TableLayout,
     requested_names: Sequence[str],
-    most_rows: int,
+    max_rows: int,
     decimal_sign: str,
 ) -> TextTable:
     """Read the requested columns and the column of times, with a given decimal sign."""
@@ -437,7 +437,7 @@ def _read_columns(
             for append_value, column_index in stamp_appends:
                 append_value(number_rows.stamp(row, column_index, line_number))
             line_numbers.append(line_number)
-            if len(line_numbers) > most_rows:
+            if len(line_numbers) > max_rows:
                 break
     number_rows.check_thousands()
     return _text_table(

@@ -522,7 +522,7 @@ class _AxisExtremes:
         high_ns, greatest_value = self._greatest.take(t_ns, greatest_value)
         low_ns, minus_low = self._least.take(t_ns, -least_value)
         value_below, value_above = missing_ticks(
-            -minus_low, greatest_value, self.view.height, self.view.plot.least_span
+            -minus_low, greatest_value, self.view.height, self.view.plot.min_span
         )
         # When either extreme leaves the window, the missing points are computed again.
         first_extreme_ns = min(low_ns, high_ns)
@@ -563,7 +563,7 @@ class _RunningMaximum:
 
 
 def missing_ticks(
-    lowest_value: float, highest_value: float, height_pt: float, least_span: float = 0.0
+    lowest_value: float, highest_value: float, height_pt: float, min_span: float = 0.0
 ) -> tuple[float | None, float | None]:
     """Return the values to add to a plot so that its axis has two labels and its least length.
 
@@ -573,7 +573,7 @@ def missing_ticks(
         Least and greatest plotted value.
     height_pt
         Height of the plot, in points.
-    least_span
+    min_span
         Least length of the axis, in the unit of the values.
 
     Returns
@@ -582,11 +582,11 @@ def missing_ticks(
         Values to add below and above the plotted values; None if none is needed on that side.
     """
     if (
-        0.0 <= highest_value - lowest_value < least_span
-        and max(-lowest_value, highest_value) < _MAX_VALUE_TO_AXIS_RATIO * least_span
+        0.0 <= highest_value - lowest_value < min_span
+        and max(-lowest_value, highest_value) < _MAX_VALUE_TO_AXIS_RATIO * min_span
     ):
         # The ends are multiples of a step, so that noise does not move the axis.
-        tick_step = least_span / 2
+        tick_step = min_span / 2
         first_multiple, last_multiple = (
             math.floor(lowest_value / tick_step),
             math.ceil(highest_value / tick_step),

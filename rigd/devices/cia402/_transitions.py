@@ -284,9 +284,7 @@ def _send_controlword_until(
     """Send a controlword with zero torque once a period until `is_reached` returns True."""
     rpdo_frame = node.frames.rpdo(controlword, 0)
     timeout_s = node.settings.enable_timeout_s
-    most_unanswered = (
-        _MAX_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MAX_UNANSWERED_SYNCS
-    )
+    max_unanswered = _MAX_UNANSWERED_SYNCS_IN_LOCK_STEP if node.lock_step else _MAX_UNANSWERED_SYNCS
     unanswered_syncs = 0
     for _ in range(ceil(timeout_s * node.rate_hz)):
         if stop():
@@ -301,7 +299,7 @@ def _send_controlword_until(
         if is_answered and is_reached():
             return
         unanswered_syncs = 0 if is_answered else unanswered_syncs + 1
-        if unanswered_syncs >= most_unanswered:
+        if unanswered_syncs >= max_unanswered:
             raise DeviceError(
                 f"{node.name}: it has stopped answering SYNC while being enabled; check its supply "
                 "and the cable."

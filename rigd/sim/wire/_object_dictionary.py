@@ -187,7 +187,7 @@ class Entry:
         )
 
     @property
-    def most_bytes(self) -> int:
+    def max_bytes(self) -> int:
         """Largest number of bytes that can be written to the entry."""
         if self.kind != "s":
             return self.bits // 8
@@ -457,7 +457,7 @@ class SdoServer:
         command_byte = data[0]
         target_entry = self._objects.find_writable(self._index, self._sub)
         if command_byte & _EXPEDITED_BIT:
-            data_size = min(target_entry.most_bytes, _EXPEDITED_SIZE)
+            data_size = min(target_entry.max_bytes, _EXPEDITED_SIZE)
             if command_byte & _SIZE_STATED_BIT:
                 data_size = _EXPEDITED_SIZE - (command_byte >> 2 & 0x03)
             self._write(data[4 : 4 + data_size])
@@ -505,7 +505,7 @@ class SdoServer:
         else:
             self._buffer += data[1 : 1 + _SEGMENT_SIZE - (command_byte >> 1 & 0x07)]
             # No writable entry is longer. Without this check a client could fill the memory.
-            if len(self._buffer) > self._objects.find_writable(self._index, self._sub).most_bytes:
+            if len(self._buffer) > self._objects.find_writable(self._index, self._sub).max_bytes:
                 raise Abort(AbortCode.LENGTH)
             is_last = bool(command_byte & _LAST_SEGMENT_BIT)
             if is_last:
