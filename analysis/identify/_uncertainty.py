@@ -235,7 +235,7 @@ def damping_size(
         Names of the determined parameters.
     covariance : ndarray, shape (k, k)
         Covariance of the determined parameters, with coefficients as logarithms.
-    least_omega_rad_s : float
+    min_omega_rad_s : float
         Smallest pivot frequency: that of the first mode, below which no mode vibrates.
     """
     if coefficient_name not in determined_names:

@@ -15,7 +15,7 @@ import numpy as np
 from rigd.bench.measure import LoopMeasurement, UsageMeter, record_measurement
 from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
-from rigd.engine.messages import Finished, SessionJob
+from rigd.engine.messages import SessionFinished, SessionJob
 from rigd.engine.reference import write_reference
 from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.errors import FailureError
@@ -123,7 +123,7 @@ def run_alone(
         process_group.control.send(SessionJob(profile, reference_record))
         sample_blocks = []
         finished_message = None
-        while not isinstance(finished_message, Finished):
+        while not isinstance(finished_message, SessionFinished):
             finished_message = process_group.control.poll(_POLL_TIMEOUT_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
             usage_meter.sample(Phase(shared_state[StateField.PHASE]))

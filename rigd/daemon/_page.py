@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.daemon._log import LOGGER_NAME
-from rigd.engine.messages import Failed, PageAddress
+from rigd.engine.messages import PageAddress, ProcessFailed
 from rigd.engine.processes import Child, ChildError
 from rigd.engine.workers import PAGE
 from rigd.runtime.addresses import announce, file_name, read_address, runtime_folder, started_at
@@ -114,7 +114,7 @@ class PageProcess:
                 match page_process.poll(None):
                     case PageAddress(port):
                         self._announce(port)
-                    case Failed(failure_text):
+                    case ProcessFailed(failure_text):
                         pass
         except (ChildError, ValueError):  # it has ended, or its input was closed
             page_process.stop()

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Final, Protocol, TypeVar
 
 from rigd.checks import check_on_paper
 from rigd.daemon._protocol import CommandError, StartRequest
-from rigd.engine.messages import Performed
+from rigd.engine.messages import JobPerformed
 from rigd.engine.processes import Child, ChildError, Parent
 from rigd.engine.workers import PLAN, PREDICTION, Worker
 from rigd.errors import RigdError
@@ -194,7 +194,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         raise CommandError(f"Its process ended with exit code {child.exit_code}.") from None
     finally:
         await asyncio.to_thread(child.stop)
-    assert isinstance(performed, Performed)
+    assert isinstance(performed, JobPerformed)
     if isinstance(performed.result, CommandError):
         raise performed.result
     job_result: Result = performed.result
@@ -219,7 +219,7 @@ def main() -> None:
         )
     if isinstance(result_or_error, dict):
         json.dumps(result_or_error, allow_nan=False)  # raises if the reply is not JSON
-    daemon.send(Performed(result_or_error))
+    daemon.send(JobPerformed(result_or_error))
 
 
 if __name__ == "__main__":

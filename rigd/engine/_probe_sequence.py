@@ -11,7 +11,7 @@ from rigd.engine._publish import ReadingPublisher
 from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, StandstillMonitor
-from rigd.engine.messages import Ending
+from rigd.engine.messages import PostRecordPlan
 from rigd.engine.processes import Parent
 from rigd.engine.shared_state import Phase, StateField
 from rigd.engine.timing import Clock, TickScheduler
@@ -41,7 +41,7 @@ class ProbeSequence(SessionSequence):
     ) -> None:
         super().__init__(
             profile, (0.0,), cycle, clock, scheduler, standstill, channels,
-            reading_publisher, parent, stop_request, Ending(),
+            reading_publisher, parent, stop_request, PostRecordPlan(),
         )  # fmt: skip
         self._rig = probed_rig(profile)
         self._move: ProbingMove | None = None

@@ -19,7 +19,7 @@ from rigd.devices.kinds import failure_of_device
 from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
-from rigd.engine.messages import Ending
+from rigd.engine.messages import PostRecordPlan
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import page_faults
 from rigd.engine.reference import ReferenceReader
@@ -142,7 +142,7 @@ class SessionSequence:
         reading_publisher: ReadingPublisher,
         parent: Parent,
         stop_request: StopRequest,
-        ending: Ending,
+        ending: PostRecordPlan,
         touch: "TouchWatch | None" = None,
         reference_reader: ReferenceReader | None = None,
     ) -> None:
@@ -724,7 +724,7 @@ class SessionSequence:
         write_event(self._channels.events, LogEvent(t_ns, level, message))
 
 
-def _return_path(profile: Profile, ending: Ending) -> list[float]:
+def _return_path(profile: Profile, ending: PostRecordPlan) -> list[float]:
     """Return the path of the motor's return as a fraction from 0 to 1 for each tick.
 
     It is computed before the drive is enabled, so that the loop does not pause for it.

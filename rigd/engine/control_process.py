@@ -30,17 +30,17 @@ from rigd.engine.cycle import (
     stored_motor_heat_nm2,
 )
 from rigd.engine.messages import (
-    Connected,
+    ControlEnded,
     ControlJob,
-    Ended,
-    Finished,
-    Measured,
-    Probe,
-    Ready,
-    Refused,
+    DevicesConnected,
+    MeasurementRefused,
+    MeasurementResult,
+    ProbeOrder,
+    ReadyToRecord,
+    SessionFinished,
     SessionJob,
-    Tare,
-    Zero,
+    TareOrder,
+    ZeroOrder,
 )
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import REFUSED, apply_realtime, collect_no_garbage
@@ -84,7 +84,7 @@ def main() -> None:
         # Imports a package and designs its controller before a connected drive expects SYNCs.
         make_controller(job.profile.controlled_rig())
     except RigdError as error:  # of a device, a controller, or a beam that cannot be simulated
-        parent.send(Ended(str(error)))
+        parent.send(ControlEnded(str(error)))
         return
     clock: Clock = VirtualClock() if job.fast else RealClock(int(realtime_settings.spin_us * 1000))
     run_control(job.profile, devices, clock, channels, parent, stop_request, realtime_results)
@@ -126,7 +126,7 @@ def run_control(
         server.observe_standstill()
         name_this_process(IDLE_NAME)
         parent.send(
-            Connected(
+            DevicesConnected(
                 calibration=devices.sensor.calibration(),
                 drive=drive.statement() if isinstance(drive, StatedDrive) else {},
                 realtime=realtime_results,
@@ -143,7 +143,7 @@ def run_control(
         channels.shared_state[StateField.PHASE] = Phase.OFF
         devices.drive.close()
         devices.sensor.close()
-    parent.send(Ended(f"{end_text} {devices.drive.off_doubt}".strip()))
+    parent.send(ControlEnded(f"{end_text} {devices.drive.off_doubt}".strip()))
 
 
 class _ControlServer:
@@ -218,11 +218,11 @@ class _ControlServer:
                         self.store_heat()
                     self.observe_standstill()
                     gc.collect()  # the torque is off: the only time for it
-                case Tare():
+                case TareOrder():
                     self._send_measurement(self._measure_tare)
-                case Zero():
+                case ZeroOrder():
                     self._send_measurement(self._set_zero)
-                case Probe():
+                case ProbeOrder():
                     self._run_probe(supervisor_order.profile)
                     self.observe_standstill()
 
@@ -270,12 +270,12 @@ class _ControlServer:
         self._cycle.check_encoder(self._standstill, self._scheduler.due_ns)
 
     def _run_session(self, session_job: SessionJob) -> None:
-        """Run one session, disable the drive in any case, and send `Finished` to the supervisor.
+        """Run one session, disable the drive in any case, and send `SessionFinished`.
 
         Raises
         ------
         DeviceError
-            If a device failed. `Finished` has been sent nevertheless.
+            If a device failed. `SessionFinished` has been sent nevertheless.
         """
         shared_state, devices = self._shared_state, self._devices
         for state_field in (
@@ -331,7 +331,7 @@ class _ControlServer:
             tare_metadata = session_sequence.tare()
             devices.drive.enable(session_sequence.stop_requested)
             session_sequence.hold()
-            self._parent.send(Ready(tare_metadata | seed_metadata))
+            self._parent.send(ReadyToRecord(tare_metadata | seed_metadata))
             session_sequence.wait_for_go()
             session_sequence.record()
             was_recorded = True
@@ -365,7 +365,7 @@ class _ControlServer:
             # Events after the last tick do not make the record incomplete.
             session_outcome, end_reason = "complete", f"After the record: {end_reason}"
         self._parent.send(
-            Finished(
+            SessionFinished(
                 outcome=session_outcome,
                 reason=end_reason,
                 fault=is_fault,
@@ -412,15 +412,15 @@ class _ControlServer:
             self._parent,
             self._stop,
         )
-        reply_message: Measured | Refused
+        reply_message: MeasurementResult | MeasurementRefused
         failure_text = ""
         name_this_process(SESSION_NAME)
         try:
             probe_sequence.tare()
             self._devices.drive.enable(probe_sequence.stop_requested)
-            reply_message = Measured(probe_sequence.move())
+            reply_message = MeasurementResult(probe_sequence.move())
         except SessionEnd as end:
-            reply_message = Refused(end.reason)
+            reply_message = MeasurementRefused(end.reason)
             failure_text = end.reason if end.device_failed else ""
         finally:
             self._devices.drive.disable()
@@ -434,11 +434,11 @@ class _ControlServer:
         self._parent.send(reply_message)
 
     def _send_measurement(self, measure_at_rest: Callable[[], dict[str, object]]) -> None:
-        """Run a measurement at rest; send its result, or `Refused` with the reason of a failure."""
+        """Run a measurement at rest; send its result, or `MeasurementRefused` with the reason."""
         try:
-            self._parent.send(Measured(measure_at_rest()))
+            self._parent.send(MeasurementResult(measure_at_rest()))
         except SessionEnd as end:
-            self._parent.send(Refused(end.reason))
+            self._parent.send(MeasurementRefused(end.reason))
 
     def _measure_tare(self) -> dict[str, object]:
         """Measure the sensor's zero at rest, and return mean and standard deviation by axis.

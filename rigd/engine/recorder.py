@@ -24,7 +24,15 @@ from rigd.engine.channels import (
     Topic,
     attach_channels,
 )
-from rigd.engine.messages import Armed, Close, Closed, Failed, FileHeader, Opened, RecorderJob
+from rigd.engine.messages import (
+    CloseFile,
+    FileClosed,
+    FileHeader,
+    FileOpened,
+    ProcessFailed,
+    RecorderJob,
+    RecorderReady,
+)
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import Precedence
 from rigd.engine.reference import is_whole
@@ -55,15 +63,15 @@ def main() -> None:
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
-        parent.send(Failed(str(error), taken=isinstance(error, SessionExistsError)))
+        parent.send(ProcessFailed(str(error), taken=isinstance(error, SessionExistsError)))
         raise SystemExit(1) from None
     _publish_free_space(channels.shared_state, job.path.parent)
-    parent.send(Opened(realtime_results))
+    parent.send(FileOpened(realtime_results))
     try:
         _record_until_closed(parent, channels, writer, job.path.parent)
     except SessionError as error:
         failure_text, saved_path = _abandon_recording(writer)
-        parent.send(Failed(f"{error}{failure_text}", saved_path=saved_path))
+        parent.send(ProcessFailed(f"{error}{failure_text}", saved_path=saved_path))
         raise SystemExit(1) from None
 
 
@@ -106,15 +114,15 @@ def _record_until_closed(
         match message:
             case FileHeader():
                 recorder.header = message
-                parent.send(Armed())
-            case Close(outcome, touches, segments):
+                parent.send(RecorderReady())
+            case CloseFile(outcome, touches, segments):
                 recorder.transfer()
                 if recorder.begun:
                     writer.write_touches(touches)
                     parent.send(recorder.close(outcome, segments))
                 else:
                     writer.discard()
-                    parent.send(Closed())
+                    parent.send(FileClosed())
                 return
 
 
@@ -200,7 +208,7 @@ class Recorder:
         self,
         outcome: Mapping[str, str],
         segments: Mapping[str, tuple[int, int]] = MappingProxyType({}),
-    ) -> Closed:
+    ) -> FileClosed:
         """Write the remaining records and the outcome, and close the file.
 
         Parameters
@@ -237,7 +245,7 @@ class Recorder:
             # Segments of a growing reference end with the record.
             segments = segments_until({**self.header.segments, **segments}, scheduled_ticks)
         closed_path = self._writer.close(outcome_with_counts, segments)
-        return Closed(closed_path, tick_counts, outcome["outcome"], outcome["reason"])
+        return FileClosed(closed_path, tick_counts, outcome["outcome"], outcome["reason"])
 
     def close_without_supervisor(self) -> None:
         """Wait until the loop has stopped, and close the file without the supervisor's order."""

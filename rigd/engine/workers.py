@@ -79,7 +79,14 @@ CONTROL: Final = Worker(
     name="control",
     module=CONTROL_MODULE,
     # It takes its real-time priority itself, as the profile states.
-    sends=("Connected", "Ready", "Finished", "Measured", "Refused", "Ended"),
+    sends=(
+        "DevicesConnected",
+        "ReadyToRecord",
+        "SessionFinished",
+        "MeasurementResult",
+        "MeasurementRefused",
+        "ControlEnded",
+    ),
     loss="fault",
     consequence="The drive's watchdog switches it off; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
@@ -89,7 +96,7 @@ CONTROL: Final = Worker(
 RECORDER: Final = Worker(
     name="recorder",
     module="rigd.engine.recorder",
-    sends=("Opened", "Armed", "Closed", "Failed"),
+    sends=("FileOpened", "RecorderReady", "FileClosed", "ProcessFailed"),
     loss="fault",
     consequence="The session ends as a fault.",
     beat=StateField.RECORDER_BEAT,
@@ -101,7 +108,7 @@ RECORDER: Final = Worker(
 LIVE: Final = Worker(
     name="live",
     module="rigd.live.publisher",
-    sends=("LiveAddress", "LiveShown", "Failed"),
+    sends=("LiveAddress", "LiveSessionShown", "ProcessFailed"),
     loss="warning",
     consequence="It is not restarted; the session continues.",
     restarts=3,
@@ -125,7 +132,7 @@ TOUCH: Final = Worker(
 FIT: Final = Worker(
     name="fit",
     module="rigd.runner.fit_process",
-    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "Failed"),
+    sends=("FitReady", "FitReport", "PlannedSegment", "SearchEnded", "ProcessFailed"),
     loss="warning",
     # A session that plans itself ends with what is planned instead.
     consequence="The session continues without fits.",
@@ -157,7 +164,7 @@ switches the torque off."""
 PAGE: Final = Worker(
     name="page",
     module="rigd.web",
-    sends=("PageAddress", "Failed"),
+    sends=("PageAddress", "ProcessFailed"),
     loss="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,
@@ -166,7 +173,7 @@ PAGE: Final = Worker(
 PREDICTION: Final = Worker(
     name="prediction",
     module="rigd.daemon.background",
-    sends=("Performed",),
+    sends=("JobPerformed",),
     loss="nothing",
     consequence="The client's request is refused.",
     end_s=0.0,

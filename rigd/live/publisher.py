@@ -18,14 +18,14 @@ from typing import TYPE_CHECKING, Any, Final
 import numpy as np
 
 from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
-from rigd.engine.messages import Failed
+from rigd.engine.messages import ProcessFailed
 from rigd.engine.processes import Heartbeat, Parent
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
 from rigd.live._feed import DrawingStream
 from rigd.live._program import RerunError
 from rigd.live._ring_reader import SessionRecordReader
 from rigd.live._server import RerunServer
-from rigd.live.messages import LiveEnd, LiveFit, LiveSession, LiveShown, LiveTouches
+from rigd.live.messages import LiveFit, LiveSession, LiveSessionEnded, LiveSessionShown, LiveTouches
 from rigd.runtime import ignore as ignore_signals
 from rigd.session.quick_look import last_quick_look, quick_look_path, read_quick_look
 from rigd.session.touches import touch_line
@@ -88,7 +88,7 @@ def main() -> None:
 
         server_program.wait()
     except (RerunError, ImportError) as error:
-        parent.send(Failed(str(error)))
+        parent.send(ProcessFailed(str(error)))
         raise SystemExit(1) from None
     publisher = _Publisher(parent, channels, server_program)
     publisher.serve()
@@ -128,7 +128,7 @@ class _Publisher:
                 case LiveFit(fit):
                     if self._shown_session is not None:
                         self._shown_session.show_fit(fit)
-                case LiveEnd():
+                case LiveSessionEnded():
                     self._finish_session(supervisor_message)
         self._show_orphaned()
 
@@ -157,7 +157,7 @@ class _Publisher:
 
     def _begin_session(self, session: LiveSession) -> None:
         """Show a new session, after the end of the previous one."""
-        self._finish_session(LiveEnd(session.begins))
+        self._finish_session(LiveSessionEnded(session.begins))
         if self._shown_session is not None:
             self._last_response = (
                 self._shown_session.reader.scene.last_response or self._last_response
@@ -168,9 +168,9 @@ class _Publisher:
         self._server_program.count_session()
         self._drawing_stream.begin(session.recording_id, self._shown_session.reader.scene.frame)
         self._show_new_records()
-        self._parent.send(LiveShown(session.recording_id))
+        self._parent.send(LiveSessionShown(session.recording_id))
 
-    def _finish_session(self, end: LiveEnd) -> None:
+    def _finish_session(self, end: LiveSessionEnded) -> None:
         """Show the end of the present session, unless it has been shown already."""
         if self._shown_session is not None and not self._shown_session.has_ended:
             self._shown_session.finish(end)
@@ -188,7 +188,7 @@ class _Publisher:
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
         self._finish_session(
-            LiveEnd(tuple(ring_buffer.written for ring_buffer in self._channels.rings))
+            LiveSessionEnded(tuple(ring_buffer.written for ring_buffer in self._channels.rings))
         )
 
     def _show_new_records(self) -> None:
@@ -283,7 +283,7 @@ class _ShownSession:
         log_notes = [Note(t_ns, "info", fit_line) for fit_line in fit["text"]]
         self.backlog.put_required([*view_scene.fit(fit), *view_scene.events(log_notes)])
 
-    def finish(self, end: LiveEnd) -> None:
+    def finish(self, end: LiveSessionEnded) -> None:
         """Queue the drawings of the session's remaining records and of its outcome."""
         self.reader.end(end.ends)
         self.queue_new_records()

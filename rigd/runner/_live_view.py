@@ -10,7 +10,14 @@ import numpy as np
 from rigd.beam import undamped_frequencies_rad_s
 from rigd.engine.workers import LIVE
 from rigd.live.address import LiveAddress
-from rigd.live.messages import LiveEnd, LiveFit, LiveJob, LiveSession, LiveShown, LiveTouches
+from rigd.live.messages import (
+    LiveFit,
+    LiveJob,
+    LiveSession,
+    LiveSessionEnded,
+    LiveSessionShown,
+    LiveTouches,
+)
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._session_worker import SessionWorker
@@ -86,7 +93,7 @@ class LiveView(SessionWorker):
         if self._session is not None:
             self._session = None
             end_positions = tuple(ring.written for ring in self._group.channels.rings)
-            self._send(LiveEnd(end_positions, outcome, reason))
+            self._send(LiveSessionEnded(end_positions, outcome, reason))
 
     def _restart(self) -> None:
         """Start a publisher process, and send it the rig and the current session."""
@@ -95,7 +102,7 @@ class LiveView(SessionWorker):
     def _process_message(self, message: object) -> None:
         """Process a message of the publisher: its address, or that it shows the session."""
         match message:
-            case LiveShown():
+            case LiveSessionShown():
                 self._is_session_shown = True
             case LiveAddress():
                 previous_address, self.address = self.address, message

@@ -10,7 +10,16 @@ from typing import Any
 
 from rigd.devices import ActuationTarget, describe_unknown_values
 from rigd.devices.contracts import DeviceError
-from rigd.engine.messages import Connected, ControlJob, Ended, Measured, Probe, Refused, Tare, Zero
+from rigd.engine.messages import (
+    ControlEnded,
+    ControlJob,
+    DevicesConnected,
+    MeasurementRefused,
+    MeasurementResult,
+    ProbeOrder,
+    TareOrder,
+    ZeroOrder,
+)
 from rigd.engine.processes import ChildError
 from rigd.engine.realtime import Precedence
 from rigd.engine.shared_state import SharedState, StateField, Stop
@@ -85,7 +94,7 @@ class Rig:
         self._fast = fast
         self._live = live
         self._group = group
-        self._connection: Connected | None = None
+        self._connection: DevicesConnected | None = None
         self._view: LiveView | None = None
         self._is_zero_set = False
         self._precedence: Precedence | None = None
@@ -158,7 +167,7 @@ class Rig:
             job = ControlJob(self._profile, target, group.channels.specs, self._fast)
             group.idle_process(CONTROL).start(job)
             connection = self._await_message(_CONNECT_TIMEOUT_S)
-            assert isinstance(connection, Connected)
+            assert isinstance(connection, DevicesConnected)
             self._connection = replace(
                 connection, realtime={**connection.realtime, **granted_settings}
             )
@@ -260,7 +269,7 @@ class Rig:
         RigError
             If the tare fails.
         """
-        return self._measure(Tare(), self._profile.session.tare_s)
+        return self._measure(TareOrder(), self._profile.session.tare_s)
 
     def zero(self) -> dict[str, Any]:
         """Set the present motor angle as the rig's zero, to which the limits are relative.
@@ -275,7 +284,7 @@ class Rig:
         RigError
             If the motor moves.
         """
-        zero_reply = self._measure(Zero(), 0.0)
+        zero_reply = self._measure(ZeroOrder(), 0.0)
         self._is_zero_set, self.zero_lost = True, False
         return zero_reply
 
@@ -313,7 +322,7 @@ class Rig:
         if stop.requested:
             request_stop()
         try:
-            group.control.send(Probe(profile))
+            group.control.send(ProbeOrder(profile))
             probe_reply = self._await_probe(group, profile)
         except (ChildError, RigError) as error:
             self.disconnect()
@@ -321,9 +330,9 @@ class Rig:
         finally:
             stop.on_request = _ignore_stop_request
             _reset_session_fields(shared_state)
-        if isinstance(probe_reply, Refused):
+        if isinstance(probe_reply, MeasurementRefused):
             raise RigError(probe_reply.reason)
-        assert isinstance(probe_reply, Measured)
+        assert isinstance(probe_reply, MeasurementResult)
         return probe_reply.values
 
     def _await_probe(self, group: ProcessGroup, profile: Profile) -> object:
@@ -342,7 +351,7 @@ class Rig:
         while True:
             probe_reply = group.control.poll(_POLL_S)
             shared_state.beat(StateField.SUPERVISOR_BEAT)
-            if isinstance(probe_reply, Ended):
+            if isinstance(probe_reply, ControlEnded):
                 raise RigError(probe_reply.reason or "It was stopped.")
             if probe_reply is not None:
                 return probe_reply
@@ -369,19 +378,21 @@ class Rig:
         try:
             control_message = group.control.poll(0.0)
         except ChildError as error:
-            control_message = Ended(str(error))
+            control_message = ControlEnded(str(error))
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
         assert CONTROL.hung_after_s is not None
         stalled_s = group.stalled_s(CONTROL)
         if control_message is None and stalled_s > CONTROL.hung_after_s:
             group.control.kill()
-            control_message = Ended(
+            control_message = ControlEnded(
                 f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
             )
         if control_message is not None:
             self.disconnect()
-            loss_reason = control_message.reason if isinstance(control_message, Ended) else ""
+            loss_reason = (
+                control_message.reason if isinstance(control_message, ControlEnded) else ""
+            )
             raise RigError(loss_reason or "The control process was asked to end.")
 
     def status(self) -> RigStatus | None:
@@ -444,7 +455,9 @@ class Rig:
             raise RigError("The rig is not connected.")
         return self._group
 
-    def _measure(self, measurement_order: Tare | Zero, duration_s: float) -> dict[str, Any]:
+    def _measure(
+        self, measurement_order: TareOrder | ZeroOrder, duration_s: float
+    ) -> dict[str, Any]:
         """Make the control process tare the sensor or set the zero; return the result.
 
         `duration_s` is the measuring time.
@@ -456,9 +469,9 @@ class Rig:
         except (ChildError, RigError) as error:
             self.disconnect()
             raise RigError(str(error)) from None
-        if isinstance(measurement_reply, Refused):
+        if isinstance(measurement_reply, MeasurementRefused):
             raise RigError(measurement_reply.reason)
-        assert isinstance(measurement_reply, Measured)
+        assert isinstance(measurement_reply, MeasurementResult)
         return measurement_reply.values
 
     def _await_message(self, timeout_s: float) -> object:
@@ -474,7 +487,7 @@ class Rig:
                 f"The control process does not answer within {timeout_s:g} s; check that the "
                 "devices are on, and check CPU load."
             )
-        if isinstance(control_message, Ended):
+        if isinstance(control_message, ControlEnded):
             raise RigError(control_message.reason or "It was stopped.")
         return control_message
 

@@ -5,7 +5,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import TYPE_CHECKING, ClassVar, Final
 
-from rigd.engine.messages import Failed
+from rigd.engine.messages import ProcessFailed
 from rigd.engine.processes import ChildError
 from rigd.engine.shared_state import Level, LogEvent
 
@@ -75,7 +75,7 @@ class SessionWorker(ABC):
             try:
                 for message in self._group[self.worker].messages(timeout_s):
                     self._is_ready |= type(message).__name__ == self.worker.sends[0]
-                    if isinstance(message, Failed):
+                    if isinstance(message, ProcessFailed):
                         self._process_failure(message.reason)
                     else:
                         self._process_message(message)

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from rigd.engine import Observer
 from rigd.engine.channels import Channels, attach_channels
-from rigd.engine.messages import Failed, FileHeader, FitJob, FitReady, FitReport, RecordEnded
+from rigd.engine.messages import FileHeader, FitJob, FitReady, FitReport, ProcessFailed, RecordEnded
 from rigd.engine.processes import Parent
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.reference import ReferenceWriter
@@ -95,7 +95,7 @@ def main() -> None:
     try:
         _SessionFit(job, parent, attach_channels(job.channels)).run()
     except EstimationError as error:
-        parent.send(Failed(str(error)))
+        parent.send(ProcessFailed(str(error)))
         exit_code = 1
     # Without the interpreter's clean-up, which would wait for a running fit.
     os._exit(exit_code)

@@ -17,7 +17,7 @@ from rigd.beam.tip import TipMotion, tip_motion
 from rigd.checks import PaperCheckResult, check_on_paper
 from rigd.control import ClosedLoop, ControlDesignError, stable_loop
 from rigd.control.damper import design_damper
-from rigd.engine.messages import Ending
+from rigd.engine.messages import PostRecordPlan
 from rigd.errors import UserError
 from rigd.excitation import KINDS, BeamEstimate, Excitation, MovePlant, Value, make_excitation
 from rigd.identified_beam import Use, read_identified_beam
@@ -88,7 +88,7 @@ class Plan:
     """Sentence on the predicted motion of the beam's free end and the linear model's validity."""
     refused: str = ""
     """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
-    ending: Ending = field(default_factory=Ending)
+    ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
     clearance: PaperCheckResult = field(default_factory=PaperCheckResult)
     """Results of the checks on the profile that need no device."""
@@ -351,15 +351,15 @@ def _amplitude_advice(profile: Profile, excitation: Excitation, *, force: bool) 
     return "lower the amplitude" + ("" if largest_rad is None else f" to {largest_rad:g} rad")
 
 
-def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> Ending:
+def _motion_after_record(loop: ClosedLoop, *, stays: bool, damped: bool) -> PostRecordPlan:
     """Return the motion after the record: a vibration-free return to the start, with damping.
 
     Active damping is designed for the loop, and left out where its controller is not known.
     """
     if loop.model.plant is None:
-        return Ending(stays=stays)
+        return PostRecordPlan(stays=stays)
     damper = design_damper(loop) if damped else None
-    return Ending(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
+    return PostRecordPlan(stays, tuple(map(complex, mode_poles(loop)[1])), damper)
 
 
 def largest_amplitude(

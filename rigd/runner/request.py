@@ -31,7 +31,7 @@ from rigd.devices.kinds import find_kind, find_owner
 from rigd.devices.obstacles import with_obstacles
 from rigd.devices.parameters import RigParameters
 from rigd.devices.running_simulator import unreachable_simulators
-from rigd.engine.messages import Connected, Ending, FileHeader
+from rigd.engine.messages import DevicesConnected, FileHeader, PostRecordPlan
 from rigd.excitation import Excitation, find_excitation
 from rigd.plugins import plugin_errors
 from rigd.printable import printable
@@ -70,7 +70,7 @@ class Order:
     """Metadata of the user (key, text), such as operator, specimen, note and number in a series."""
     predicted: tuple[tuple[str, str], ...] = ()
     """Metadata (key, text) with the predicted peaks and their limits."""
-    ending: Ending = field(default_factory=Ending)
+    ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion after the record, such as the return to the start."""
     touch: TouchSearch | None = None
     """Settings of the search for an obstacle, or None for a session without a search."""
@@ -366,7 +366,7 @@ def remaining_file_text(session_path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) -> FileHeader:
+def file_header(order: Order, connection: DevicesConnected, tare: Mapping[str, str]) -> FileHeader:
     """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
@@ -391,7 +391,7 @@ def file_header(order: Order, connection: Connected, tare: Mapping[str, str]) ->
 
 
 def _session_metadata(
-    order: Order, connection: Connected, tare: Mapping[str, str]
+    order: Order, connection: DevicesConnected, tare: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the record ``session`` of a session file: key → text."""
     rig = order.profile.rig

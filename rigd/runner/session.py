@@ -15,16 +15,16 @@ from typing import Any, Final, TypeVar
 
 from rigd.engine import Observer
 from rigd.engine.messages import (
-    Armed,
-    Close,
-    Closed,
-    Connected,
-    Ended,
-    Failed,
-    Finished,
-    Opened,
-    Ready,
+    CloseFile,
+    ControlEnded,
+    DevicesConnected,
+    FileClosed,
+    FileOpened,
+    ProcessFailed,
+    ReadyToRecord,
     RecorderJob,
+    RecorderReady,
+    SessionFinished,
     SessionJob,
 )
 from rigd.engine.processes import ChildError
@@ -232,7 +232,7 @@ class SessionRun:
         self,
         order: Order,
         group: ProcessGroup,
-        connection: Connected,
+        connection: DevicesConnected,
         live: LiveView | None,
         watcher: ProgressCallback,
         can_receive_stop: Callable[[], bool],
@@ -334,17 +334,17 @@ class SessionRun:
         )
         process_group.control.send(job)
         control_message = self._await_control()
-        if isinstance(control_message, Ready):
+        if isinstance(control_message, ReadyToRecord):
             file_header_data = file_header(session_order, self._connection, control_message.tare)
             process_group.recorder.send(file_header_data)
             if self._fit is not None:
                 self._fit.begin(file_header_data)
-            self._await_recorder(Armed)
+            self._await_recorder(RecorderReady)
             self._shared_state[StateField.GO] = 1
             control_message = self._await_control()
         if self._recorder_failure is not None:
             raise SessionFailedError(self._recorder_failure)
-        assert isinstance(control_message, Finished)
+        assert isinstance(control_message, SessionFinished)
         return self._close(control_message)
 
     def _report_and_check_stop(self) -> bool:
@@ -360,7 +360,7 @@ class SessionRun:
             job = RecorderJob(self._order.path, process_group.channels.specs, realtime_settings)
             process_group.idle_process(RECORDER).start(job)
             try:
-                opened_reply = self._await_recorder(Opened, _RECORDER_START_TIMEOUT_S)
+                opened_reply = self._await_recorder(FileOpened, _RECORDER_START_TIMEOUT_S)
             except _FileExistsError as error:
                 name_error = error
                 self._order = replace(self._order, path=another_path(self._order.path))
@@ -389,7 +389,7 @@ class SessionRun:
             and setting_text.startswith(REFUSED)
         }
 
-    def _await_control(self) -> Ready | Finished:
+    def _await_control(self) -> ReadyToRecord | SessionFinished:
         """Supervise all processes until the control process sends a message, and return that.
 
         A hung control process is killed.
@@ -430,10 +430,10 @@ class SessionRun:
                 if self._recorder_failure is not None:
                     self._shared_state[StateField.STOP] = Stop.NO_RECORDER
 
-    def _checked_control_message(self, control_message: object) -> Ready | Finished:
-        """Return the message of the control process as ``Ready`` or ``Finished``."""
+    def _checked_control_message(self, control_message: object) -> ReadyToRecord | SessionFinished:
+        """Return the message of the control process as ``ReadyToRecord`` or ``SessionFinished``."""
         match control_message:
-            case Ended(reason):  # before the session began
+            case ControlEnded(reason):  # before the session began
                 session_end = self._control_died(reason)
                 if reason:
                     return session_end
@@ -441,17 +441,17 @@ class SessionRun:
                 return replace(
                     session_end, outcome="stopped", reason="Stopped by the operator.", fault=False
                 )
-            case Finished():
+            case SessionFinished():
                 self._is_control_busy = False
                 if control_message.device_failed:
                     self.device_failed = True
                     self._final_drive_state = control_message.reason
                 return control_message
-            case Ready():
+            case ReadyToRecord():
                 return control_message
         raise SessionFailedError(f"The control process answers {control_message}.")
 
-    def _kill_control(self, failure_predicate: str) -> Finished:
+    def _kill_control(self, failure_predicate: str) -> SessionFinished:
         """Kill a hung control process, and return the session's end.
 
         The drive's watchdog then switches the torque off.
@@ -462,20 +462,20 @@ class SessionRun:
             "drive switches itself off. Check that it is off."
         )
 
-    def _control_died(self, reason: str) -> Finished:
+    def _control_died(self, reason: str) -> SessionFinished:
         """Mark the control process as ended, and return the session's end with the reason."""
         self._is_control_busy = False
         self.device_failed = True
         self._final_drive_state = reason
         return self._finished_from_shared_state(reason)
 
-    def _finished_from_shared_state(self, reason: str) -> Finished:
+    def _finished_from_shared_state(self, reason: str) -> SessionFinished:
         """Return the session's end for a dead control process, from counts in shared memory."""
         tick_counts = self._counts()
         is_complete = is_whole(
             self._shared_state, tick_counts["scheduled"], self._order.excitation.reference_rad.size
         )
-        return Finished(
+        return SessionFinished(
             outcome="complete" if is_complete else "fault",
             reason=f"After the record: {reason}" if is_complete else reason,
             fault=True,
@@ -497,7 +497,7 @@ class SessionRun:
             recorder_message = self._group.recorder.poll(0.0)
         except ChildError as error:
             return str(error)
-        if isinstance(recorder_message, Failed):
+        if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
             return recorder_message.reason
         return None if recorder_message is None else str(recorder_message)
@@ -520,7 +520,7 @@ class SessionRun:
                 f"The recorder process does not answer within {timeout_s:g} s. Check CPU load and "
                 "disk."
             )
-        if isinstance(recorder_message, Failed):
+        if isinstance(recorder_message, ProcessFailed):
             self._saved_path = recorder_message.saved_path
             raise (_FileExistsError if recorder_message.taken else SessionFailedError)(
                 recorder_message.reason
@@ -558,7 +558,7 @@ class SessionRun:
             new_events,
         )
 
-    def _close(self, finished: Finished) -> RunResult:
+    def _close(self, finished: SessionFinished) -> RunResult:
         """Complete touches and fit, make the recorder close the file, and return the result."""
         self._report()
         touch_documents = None
@@ -588,10 +588,10 @@ class SessionRun:
                 outcome_record["reason"] = f"{self._fit.search_failure} {finished.reason}"
         self._group.recorder.resume()
         packed_touches = b"" if self._touches is None else self._touches.encoded_touches()
-        self._group.recorder.send(Close(outcome_record, packed_touches, segment_ticks))
+        self._group.recorder.send(CloseFile(outcome_record, packed_touches, segment_ticks))
         # A disk may stall for as long at the end of a record as during the record.
         stall_s = self._order.profile.limits.recorder_lag_s
-        closed_reply = self._await_recorder(Closed, stall_s + 2 * _REPLY_TIMEOUT_S)
+        closed_reply = self._await_recorder(FileClosed, stall_s + 2 * _REPLY_TIMEOUT_S)
         # The recorder's counts take precedence over those of the control process.
         tick_counts = {**_ZERO_COUNTS, **finished.counts, **closed_reply.counts}
         outcome_text, end_reason = finished.outcome, outcome_record["reason"]

@@ -134,7 +134,7 @@ def read_table(stream: BinaryIO, requested_names: Sequence[str], *, max_rows: in
         The file must be seekable; it is not closed.
     requested_names : sequence of str
         Titles of the requested columns, or numbers such as ``#3`` for the third column.
-    most_rows : int
+    max_rows : int
         Number of rows after which reading ends. If the file has more rows, one more is returned.
 
     Returns

@@ -15,7 +15,7 @@ from aiohttp import web
 
 from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
-from rigd.engine.messages import Failed, PageAddress
+from rigd.engine.messages import PageAddress, ProcessFailed
 from rigd.engine.processes import Parent
 from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
@@ -350,7 +350,7 @@ async def _serve_until_end(daemon: Parent, job: Document) -> None:
     try:
         page_server, _, listening_server = await open_page(job)
     except OSError as error:
-        daemon.send(Failed(f"port {job['port']} cannot be had: {error.strerror}"))
+        daemon.send(ProcessFailed(f"port {job['port']} cannot be had: {error.strerror}"))
         return
     daemon.send(PageAddress(port_of(listening_server)))
     server_task = asyncio.create_task(page_server.run())
@@ -358,7 +358,7 @@ async def _serve_until_end(daemon: Parent, job: Document) -> None:
     await asyncio.wait((server_task, daemon_ended), return_when=asyncio.FIRST_COMPLETED)
     has_failed = server_task.done()
     if has_failed:
-        daemon.send(Failed(f"unexpected error ({server_task.exception()!r})"))
+        daemon.send(ProcessFailed(f"unexpected error ({server_task.exception()!r})"))
     # The successor of this process or of the daemon may need the port.
     listening_server.close()
     page_server.end(

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from rigd.engine import shared_memory_fd
-from rigd.engine.messages import Ended, MessageReader, Ready, SessionJob, encode
+from rigd.engine.messages import ControlEnded, MessageReader, ReadyToRecord, SessionJob, encode
 from rigd.engine.processes import Child, ChildError
 from rigd.engine.reference import map_reference, write_reference
 from rigd.engine.workers import RECORDER
@@ -53,13 +53,13 @@ def pipe():
 
 def test_nobody_waits_for_the_rest_of_a_message(pipe):
     read, write = pipe
-    reader, message = MessageReader(read), Ready({"start_angle_rad": "0.1"})
+    reader, message = MessageReader(read), ReadyToRecord({"start_angle_rad": "0.1"})
     for byte in (data := encode(message))[:-1]:
         os.write(write, bytes([byte]))
         assert reader.next(0.0) is None
-    os.write(write, data[-1:] + encode(Ended("")) + data[:7])
+    os.write(write, data[-1:] + encode(ControlEnded("")) + data[:7])
     assert reader.next(0.0) == message
-    assert reader.next(None) == Ended("")
+    assert reader.next(None) == ControlEnded("")
     assert reader.next(0.01) is None
     os.close(write)
     with pytest.raises(EOFError):
@@ -95,7 +95,7 @@ def test_what_a_library_prints_does_not_stand_among_the_messages():
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE,
     )  # fmt: skip
     output, errors = child.communicate(timeout=60)
-    assert output == encode(Ended(""))
+    assert output == encode(ControlEnded(""))
     assert errors == b"of a library\nand so on"
 
 

@@ -15,7 +15,7 @@ import pytest
 from online_fits import online_fit
 from processes import eventually, has_ended, listeners, sockets
 
-from rigd.engine.messages import Failed
+from rigd.engine.messages import ProcessFailed
 from rigd.engine.shared_state import StateField
 from rigd.live.address import LiveAddress, find
 from rigd.live.messages import LiveFit, LiveJob
@@ -319,7 +319,7 @@ def test_a_server_that_does_not_start_is_told_in_a_sentence(
     (package / "rerun").write_text(script)
     (package / "rerun").chmod(mode)
     publisher = start_publisher(PYTHONPATH=str(tmp_path))
-    assert isinstance(publisher.answer, Failed)
+    assert isinstance(publisher.answer, ProcessFailed)
     assert publisher.answer.reason.endswith(sentence)
     assert publisher.end() == (1, "", "")
 
