@@ -16,7 +16,7 @@ from math import inf
 from pathlib import Path
 from typing import TypeVar
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.daemon import _protocol as protocol
 from rigd.daemon import background
 from rigd.daemon._log import LOGGER_NAME
@@ -112,7 +112,7 @@ class Service:
         self._find_target = find_target
         self._announced_target = find_target()
         self._failed_checks = [
-            asdict(failed_check) for failed_check in check_on_paper(profile).failed
+            asdict(failed_check) for failed_check in run_offline_checks(profile).failed
         ]
         self._fast = fast
         self._live = live

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar, Final, Protocol, TypeVar
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.daemon._protocol import CommandError, StartRequest
 from rigd.engine.messages import JobPerformed
 from rigd.engine.processes import Child, ChildError, Parent
@@ -145,7 +145,7 @@ class PlanJob:
         notes = request.notes.as_metadata()
         try:
             profile = with_specimen(self.profile, notes.get("specimen", ""))
-            check_on_paper(profile, request.accept).require()
+            run_offline_checks(profile, request.accept).require()
             profile = with_tip_slope(profile, request.tip_slope_rad)
             return Series(
                 profile,

@@ -9,7 +9,7 @@ from typing import Final, Self
 
 import typer
 
-from rigd.checks import check_on_paper
+from rigd.checks import run_offline_checks
 from rigd.devices import ActuationTarget, describe_actuation_target, simulated_differently
 from rigd.engine.shared_state import LogEvent
 from rigd.errors import FailureError, RigdError
@@ -139,7 +139,7 @@ def run_in_foreground(
                 profile_name, fast=fast, seed=seed, hardware=hardware, obstacles=obstacles
             )
             specimen = notes.get("specimen", "")
-            check_on_paper(with_specimen(profile, specimen), accept).require()
+            run_offline_checks(with_specimen(profile, specimen), accept).require()
             if prepare is not None:
                 profile = prepare(profile)
             profile = with_tip_slope(profile, tip_slope_rad)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from rigd.beam import Beam, Plant
 from rigd.beam.realisation import RealisationError
 from rigd.beam.tip import TipMotion, tip_motion
-from rigd.checks import PaperCheckResult, check_on_paper
+from rigd.checks import OfflineCheckResult, run_offline_checks
 from rigd.control import ClosedLoop, ControlDesignError, stable_loop
 from rigd.control.damper import design_damper
 from rigd.engine.messages import PostRecordPlan
@@ -90,7 +90,7 @@ class Plan:
     """Reasons to refuse the session, one line for each exceeded limit, or empty if allowed."""
     ending: PostRecordPlan = field(default_factory=PostRecordPlan)
     """Motion that the control process makes after the record, such as the return to the start."""
-    clearance: PaperCheckResult = field(default_factory=PaperCheckResult)
+    clearance: OfflineCheckResult = field(default_factory=OfflineCheckResult)
     """Results of the checks on the profile that need no device."""
 
 
@@ -294,7 +294,7 @@ def predict_session(
     RealisationError
         If the beam's damping cannot be realised by a model with poles.
     """
-    paper_check = check_on_paper(profile, accept)
+    offline_check = run_offline_checks(profile, accept)
     closed_loop, instability_warning = stable_loop(loop_model_with(profile, excitation.model))
     prediction = predict(closed_loop, excitation)
     violations, torque_violations = (
@@ -305,7 +305,7 @@ def predict_session(
         ]
         for limited_peaks in _limited_peaks(profile, prediction)
     )
-    refusals = list(paper_check.refusals)
+    refusals = list(offline_check.refusals)
     tip_slope = _limited_tip_slope(profile, prediction) if has_slope_limit(excitation) else None
     slope_violation = tip_slope is not None and tip_slope.violation_text()
     if violations or slope_violation or (torque_violations and not force):
@@ -318,7 +318,7 @@ def predict_session(
             f"{violation_text}; {amplitude_advice}, or allow clipping with --force."
             for violation_text in torque_violations
         ]
-    warnings = [*paper_check.warnings, *([instability_warning] if instability_warning else [])]
+    warnings = [*offline_check.warnings, *([instability_warning] if instability_warning else [])]
     if not profile.is_loop_modelled:
         warnings.append(
             f'The peaks are predicted with the PID of [control]: controller "'
@@ -339,7 +339,7 @@ def predict_session(
         ending=_motion_after_record(
             closed_loop, stays=excitation.stays, damped=profile.is_loop_modelled
         ),
-        clearance=paper_check,
+        clearance=offline_check,
     )
 
 
