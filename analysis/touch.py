@@ -39,7 +39,7 @@ from rigd.touch import (
     TouchEstimator,
     TouchModel,
     TouchRecord,
-    watched_beam,
+    detector_model,
 )
 from rigd.touch.samples import (
     CONTACT_S,
@@ -452,7 +452,7 @@ def _detect_touches(
         None if shear_coefficients is None else _white_noise_std(shear_n[is_at_rest]),
         _angle_noise_std(samples["angle_rad"], is_at_rest),
     )
-    beam_watch = watched_beam(touch_model, rate_hz, channel_noise)
+    beam_watch = detector_model(touch_model, rate_hz, channel_noise)
     detector = TouchDetector(beam_watch, rate_hz, DetectorSettings())
     is_armed = False
     detections: list[tuple[int, int]] = []

@@ -66,7 +66,7 @@ class ProbeSequence(SessionSequence):
         cycle = self._cycle
         start_rad = cycle.angle_rad
         probing_move = ProbingMove(self._rig, plan_probe(self._rig), self._rest_spread_nm)
-        cycle.encoder_watch = None  # the move itself compares angle and torques
+        cycle.encoder_monitor = None  # the move itself compares angle and torques
         cycle.controller = probing_move
         cycle.start(self._rest_spread_nm)
         self._run_tick(start_rad, excused=True)  # enabling takes its time

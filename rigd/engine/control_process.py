@@ -173,7 +173,7 @@ class _ControlServer:
         self._on_lines = devices.uses_line
         # A simulated motor starts cold.
         real_motor = not devices.simulated
-        self._watch = make_limit_monitor(
+        self._limit_monitor = make_limit_monitor(
             profile, stored_motor_heat_nm2(profile) if real_motor else 0.0
         )
         self._standstill = StandstillMonitor(profile)
@@ -183,7 +183,7 @@ class _ControlServer:
     def store_heat(self) -> None:
         """Store the heat of a real motor in a file for the next connection to the rig."""
         if not self._devices.simulated:
-            store_motor_heat(self._profile, self._watch.heat_nm2)
+            store_motor_heat(self._profile, self._limit_monitor.heat_nm2)
 
     def observe_standstill(self) -> None:
         """Read the devices with the torque off until the motor's angle and speed are known.
@@ -296,11 +296,11 @@ class _ControlServer:
         self._log_accepted(session_job)
         cycle = self._cycle = self._make_cycle(session_job.profile)
         reference_rad = map_reference(session_job.reference)
-        touch_watch = None
+        touch_monitor = None
         if session_job.touch is not None:
-            from rigd.engine._touch_watch import TouchWatch  # late: few sessions need it
+            from rigd.engine._touch_monitor import TouchMonitor  # late: few sessions need it
 
-            touch_watch = TouchWatch(
+            touch_monitor = TouchMonitor(
                 session_job.touch, cycle, reference_rad, session_job.profile.rig.rate_hz
             )
         reference_reader = None
@@ -320,7 +320,7 @@ class _ControlServer:
             self._parent,
             self._stop,
             session_job.ending,
-            touch_watch,
+            touch_monitor,
             reference_reader,
         )
         session_outcome, end_reason = "complete", ""
@@ -445,13 +445,13 @@ class _ControlServer:
 
         The values are for display, because each session measures the zero itself.
         """
-        self._cycle.sensor_watch.learn()
+        self._cycle.sensor_monitor.learn()
         rest_readings = self._read_rest(self._profile.session.tare_s)
-        sensor_violation = self._cycle.sensor_watch.finish_learning()
+        sensor_violation = self._cycle.sensor_monitor.finish_learning()
         if sensor_violation is not None:
             raise SessionEnd("fault", str(sensor_violation))
         self._cycle.tare = rest_readings.mean
-        self._watch.tared_nm = float(rest_readings.torques_nm.mean())
+        self._limit_monitor.tared_nm = float(rest_readings.torques_nm.mean())
         return {
             "mean": dict(zip(WRENCH_FIELDS, rest_readings.mean, strict=True)),
             "std": dict(zip(WRENCH_FIELDS, rest_readings.spread, strict=True)),
@@ -517,7 +517,7 @@ class _ControlServer:
             self._devices,
             rig.sensor.projection,
             make_controller(profile.controlled_rig()),
-            self._watch,
+            self._limit_monitor,
             make_reading_monitors(profile, self._devices),
         )
         cycle.zero_rad = self._zero_rad

@@ -37,7 +37,7 @@ if TYPE_CHECKING:  # children start before the supervisor has imported any of th
     from rigd.engine.reference import ReferenceSpec
     from rigd.excitation import Approach, PrecisionSearch
     from rigd.profile import Profile, RealtimeSettings
-    from rigd.touch import DetectorSettings, TouchModel, WatchedBeam
+    from rigd.touch import DetectorModel, DetectorSettings, TouchModel
 
 _LENGTH_HEADER: Final = struct.Struct("=I")
 """Binary format of the length in bytes that precedes each message."""
@@ -79,7 +79,7 @@ class PostRecordPlan:
 class TouchOrder:
     """Settings of a session that moves the beam until it touches an obstacle."""
 
-    beam: "WatchedBeam"
+    beam: "DetectorModel"
     """Model of the beam for the touch detector."""
     settings: "DetectorSettings"
     """Sensitivity of the touch detector."""

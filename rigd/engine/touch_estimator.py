@@ -50,7 +50,7 @@ def main() -> None:
     sample_reader = Observer(channels.samples, job.first)
     estimator = TouchEstimator(job.model, job.rate_hz)
     parent.send(TouchReady())
-    touch_follower = TouchFollower(estimator, job)
+    touch_follower = RunningTouchEstimator(estimator, job)
     while True:
         channels.shared_state.beat(StateField.TOUCH_BEAT)
         sample_bytes = sample_reader.take(_MAX_BLOCK_SAMPLES)
@@ -85,7 +85,7 @@ class _PendingTouch:
     """Whether the first estimate has been sent."""
 
 
-class TouchFollower:
+class RunningTouchEstimator:
     """Estimator of all detected touches of a record, each as soon as it has enough samples.
 
     Parameters

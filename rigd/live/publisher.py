@@ -232,7 +232,7 @@ class _ShownSession:
         self.has_ended = False
         self.supervisor_lost = False
         self._health_reader = HealthReader(channels)
-        self._state_watch = StateWatch(channels)
+        self._state_reader = SessionStateReader(channels)
         self._unsent_samples = 0
         session_folder, session_name = session.folder, session.subject.name
         self._quick_look_path = (
@@ -258,7 +258,7 @@ class _ShownSession:
         if self._health_reader.is_due(now_s):
             rig_health = self._health_reader.read(now_s, self.dropped)
             queued_drawings += self.reader.scene.health(self.reader.t_ns, rig_health)
-        banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_watch.read(now_s)
+        banner_state = SUPERVISOR_LOST if self.supervisor_lost else self._state_reader.read(now_s)
         queued_drawings += self.reader.scene.state(self.reader.t_ns, banner_state)
         self.backlog.put_required(new_drawings.notes)
         self.backlog.put(queued_drawings, new_drawings.samples)
@@ -477,7 +477,7 @@ _ACTIVITY_BANNERS: Final = {  # Banner for each activity of the rig
 }
 
 
-class StateWatch:
+class SessionStateReader:
     """Derives the session's state, shown in the view's banner, from the processes' shared state.
 
     Parameters

@@ -45,7 +45,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
     """Return the settings of the search for an obstacle, or None if there is no search."""
     if excitation.approach is None:
         return None
-    from rigd.touch import DetectorSettings, TouchModel, watched_beam
+    from rigd.touch import DetectorSettings, TouchModel, detector_model
 
     rig = profile.rig
     sensor = rig.sensor
@@ -57,7 +57,7 @@ def touch_search(profile: Profile, excitation: Excitation) -> TouchSearch | None
         )
     else:
         touch_model = TouchModel.assumed(profile.plant, rig.encoder.delay_s, sensor_filter)
-    beam_prediction = watched_beam(touch_model, rig.rate_hz, _reading_noise(profile))
+    beam_prediction = detector_model(touch_model, rig.rate_hz, _reading_noise(profile))
     shear_projection = sensor.shear_projection if any(sensor.shear_projection) else None
     return TouchSearch(
         TouchOrder(beam_prediction, DetectorSettings(), excitation.approach, shear_projection),

@@ -12,6 +12,6 @@ from ._model import TouchModel as TouchModel
 from ._results import Estimated as Estimated
 from ._results import TouchEstimate as TouchEstimate
 from ._sensor_filter import SensorFilter as SensorFilter
-from ._signatures import WatchedBeam as WatchedBeam
+from ._signatures import DetectorModel as DetectorModel
+from ._signatures import detector_model as detector_model
 from ._signatures import signatures as signatures
-from ._signatures import watched_beam as watched_beam

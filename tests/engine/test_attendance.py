@@ -16,7 +16,7 @@ from rigd.engine.messages import (
     ZeroOrder,
 )
 from rigd.engine.shared_state import Phase, StateField
-from rigd.engine.timing import SuspendWatch, VirtualClock
+from rigd.engine.timing import SuspendMonitor, VirtualClock
 from rigd.excitation import hold, step
 from rigd.session.layout import Status
 
@@ -211,8 +211,8 @@ def test_a_supervisor_that_hangs_ends_the_session(make_session):
 
 def test_a_suspend_of_the_computer_ends_the_session(make_session, monkeypatch):
     boot_ns = [0]
-    watch = SuspendWatch(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
-    monkeypatch.setattr("rigd.engine._session_sequence.SuspendWatch", lambda: watch)
+    watch = SuspendMonitor(monotonic_ns=lambda: 0, boot_ns=lambda: boot_ns[0])
+    monkeypatch.setattr("rigd.engine._session_sequence.SuspendMonitor", lambda: watch)
     session = make_session(clock=FakeRealClock())
 
     read_angle = session.drive.read_angle

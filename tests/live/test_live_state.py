@@ -12,7 +12,7 @@ from processes import eventually
 from rigd.beam import Beam
 from rigd.engine.shared_state import Phase, StateField, Stop
 from rigd.live.messages import LiveSession
-from rigd.live.publisher import StateWatch, last_response
+from rigd.live.publisher import SessionStateReader, last_response
 from rigd.view import Subject
 from rigd.view.banner import (
     FINISHING,
@@ -32,7 +32,7 @@ PERIOD_S = 1 / 15
 
 
 def test_the_board_tells_every_state_of_a_session(channels):
-    shared_state, states = channels.shared_state, StateWatch(channels)
+    shared_state, states = channels.shared_state, SessionStateReader(channels)
 
     def state(**words):
         for name, value in words.items():
@@ -51,7 +51,7 @@ def test_the_board_tells_every_state_of_a_session(channels):
 
 
 def test_a_supervisor_that_hangs_is_told_within_a_second(channels):
-    shared_state, states, now_s = channels.shared_state, StateWatch(channels), 100.0
+    shared_state, states, now_s = channels.shared_state, SessionStateReader(channels), 100.0
     shared_state[StateField.GO], shared_state[StateField.PHASE] = 1, Phase.RUNNING
     for _ in range(100):
         now_s += PERIOD_S
