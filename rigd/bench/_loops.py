@@ -17,7 +17,7 @@ from rigd.devices import unknown_values
 from rigd.devices.parameters import DeviceSelection
 from rigd.engine.messages import SessionFinished, SessionJob
 from rigd.engine.reference import write_reference
-from rigd.engine.shared_state import Phase, StateField, Stop
+from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
@@ -117,7 +117,7 @@ def run_alone(
     with connected_rig(profile) as (_, process_group):
         channels, shared_state = process_group.channels, process_group.channels.shared_state
         usage_meter = UsageMeter(process_group.control.pid)
-        shared_state[StateField.STOP] = Stop.NO
+        shared_state[StateField.STOP] = StopReason.NONE
         shared_state[StateField.GO] = 1
         reference_record = write_reference(channels.reference_fd, excitation.reference_rad)
         process_group.control.send(SessionJob(profile, reference_record))

@@ -286,7 +286,7 @@ def _process_state(process: ProcessStatus, phase: Phase) -> str:
 
     A process that runs for one session only has the state ``done``, not ``ended``, after it.
     """
-    is_for_one_session = any(p.for_one_session and p.name == process.name for p in PROCESSES)
+    is_for_one_session = any(p.is_per_session and p.name == process.name for p in PROCESSES)
     return (
         "done"
         if process.state == "ended" and is_for_one_session and phase is Phase.OFF

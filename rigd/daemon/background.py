@@ -14,7 +14,7 @@ from typing import Any, ClassVar, Final, Protocol, TypeVar
 from rigd.checks import run_offline_checks
 from rigd.daemon._protocol import CommandError, StartRequest
 from rigd.engine.messages import JobPerformed
-from rigd.engine.processes import Child, ChildError, Parent
+from rigd.engine.processes import ChildError, ChildProcess, SupervisorConnection
 from rigd.engine.workers import PLAN, PREDICTION, Worker
 from rigd.errors import RigdError
 from rigd.excitation import Value
@@ -181,7 +181,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
         If the job is refused, fails, or takes longer than 50 s.
     """
     try:
-        child = Child(job.worker)
+        child = ChildProcess(job.worker)
     except ChildError as error:
         raise CommandError(f"No process can be started for it ({error.system_reason}).") from None
     try:
@@ -204,7 +204,7 @@ async def perform(job: BackgroundJob[Result]) -> Result:
 def main() -> None:
     """Perform a job of the daemon, and send its result, or an error in place of the result."""
     ignore_signals()
-    daemon = Parent()
+    daemon = SupervisorConnection()
     job: BackgroundJob[object] = daemon.receive_job()
     result_or_error: object
     try:

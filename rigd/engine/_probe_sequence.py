@@ -12,7 +12,7 @@ from rigd.engine._session_sequence import SessionEnd, SessionSequence
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, StandstillMonitor
 from rigd.engine.messages import PostRecordPlan
-from rigd.engine.processes import Parent
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.shared_state import Phase, StateField
 from rigd.engine.timing import Clock, TickScheduler
 from rigd.profile import Profile
@@ -36,7 +36,7 @@ class ProbeSequence(SessionSequence):
         standstill: StandstillMonitor,
         channels: Channels,
         reading_publisher: ReadingPublisher,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
     ) -> None:
         super().__init__(

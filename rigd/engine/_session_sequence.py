@@ -20,11 +20,17 @@ from rigd.engine._publish import ReadingPublisher, SampleLog
 from rigd.engine.channels import Channels
 from rigd.engine.cycle import Cycle, RestReadings, StandstillMonitor, observe_rest
 from rigd.engine.messages import PostRecordPlan
-from rigd.engine.processes import Parent
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import page_faults
 from rigd.engine.reference import ReferenceReader
-from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, Stop, write_event
-from rigd.engine.timing import SIGN_OF_LIFE_S, SUSPENDED_S, Clock, SuspendMonitor, TickScheduler
+from rigd.engine.shared_state import Level, LogEvent, Phase, StateField, StopReason, write_event
+from rigd.engine.timing import (
+    MAX_VIRTUAL_PAUSE_S,
+    SUSPENDED_S,
+    Clock,
+    SuspendMonitor,
+    TickScheduler,
+)
 from rigd.excitation.moves import quintic, vibration_free_path
 from rigd.profile import Profile
 from rigd.runtime import StopRequest
@@ -140,7 +146,7 @@ class SessionSequence:
         standstill: StandstillMonitor,
         channels: Channels,
         reading_publisher: ReadingPublisher,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
         ending: PostRecordPlan,
         touch: "TouchMonitor | None" = None,
@@ -423,7 +429,7 @@ class SessionSequence:
         uses_line = self._cycle.devices.uses_line
         wait_start_s = time.monotonic()
         while reference_reader.must_wait(tick) and self._stop_reason() is None:
-            if uses_line and time.monotonic() - wait_start_s > SIGN_OF_LIFE_S:
+            if uses_line and time.monotonic() - wait_start_s > MAX_VIRTUAL_PAUSE_S:
                 return
             self._display.publish(self._cycle, self._scheduler.due_ns)
             time.sleep(_VIRTUAL_POLL_S)
@@ -618,9 +624,9 @@ class SessionSequence:
     def _stop_reason(self) -> SessionEnd | None:
         """Return an error that ends the session if a stop is requested or a process died."""
         stop_reason = self._shared_state[StateField.STOP]
-        if self._stop.requested or stop_reason == Stop.OPERATOR:
+        if self._stop.requested or stop_reason == StopReason.OPERATOR:
             return SessionEnd("stopped", "Stopped by the operator.")
-        if stop_reason == Stop.NO_RECORDER:
+        if stop_reason == StopReason.NO_RECORDER:
             return SessionEnd("fault", "The recorder process ended during the session.")
         if self.counts.lost:
             # A record with a lost sample can never be complete.
@@ -639,7 +645,7 @@ class SessionSequence:
         violation = self._cycle.check_slow_limits(
             self._scheduler.due_ns,
             # With the virtual clock the loop waits for the recorder.
-            0.0 if self._clock.virtual else self._channels.samples.waiting / self._rate_hz,
+            0.0 if self._clock.virtual else self._channels.samples.waiting_count / self._rate_hz,
             self._shared_state[StateField.DISK_FREE_MB] or inf,
         )
         self._report_warnings()

@@ -42,11 +42,11 @@ from rigd.engine.messages import (
     TareOrder,
     ZeroOrder,
 )
-from rigd.engine.processes import Parent
-from rigd.engine.realtime import REFUSED, apply_realtime, collect_no_garbage
+from rigd.engine.processes import SupervisorConnection
+from rigd.engine.realtime import REFUSED, apply_realtime, disable_garbage_collection
 from rigd.engine.reference import ReferenceReader, map_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, write_event
-from rigd.engine.timing import SIGN_OF_LIFE_S, Clock, RealClock, TickScheduler, VirtualClock
+from rigd.engine.timing import MAX_VIRTUAL_PAUSE_S, Clock, RealClock, TickScheduler, VirtualClock
 from rigd.errors import RigdError
 from rigd.plugins import PluginError
 from rigd.profile import Profile
@@ -69,12 +69,12 @@ def main() -> None:
     """Run the control process, started as ``python -m rigd.engine.control_process``."""
     stop_request = StopRequest()
     stop_request.catch()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: ControlJob = parent.receive_job()
     channels = attach_channels(job.channels)
     realtime_settings = job.profile.realtime
     if job.fast:
-        realtime_results = {"clock": "virtual", "garbage_collector": collect_no_garbage()}
+        realtime_results = {"clock": "virtual", "garbage_collector": disable_garbage_collection()}
     else:
         realtime_results = {"clock": "real"} | apply_realtime(
             priority=realtime_settings.priority, cpu=realtime_settings.cpu
@@ -95,7 +95,7 @@ def run_control(
     devices: Devices,
     clock: Clock,
     channels: Channels,
-    parent: Parent,
+    parent: SupervisorConnection,
     stop_request: StopRequest,
     realtime_results: dict[str, str],
 ) -> None:
@@ -155,7 +155,7 @@ class _ControlServer:
         devices: Devices,
         clock: Clock,
         channels: Channels,
-        parent: Parent,
+        parent: SupervisorConnection,
         stop_request: StopRequest,
         realtime_results: dict[str, str],
     ) -> None:
@@ -245,7 +245,7 @@ class _ControlServer:
                 return supervisor_message
             if not self._clock.virtual:
                 self._read_idle_devices()
-            elif self._on_lines and time.monotonic() - last_tick_s > SIGN_OF_LIFE_S:
+            elif self._on_lines and time.monotonic() - last_tick_s > MAX_VIRTUAL_PAUSE_S:
                 last_tick_s = time.monotonic()
                 self._scheduler.wait()
                 self._read_at_rest()
@@ -287,9 +287,9 @@ class _ControlServer:
             StateField.STALE_ANGLES,
             StateField.STALE_WRENCHES,
             StateField.TOUCHES,
-            StateField.HELD,
-            StateField.HELD_BEFORE,
-            StateField.BEGUN,
+            StateField.HELD_TICKS,
+            StateField.HELD_TICKS_BEFORE_SEGMENT,
+            StateField.BEGUN_REFERENCE_TICKS,
         ):
             shared_state[state_field] = 0
         self._warn_of_refusals(session_job)

@@ -33,9 +33,9 @@ from rigd.engine.messages import (
     RecorderJob,
     RecorderReady,
 )
-from rigd.engine.processes import Parent
-from rigd.engine.realtime import Precedence
-from rigd.engine.reference import is_whole
+from rigd.engine.processes import SupervisorConnection
+from rigd.engine.realtime import RaisedPriority
+from rigd.engine.reference import covers_reference
 from rigd.engine.shared_state import Phase, SharedState, StateField, read_events
 from rigd.runtime import ignore as ignore_signals
 from rigd.session import SessionError, SessionExistsError, SessionWriter, segments_until
@@ -54,12 +54,14 @@ _DISK_POLL_S = 1.0
 def main() -> None:
     """Run the recorder process, started as ``python -m rigd.engine.recorder``."""
     ignore_signals()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: RecorderJob = parent.receive_job()
     channels = attach_channels(job.channels)
     realtime_results = {}
     if job.realtime is not None:
-        realtime_results = Precedence(job.realtime.supervision_priority, job.realtime.cpu).take()
+        realtime_results = RaisedPriority(
+            job.realtime.supervision_priority, job.realtime.cpu
+        ).request()
     try:
         writer = SessionWriter(job.path)
     except SessionError as error:
@@ -96,7 +98,7 @@ def _abandon_recording(writer: SessionWriter) -> tuple[str, Path | None]:
 
 
 def _record_until_closed(
-    parent: Parent, channels: Channels, writer: SessionWriter, disk_folder: Path
+    parent: SupervisorConnection, channels: Channels, writer: SessionWriter, disk_folder: Path
 ) -> None:
     """Write the records of the rings until the supervisor orders to close the file, or ends."""
     recorder = Recorder(channels, writer)
@@ -162,7 +164,7 @@ class Recorder:
         self._ring_writers = [
             (ring, topic_writers[topic])
             for topic, ring in zip(TOPICS, channels.rings, strict=True)
-            if topic.logged
+            if topic.is_recorded
         ]
         self._recorded = 0
         self.header: FileHeader | None = None
@@ -260,7 +262,7 @@ class Recorder:
             self._writer.discard()
             return
         scheduled_ticks = shared_state[StateField.SCHEDULED]
-        is_complete = is_whole(
+        is_complete = covers_reference(
             shared_state, scheduled_ticks, max(end for _, end in self.header.segments.values())
         )
         self.close(

@@ -13,7 +13,7 @@ from typing import Protocol
 SUSPENDED_S = 0.01
 """Time in s from :meth:`SuspendMonitor.suspended_s` above which the computer counts as suspended;
 every real suspend is longer."""
-SIGN_OF_LIFE_S = 1.0
+MAX_VIRTUAL_PAUSE_S = 1.0
 """Longest pause in s between two ticks of virtual time with devices on a bus or serial line, which
 would otherwise treat the silent host as failed."""
 

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rigd.engine._ring import Observer
 from rigd.engine.channels import attach_channels
 from rigd.engine.messages import TouchJob, TouchReady, TouchReport
-from rigd.engine.processes import Parent
+from rigd.engine.processes import SupervisorConnection
 from rigd.engine.realtime import pin_off_loop_core
 from rigd.engine.shared_state import StateField
 from rigd.runtime import ignore as ignore_signals
@@ -42,7 +42,7 @@ estimate."""
 def main() -> None:
     """Run the touch process, started as ``python -m rigd.engine.touch_estimator``."""
     ignore_signals()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: TouchJob = parent.receive_job()
     if job.realtime is not None:
         pin_off_loop_core(job.realtime.cpu)

@@ -1,7 +1,8 @@
 """The table of workers: every child process of rigd, how it is started, and what follows its loss.
 
-Each row is a `Worker`; `rigd.engine.processes.Child` starts it, and is the client of its messages.
-The programs of the analyser are named here and nowhere else, since rigd does not import them.
+Each row is a `Worker`; `rigd.engine.processes.ChildProcess` starts it, and is the client of its
+messages. The programs of the analyser are named here and nowhere else, since rigd does not import
+them.
 """
 
 from dataclasses import dataclass
@@ -55,21 +56,21 @@ class Worker:
     """Number of times that the process is started again in a session, or in a row for the page."""
     beat: StateField | None = None
     """Field of its heartbeat in the shared state; None: the process has no access to it."""
-    start_s: float = 20.0
+    start_timeout_s: float = 20.0
     """Longest time in s for the process to become ready on a busy computer."""
-    hung_after_s: float | None = None
+    max_silence_s: float | None = None
     """Longest time in s without a heartbeat; None: the process's results are checked instead."""
-    end_s: float
+    end_timeout_s: float
     """Time in s in which the process must end on request, before it is terminated, then killed."""
-    for_one_session: bool = False
+    is_per_session: bool = False
     """Whether each session starts a new process of this kind."""
     niceness: int | None = 0
     """Increment of the niceness; None: it runs only while no other process needs the processor."""
     memory: MemoryLimit | None = None
     """Limit of its memory; None: no limit."""
-    ended_for_memory: bool = False
+    prefers_oom_kill: bool = False
     """Whether the system ends this process first if memory runs out."""
-    errors_hidden: bool = False
+    captures_stderr: bool = False
     """Whether its standard error is read by its client instead of being shown to the operator."""
 
 
@@ -90,8 +91,8 @@ CONTROL: Final = Worker(
     loss="fault",
     consequence="The drive's watchdog switches it off; the session ends as a fault.",
     beat=StateField.CONTROL_BEAT,
-    hung_after_s=3.0,
-    end_s=5.0,
+    max_silence_s=3.0,
+    end_timeout_s=5.0,
 )
 RECORDER: Final = Worker(
     name="recorder",
@@ -101,9 +102,9 @@ RECORDER: Final = Worker(
     consequence="The session ends as a fault.",
     beat=StateField.RECORDER_BEAT,
     # A disk may stall for seconds; the number of waiting samples is checked instead.
-    hung_after_s=None,
-    end_s=5.0,
-    for_one_session=True,
+    max_silence_s=None,
+    end_timeout_s=5.0,
+    is_per_session=True,
 )
 LIVE: Final = Worker(
     name="live",
@@ -113,9 +114,9 @@ LIVE: Final = Worker(
     consequence="It is not restarted; the session continues.",
     restarts=3,
     beat=StateField.LIVE_BEAT,
-    start_s=60.0,
-    hung_after_s=5.0,
-    end_s=2.0,
+    start_timeout_s=60.0,
+    max_silence_s=5.0,
+    end_timeout_s=2.0,
 )
 TOUCH: Final = Worker(
     name="touch",
@@ -125,9 +126,9 @@ TOUCH: Final = Worker(
     consequence="Touches are detected but not estimated; the session continues.",
     beat=StateField.TOUCH_BEAT,
     # An estimate may take long; a missing estimate is reported as such.
-    hung_after_s=None,
-    end_s=1.0,
-    for_one_session=True,
+    max_silence_s=None,
+    end_timeout_s=1.0,
+    is_per_session=True,
 )
 FIT: Final = Worker(
     name="fit",
@@ -138,11 +139,11 @@ FIT: Final = Worker(
     consequence="The session continues without fits.",
     beat=StateField.FIT_BEAT,
     # A decision may take long on a busy computer; the loop holds the angle meanwhile.
-    hung_after_s=15.0,
-    end_s=1.0,
-    for_one_session=True,
+    max_silence_s=15.0,
+    end_timeout_s=1.0,
+    is_per_session=True,
     niceness=5,  # a third of a processor in competition with another program
-    ended_for_memory=True,
+    prefers_oom_kill=True,
 )
 SUPERVISOR: Final = Worker(
     name="supervisor",
@@ -150,8 +151,8 @@ SUPERVISOR: Final = Worker(
     loss="fault",
     consequence="The control process ends the session as a fault.",
     beat=StateField.SUPERVISOR_BEAT,
-    hung_after_s=2.0,
-    end_s=0.0,
+    max_silence_s=2.0,
+    end_timeout_s=0.0,
 )
 
 PROCESSES: Final = (CONTROL, RECORDER, LIVE, TOUCH, FIT, SUPERVISOR)
@@ -168,7 +169,7 @@ PAGE: Final = Worker(
     loss="warning",
     consequence="It is not started again; the rig does not need it.",
     restarts=4,
-    end_s=3.0,
+    end_timeout_s=3.0,
 )
 PREDICTION: Final = Worker(
     name="prediction",
@@ -176,13 +177,13 @@ PREDICTION: Final = Worker(
     sends=("JobPerformed",),
     loss="nothing",
     consequence="The client's request is refused.",
-    end_s=0.0,
+    end_timeout_s=0.0,
     niceness=19,  # it may run during a session
     # Apart from the control process of a session, the memory of no process is locked. A session of
     # two minutes needs 180 MiB, of which 120 MiB are the program.
     memory=MemoryLimit(fraction=0.25, min_bytes=256 << 20, max_bytes=4 << 30),
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 PLAN: Final = Worker(
     name="plan",
@@ -190,10 +191,10 @@ PLAN: Final = Worker(
     sends=PREDICTION.sends,
     loss="nothing",
     consequence="The session is not started.",
-    end_s=0.0,
+    end_timeout_s=0.0,
     memory=PREDICTION.memory,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 
 
@@ -207,21 +208,21 @@ QUICK_LOOK: Final = Worker(
     module="analysis.quick_look",
     loss="warning",
     consequence="The session has no quick look.",
-    end_s=0.5,
+    end_timeout_s=0.5,
     # Not the lowest priority, because other programs may never pause.
     niceness=10,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 REPORT: Final = Worker(
     name="report",
     module="analysis",
     loss="warning",
     consequence="The report, campaign or export is not made.",
-    end_s=5.0,
+    end_timeout_s=5.0,
     niceness=None,
-    ended_for_memory=True,
-    errors_hidden=True,
+    prefers_oom_kill=True,
+    captures_stderr=True,
 )
 
 WORKERS: Final = (*PROCESSES, PAGE, PREDICTION, PLAN, QUICK_LOOK, REPORT)

@@ -19,7 +19,7 @@ import numpy as np
 
 from rigd.engine.channels import SAMPLE, TOPICS, Channels, attach_channels
 from rigd.engine.messages import ProcessFailed
-from rigd.engine.processes import Heartbeat, Parent
+from rigd.engine.processes import Heartbeat, SupervisorConnection
 from rigd.engine.shared_state import Activity, Phase, StateField, activity
 from rigd.live._feed import DrawingStream
 from rigd.live._program import RerunError
@@ -79,7 +79,7 @@ def main() -> None:
     signal.signal(signal.SIGALRM, signal.SIG_DFL)
     signal.pthread_sigmask(signal.SIG_UNBLOCK, (signal.SIGALRM,))
     prepare_sdk_environment()
-    parent = Parent()
+    parent = SupervisorConnection()
     job: LiveJob = parent.receive_job()
     channels = attach_channels(job.channels)
     try:
@@ -101,7 +101,9 @@ def main() -> None:
 class _Publisher:
     """Main loop of the publisher: receives sessions from the supervisor and shows them."""
 
-    def __init__(self, parent: Parent, channels: Channels, server_program: RerunServer) -> None:
+    def __init__(
+        self, parent: SupervisorConnection, channels: Channels, server_program: RerunServer
+    ) -> None:
         self._parent = parent
         self._channels = channels
         self._server_program = server_program
@@ -188,7 +190,9 @@ class _Publisher:
             self._show_new_records()
             time.sleep(_SEND_PERIOD_S)
         self._finish_session(
-            LiveSessionEnded(tuple(ring_buffer.written for ring_buffer in self._channels.rings))
+            LiveSessionEnded(
+                tuple(ring_buffer.written_count for ring_buffer in self._channels.rings)
+            )
         )
 
     def _show_new_records(self) -> None:
@@ -221,7 +225,7 @@ class _ShownSession:
         shared_state = self._shared_state = channels.shared_state
         first_sample, seen_samples = (
             session.begins[TOPICS.index(SAMPLE)],
-            shared_state[StateField.LIVE_SEEN],
+            shared_state[StateField.LIVE_SAMPLES_SEEN],
         )
         # Continue the count of a previous publisher of the same session.
         self._dropped_before = (
@@ -268,8 +272,10 @@ class _ShownSession:
         """Store the counts of shown and dropped samples for a publisher that replaces this one."""
         shared_state = self._shared_state
         shared_state[StateField.LIVE_DROPPED] = self.dropped
-        shown_samples = self.reader.next - self.backlog.samples
-        shared_state[StateField.LIVE_SEEN] = max(shared_state[StateField.LIVE_SEEN], shown_samples)
+        shown_samples = self.reader.next_index - self.backlog.samples
+        shared_state[StateField.LIVE_SAMPLES_SEEN] = max(
+            shared_state[StateField.LIVE_SAMPLES_SEEN], shown_samples
+        )
 
     def show_touches(self, touches: "Sequence[Mapping[str, Any]]") -> None:
         """Queue the drawings and log lines of estimated touches."""
@@ -569,7 +575,7 @@ class HealthReader:
             missed_ticks=missed_ticks,
             late_ticks=late_ticks,
             lost_ticks=lost_samples,
-            recorder_lag_ticks=self._samples.waiting,
+            recorder_lag_ticks=self._samples.waiting_count,
             disk_free_mb=shared_state[StateField.DISK_FREE_MB] or None,
             view_dropped=view_dropped,
             bus_load_percent=None if load_ppm is None else load_ppm * 1e-4,

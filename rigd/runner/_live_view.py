@@ -61,7 +61,7 @@ class LiveView(SessionWorker):
         if self.failure:  # a new attempt for the new session
             self._restart()
         self._wait(lambda: self._is_ready, _ADDRESS_TIMEOUT_S, is_not_stopped)
-        start_positions = tuple(ring.written for ring in self._group.channels.rings)
+        start_positions = tuple(ring.written_count for ring in self._group.channels.rings)
         self._session = LiveSession(
             subject_of(order, fast=self._fast),
             str(uuid.uuid4()),
@@ -92,7 +92,7 @@ class LiveView(SessionWorker):
         """Show the end of the current session; an unknown outcome and reason are empty."""
         if self._session is not None:
             self._session = None
-            end_positions = tuple(ring.written for ring in self._group.channels.rings)
+            end_positions = tuple(ring.written_count for ring in self._group.channels.rings)
             self._send(LiveSessionEnded(end_positions, outcome, reason))
 
     def _restart(self) -> None:

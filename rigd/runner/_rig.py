@@ -21,8 +21,8 @@ from rigd.engine.messages import (
     ZeroOrder,
 )
 from rigd.engine.processes import ChildError
-from rigd.engine.realtime import Precedence
-from rigd.engine.shared_state import SharedState, StateField, Stop
+from rigd.engine.realtime import RaisedPriority
+from rigd.engine.shared_state import SharedState, StateField, StopReason
 from rigd.engine.workers import CONTROL, LIVE
 from rigd.errors import FailureError
 from rigd.profile import Profile
@@ -97,7 +97,7 @@ class Rig:
         self._connection: DevicesConnected | None = None
         self._view: LiveView | None = None
         self._is_zero_set = False
-        self._precedence: Precedence | None = None
+        self._raised_priority: RaisedPriority | None = None
         self._status_lock = threading.Lock()
         self._status_reader = StatusReader(profile.rig.rate_hz)
         self._signal_reader = SignalReader(profile)
@@ -212,8 +212,8 @@ class Rig:
                 "The zero of the angle was lost with the connection, and the limits with it; move "
                 "the motor to mid-travel and run rigd zero."
             )
-        if self._precedence is not None:
-            self._precedence.cover()
+        if self._raised_priority is not None:
+            self._raised_priority.raise_new_threads()
         _reset_session_fields(group.channels.shared_state)
         group.channels.clear()
         session_run = SessionRun(
@@ -311,12 +311,12 @@ class Rig:
         """
         group = self._connected_group()
         shared_state = group.channels.shared_state
-        if self._precedence is not None:
-            self._precedence.cover()
+        if self._raised_priority is not None:
+            self._raised_priority.raise_new_threads()
         _reset_session_fields(shared_state)
 
         def request_stop() -> None:
-            shared_state[StateField.STOP] = Stop.OPERATOR
+            shared_state[StateField.STOP] = StopReason.OPERATOR
 
         stop.on_request = request_stop
         if stop.requested:
@@ -341,11 +341,11 @@ class Rig:
         A hung control process is killed.
         """
         shared_state = group.channels.shared_state
-        assert CONTROL.hung_after_s is not None
-        hung_after_s = (
+        assert CONTROL.max_silence_s is not None
+        max_silence_s = (
             _VIRTUAL_CLOCK_HEARTBEAT_TIMEOUT_S
             if self._fast
-            else CONTROL.hung_after_s + _ENABLE_TIMEOUT_S
+            else CONTROL.max_silence_s + _ENABLE_TIMEOUT_S
         )
         deadline_s = time.monotonic() + profile.session.rest_timeout_s + _PROBE_TIMEOUT_S
         while True:
@@ -356,7 +356,7 @@ class Rig:
             if probe_reply is not None:
                 return probe_reply
             now_s = time.monotonic()
-            if group.stalled_s(CONTROL) > hung_after_s or now_s > deadline_s:
+            if group.stalled_s(CONTROL) > max_silence_s or now_s > deadline_s:
                 group.control.kill()
                 raise RigError(
                     "The control process did not end the probing move and was killed: without its "
@@ -381,9 +381,9 @@ class Rig:
             control_message = ControlEnded(str(error))
         shared_state = group.channels.shared_state
         shared_state.beat(StateField.SUPERVISOR_BEAT)
-        assert CONTROL.hung_after_s is not None
+        assert CONTROL.max_silence_s is not None
         stalled_s = group.stalled_s(CONTROL)
-        if control_message is None and stalled_s > CONTROL.hung_after_s:
+        if control_message is None and stalled_s > CONTROL.max_silence_s:
             group.control.kill()
             control_message = ControlEnded(
                 f"The control process has not responded for {stalled_s:.1f} s. Check CPU load."
@@ -424,20 +424,22 @@ class Rig:
             self.connected = False
         if group is not None:
             group.end()
-        if self._precedence is not None:
-            self._precedence.release()
-            self._precedence = None
+        if self._raised_priority is not None:
+            self._raised_priority.restore()
+            self._raised_priority = None
 
     def _raise_priority(self, group: ProcessGroup) -> dict[str, str]:
         """Raise the priority of this process, and return the granted settings as metadata."""
         if self._fast:
             return {}
         realtime_settings = self._profile.realtime
-        self._precedence = Precedence(realtime_settings.supervision_priority, realtime_settings.cpu)
-        group.cores = self._precedence.cores_before
+        self._raised_priority = RaisedPriority(
+            realtime_settings.supervision_priority, realtime_settings.cpu
+        )
+        group.cores = self._raised_priority.cores_before
         return {
             f"supervisor_{setting_name}": setting_text
-            for setting_name, setting_text in self._precedence.take().items()
+            for setting_name, setting_text in self._raised_priority.request().items()
         }
 
     def _reset_fault(self, target: ActuationTarget | None) -> None:
@@ -505,7 +507,7 @@ def _ignore_stop_request() -> None:
 
 def _reset_session_fields(shared_state: SharedState) -> None:
     """Reset the fields of the shared state that belong to a single session."""
-    shared_state[StateField.STOP] = Stop.NO
+    shared_state[StateField.STOP] = StopReason.NONE
     shared_state[StateField.GO] = 0
     shared_state[StateField.LIVE_DROPPED] = 0
     shared_state[StateField.PLANNED] = 0

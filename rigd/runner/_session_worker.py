@@ -48,9 +48,11 @@ class SessionWorker(ABC):
 
         The wait ends early if `call_while_waiting`, which is called repeatedly, returns False.
         """
-        start_s = self.worker.start_s
-        if not self._wait(lambda: self._is_ready, start_s, call_while_waiting):
-            self._lose(f"The {self.worker.name} process was not ready within {start_s:g} s.")
+        start_timeout_s = self.worker.start_timeout_s
+        if not self._wait(lambda: self._is_ready, start_timeout_s, call_while_waiting):
+            self._lose(
+                f"The {self.worker.name} process was not ready within {start_timeout_s:g} s."
+            )
         return self.failure
 
     def poll(self) -> list[LogEvent]:
@@ -61,8 +63,8 @@ class SessionWorker(ABC):
 
     def check(self) -> None:
         """Process the received messages, and give the worker up or restart it if it hangs."""
-        if self.process_messages(0.0) and self.worker.hung_after_s is not None:
-            limit_s = self.worker.hung_after_s if self._is_ready else self.worker.start_s
+        if self.process_messages(0.0) and self.worker.max_silence_s is not None:
+            limit_s = self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
             if self._group.stalled_s(self.worker) > limit_s:
                 self._group[self.worker].kill()
                 self._lose(

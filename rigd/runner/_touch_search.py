@@ -121,7 +121,7 @@ class TouchEstimates(SessionWorker):
         self._start(
             TouchJob(
                 group.channels.specs,
-                group.channels.samples.written,
+                group.channels.samples.written_count,
                 rate_hz,
                 search.model,
                 search.order.shear_projection,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
 
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.printable import printable
 from rigd.runner.session import RunResult
@@ -98,7 +98,7 @@ class QuickLooks:
         self._on_result = on_result
         self._lock = threading.Lock()
         self._waiting_sessions: deque[Path] = deque()
-        self._process: Child | None = None
+        self._process: ChildProcess | None = None
         self._session = Path()
         self._is_suspended = False
         self._run_time_s = 0.0
@@ -203,7 +203,7 @@ class QuickLooks:
         self._session = self._waiting_sessions.popleft()
         self._run_time_s, self._processor_s, self._run_time_updated_s = 0.0, 0.0, time.monotonic()
         try:
-            self._process = Child(QUICK_LOOK, str(self._session))
+            self._process = ChildProcess(QUICK_LOOK, str(self._session))
         except ChildError as error:
             yield QuickLook.failed(
                 self._session, f"its program cannot be started ({error.system_reason})."

@@ -29,8 +29,8 @@ from rigd.engine.messages import (
 )
 from rigd.engine.processes import ChildError
 from rigd.engine.realtime import REFUSED
-from rigd.engine.reference import is_whole, write_reference
-from rigd.engine.shared_state import LogEvent, Phase, StateField, Stop, read_events
+from rigd.engine.reference import covers_reference, write_reference
+from rigd.engine.shared_state import LogEvent, Phase, StateField, StopReason, read_events
 from rigd.engine.workers import CONTROL, RECORDER
 from rigd.errors import FailureError
 from rigd.runner._live_view import LiveView
@@ -272,7 +272,7 @@ class SessionRun:
         except (ChildError, SessionFailedError) as error:
             self._recorder_failure = self._recorder_failure or str(error)
             if self._is_control_busy:
-                self._shared_state[StateField.STOP] = Stop.NO_RECORDER
+                self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
                 self._await_control()
             failure_error = SessionFailedError(
                 f"{self._recorder_failure} {self._final_drive_state}"
@@ -285,7 +285,7 @@ class SessionRun:
 
     def _request_stop(self) -> None:
         """Request the control process to stop the session."""
-        self._shared_state[StateField.STOP] = Stop.OPERATOR
+        self._shared_state[StateField.STOP] = StopReason.OPERATOR
 
     def _run(self) -> RunResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
@@ -350,7 +350,7 @@ class SessionRun:
     def _report_and_check_stop(self) -> bool:
         """Report progress before any motion; return whether no stop is requested so far."""
         self._report()
-        return self._shared_state[StateField.STOP] == Stop.NO
+        return self._shared_state[StateField.STOP] == StopReason.NONE
 
     def _open_file(self) -> None:
         """Start the recorder, which creates the session file; use another name if one exists."""
@@ -410,7 +410,7 @@ class SessionRun:
                 and not self._is_virtual_clock
             )
             if (
-                self._shared_state[StateField.STOP] == Stop.NO
+                self._shared_state[StateField.STOP] == StopReason.NONE
                 or self._shared_state[StateField.PHASE] != last_phase
             ):
                 last_phase = self._shared_state[StateField.PHASE]
@@ -418,17 +418,17 @@ class SessionRun:
                 deadline_s = now_s + timeout_s
             elif control_message is None and now_s > deadline_s:
                 return self._kill_control(f"did not stop within {timeout_s:g} s")
-            assert CONTROL.hung_after_s is not None
-            hung_after_s = CONTROL.hung_after_s if is_torque_on else _DRIVE_TIMEOUT_S
+            assert CONTROL.max_silence_s is not None
+            max_silence_s = CONTROL.max_silence_s if is_torque_on else _DRIVE_TIMEOUT_S
             stalled_s = self._group.stalled_s(CONTROL)
-            if control_message is None and stalled_s > hung_after_s:
-                return self._kill_control(f"hung for {hung_after_s:g} s (check CPU load)")
+            if control_message is None and stalled_s > max_silence_s:
+                return self._kill_control(f"hung for {max_silence_s:g} s (check CPU load)")
             if control_message is not None:
                 return self._checked_control_message(control_message)
             if self._recorder_failure is None:
                 self._recorder_failure = self._recorder_failure_reason()
                 if self._recorder_failure is not None:
-                    self._shared_state[StateField.STOP] = Stop.NO_RECORDER
+                    self._shared_state[StateField.STOP] = StopReason.NO_RECORDER
 
     def _checked_control_message(self, control_message: object) -> ReadyToRecord | SessionFinished:
         """Return the message of the control process as ``ReadyToRecord`` or ``SessionFinished``."""
@@ -472,7 +472,7 @@ class SessionRun:
     def _finished_from_shared_state(self, reason: str) -> SessionFinished:
         """Return the session's end for a dead control process, from counts in shared memory."""
         tick_counts = self._counts()
-        is_complete = is_whole(
+        is_complete = covers_reference(
             self._shared_state, tick_counts["scheduled"], self._order.excitation.reference_rad.size
         )
         return SessionFinished(

@@ -98,7 +98,9 @@ class SignalReader:
             self._samples_since_gauges = []
             self._gauges.forget_angle()
         self._last_call_s = now_s
-        signal_blocks = list(self._read_blocks(self._ring_and_observer[1], sample_ring.written))
+        signal_blocks = list(
+            self._read_blocks(self._ring_and_observer[1], sample_ring.written_count)
+        )
         if now_s - self._last_gauges_s < _MIN_GAUGES_INTERVAL_S:
             return signal_blocks
         self._last_gauges_s = now_s
@@ -129,8 +131,8 @@ class SignalReader:
 
     def _read_blocks(self, observer: Observer, end: int) -> Iterator[SignalBlock]:
         """Yield the unread samples before position `end` of the ring buffer in blocks."""
-        while observer.next < end:
-            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next))
+        while observer.next_index < end:
+            ring_bytes = observer.take(min(_MAX_BLOCK_TICKS, end - observer.next_index))
             try:
                 sample_array = decode_samples(ring_bytes)
             except ValueError:

@@ -16,7 +16,7 @@ from aiohttp import web
 from rigd.beam import Beam, Damping
 from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
 from rigd.engine.messages import PageAddress, ProcessFailed
-from rigd.engine.processes import Parent
+from rigd.engine.processes import SupervisorConnection
 from rigd.excitation import KINDS, excitation_options
 from rigd.profile import specimen_files
 from rigd.runner.quick_looks import QuickLook
@@ -341,11 +341,11 @@ def run_page() -> None:
     # No log: a stopped terminal (Ctrl-S) would block all pages, and invalid requests would fill the
     # journal.
     logging.disable()
-    daemon = Parent()
+    daemon = SupervisorConnection()
     asyncio.run(_serve_until_end(daemon, daemon.receive_job()))
 
 
-async def _serve_until_end(daemon: Parent, job: Document) -> None:
+async def _serve_until_end(daemon: SupervisorConnection, job: Document) -> None:
     """Serve the page of a job until the daemon ends or the server fails."""
     try:
         page_server, _, listening_server = await open_page(job)

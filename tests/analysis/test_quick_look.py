@@ -313,9 +313,9 @@ def test_it_runs_at_a_low_priority_and_ends_with_its_parent(short_chirps, tmp_pa
     path = Path(shutil.copy(short_chirps[0], tmp_path))
     code = (
         "import os, pathlib, sys, time\n"
-        "from rigd.engine.processes import Child\n"
+        "from rigd.engine.processes import ChildProcess\n"
         "from rigd.engine.workers import QUICK_LOOK\n"
-        "look = Child(QUICK_LOOK, sys.argv[1])\n"
+        "look = ChildProcess(QUICK_LOOK, sys.argv[1])\n"
         "own = os.getpriority(os.PRIO_PROCESS, 0)\n"
         "assert os.getpriority(os.PRIO_PROCESS, look.pid) == min(19, own + 10)\n"
         "command = pathlib.Path(f'/proc/{look.pid}/cmdline')\n"

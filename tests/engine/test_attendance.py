@@ -356,7 +356,7 @@ def test_virtual_time_goes_on_slowly_where_a_device_waits_for_signs_of_life(
     make_session, monkeypatch, bits
 ):
     """On a line, that is: it stands still for a rig that is simulated in this process."""
-    monkeypatch.setattr("rigd.engine.control_process.SIGN_OF_LIFE_S", 0.0)
+    monkeypatch.setattr("rigd.engine.control_process.MAX_VIRTUAL_PAUSE_S", 0.0)
     session = make_session()
     session.drive.health = lambda: LineHealth(bits)
     reads = []

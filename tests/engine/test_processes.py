@@ -12,7 +12,7 @@ import pytest
 
 from rigd.engine import shared_memory_fd
 from rigd.engine.messages import ControlEnded, MessageReader, ReadyToRecord, SessionJob, encode
-from rigd.engine.processes import Child, ChildError
+from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.reference import map_reference, write_reference
 from rigd.engine.workers import RECORDER
 from rigd.profile import load_profile
@@ -75,7 +75,7 @@ def test_what_is_no_message_is_not_waited_for(pipe):
 
 @pytest.mark.process
 def test_what_is_no_message_is_told_with_the_name_of_the_process():
-    child = Child(replace(RECORDER, module="this"))  # prints the Zen of Python
+    child = ChildProcess(replace(RECORDER, module="this"))  # prints the Zen of Python
     try:
         with pytest.raises(ChildError, match="recorder process sent no message, but b'The Zen of"):
             child.poll(60.0)
@@ -86,9 +86,10 @@ def test_what_is_no_message_is_told_with_the_name_of_the_process():
 @pytest.mark.process
 def test_what_a_library_prints_does_not_stand_among_the_messages():
     says = (
-        "import os; from rigd.engine.messages import Ended; "
-        "from rigd.engine.processes import Parent; parent = Parent(); "
-        "print('of a library', flush=True); os.write(1, b'and so on'); parent.send(Ended(''))"
+        "import os; from rigd.engine.messages import ControlEnded; "
+        "from rigd.engine.processes import SupervisorConnection; "
+        "parent = SupervisorConnection(); print('of a library', flush=True); "
+        "os.write(1, b'and so on'); parent.send(ControlEnded(''))"
     )
     child = subprocess.Popen(
         [sys.executable, "-c", says, str(os.getpid())],
@@ -101,7 +102,7 @@ def test_what_a_library_prints_does_not_stand_among_the_messages():
 
 @pytest.mark.process
 def test_a_process_may_be_stopped_twice():
-    child = Child(RECORDER)
+    child = ChildProcess(RECORDER)
     child.stop()
     child.stop()
     assert not child.running
@@ -114,4 +115,4 @@ def test_a_process_that_the_system_does_not_start_is_told(monkeypatch):
 
     monkeypatch.setattr(subprocess, "Popen", refuse)
     with pytest.raises(ChildError, match=r"recorder process cannot be started .*ulimit"):
-        Child(RECORDER)
+        ChildProcess(RECORDER)

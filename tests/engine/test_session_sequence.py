@@ -11,7 +11,7 @@ import pytest
 from rigd.control import close_loop
 from rigd.devices.contracts import DeviceError
 from rigd.engine.messages import DevicesConnected, ReadyToRecord, SessionFinished
-from rigd.engine.shared_state import Phase, StateField, Stop
+from rigd.engine.shared_state import Phase, StateField, StopReason
 from rigd.engine.timing import VirtualClock
 from rigd.excitation import hold
 from rigd.session.layout import Status, decode_samples
@@ -119,12 +119,12 @@ class StopAt(VirtualClock):
     ("action", "outcome", "words"),
     [
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.OPERATOR),
+            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.OPERATOR),
             "stopped",
             "operator",
         ),
         (
-            lambda s: s.shared_state.__setitem__(StateField.STOP, Stop.NO_RECORDER),
+            lambda s: s.shared_state.__setitem__(StateField.STOP, StopReason.NO_RECORDER),
             "fault",
             "recorder",
         ),

@@ -53,7 +53,7 @@ class Producer(threading.Thread):
         self.fds = descriptors()
         *for_rings, for_board, _ = self.fds
         rings = [
-            Ring.create(topic.record_size, capacity if topic.every else 256, fd)
+            Ring.create(topic.record_size, capacity if topic.tick_interval else 256, fd)
             for topic, fd in zip(TOPICS, for_rings, strict=True)
         ]
         self.channels = Channels(*rings, SharedState.create(for_board))
@@ -169,7 +169,7 @@ class Publisher:
 
     def finish(self, outcome: str = "stopped", reason: str = "The test is over.") -> None:
         """Tell it that the session is over."""
-        ends = tuple(ring.written for ring in self.producer.channels.rings)
+        ends = tuple(ring.written_count for ring in self.producer.channels.rings)
         self.send(LiveSessionEnded(ends, outcome, reason))
 
     def send(self, message: object) -> None:

@@ -290,13 +290,13 @@ def test_one_that_takes_over_counts_only_what_nobody_showed(start_producer, star
     shared_state = producer.channels.shared_state
     assert eventually(lambda: producer.tick > 5000)
     producer.stop()
-    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SAMPLES_SEEN] == producer.tick)
     before = producer.dropped
     first.process.kill()
     first.process.wait()
     producer.go_on(3000)
     second = start_publisher(producer)
-    assert eventually(lambda: shared_state[StateField.LIVE_SEEN] == producer.tick)
+    assert eventually(lambda: shared_state[StateField.LIVE_SAMPLES_SEEN] == producer.tick)
     # An observer reads half of what a ring has; the half before it is gone.
     assert second.dropped == before + 3000 - 4000 // 2
 

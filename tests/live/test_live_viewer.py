@@ -59,7 +59,7 @@ def test_it_keeps_up_through_everything(publisher, viewer, shown_s):
 
     # Sessions follow each other in it.
     publisher.finish()
-    begins = tuple(ring.written for ring in publisher.producer.channels.rings)
+    begins = tuple(ring.written_count for ring in publisher.producer.channels.rings)
     publisher.show("second", begins)
     assert eventually(lambda: shown_s() > begins[-1] * 1e-3 + 0.2)
 

@@ -7,7 +7,7 @@ import pytest
 
 from rigd.engine.messages import FitReport, SearchEnded
 from rigd.engine.processes import ChildError
-from rigd.engine.shared_state import StateField, Stop
+from rigd.engine.shared_state import StateField, StopReason
 from rigd.excitation.targets import parse_target
 from rigd.runner._online_fit import FitSupervisor
 
@@ -49,7 +49,7 @@ def test_reason_and_result_agree(ended, std, reached, reason):
     assert (fit.unmet_reason == "") == reached
 
 
-STOPPED = {StateField.STOP: Stop.OPERATOR}
+STOPPED = {StateField.STOP: StopReason.OPERATOR}
 ON_THE_WAY = of_whole_record(0.9e-4, final=False)
 FAILED = FitReport({"problem": "The sensor stands still.", "modes": [], "text": []}, final=True)
 NOT_A_NUMBER = of_whole_record(float("nan"))

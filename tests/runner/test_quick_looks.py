@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 from processes import children, eventually, state_of
 
-from rigd.engine.processes import Child
+from rigd.engine.processes import ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.runner import quick_looks
 from rigd.runner.quick_looks import QuickLook, QuickLooks
@@ -162,7 +162,7 @@ def test_what_a_process_does_with_the_processors():
 def test_nobody_waits_for_the_end_of_one_that_is_killed(looks, tmp_path, monkeypatch):
     monkeypatch.setattr(quick_looks, "_MAX_RUN_TIME_S", 0.05)
     # As on a busy computer, it has no time to end in; at last it is killed, lest a failure hang.
-    monkeypatch.setattr(Child, "kill", lambda _: None)
+    monkeypatch.setattr(ChildProcess, "kill", lambda _: None)
     for end in (looks.poll, looks.close):
         looks.begin(tmp_path / "hangs.mcap")
         process = looks._process

@@ -45,7 +45,7 @@ def test_a_stop_does_not_wait_for_a_process_that_prepares():
     ("messages", "words"), [([TouchReady()], []), ([], ["was not ready within 0 s. Touches are"])]
 )
 def test_the_session_waits_until_it_is_ready_or_late(monkeypatch, messages, words):
-    monkeypatch.setattr(TouchEstimates, "worker", replace(TOUCH, start_s=0.0))
+    monkeypatch.setattr(TouchEstimates, "worker", replace(TOUCH, start_timeout_s=0.0))
     touches = estimates(lambda _: messages)
     touches.await_ready(lambda: True)
     told = [event.message for event in touches.poll()]
