@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from analysis.identify._explanations import CauseFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify.headline import Headline, ReportedLossFactor, StructureStatus
-    from analysis.identify.profile_likelihood import LikelihoodProfile, Order
+    from analysis.identify.profile_likelihood import LikelihoodProfile, SessionOrder
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
@@ -373,7 +373,7 @@ def effective_reason(parameter_name: str, *, refused: bool) -> str | None:
 
 
 def order_verdict_with_geometry_tolerance(
-    order: Order,
+    order: SessionOrder,
     estimate: TolerantEstimate,
     profile: LikelihoodProfile,
     doubt: str | None,
@@ -397,7 +397,7 @@ def order_verdict_with_geometry_tolerance(
 
 
 def order_status_with_geometry_tolerance(
-    order: Order, estimate: TolerantEstimate, *, refused: bool
+    order: SessionOrder, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
     """Return the status of one damping order, and the reason if it is not identifiable.
 

@@ -22,7 +22,7 @@ from rigd.errors import FailureError
 from rigd.excitation import Excitation, hold
 from rigd.profile import Profile, load_profile
 from rigd.runner import ProcessGroup, Rig
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest
 from rigd.session import read_session
@@ -155,7 +155,7 @@ def run_session(
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as temporary_folder,
         connected_rig(profile, live=live) as (rig, process_group),
     ):
-        session_order = Order(profile, excitation, Path(temporary_folder) / "bench.mcap")
+        session_order = SessionOrder(profile, excitation, Path(temporary_folder) / "bench.mcap")
         usage_meter = UsageMeter(process_group.control.pid)
         stop_request = StopRequest()
         if live:

@@ -308,7 +308,7 @@ the modal constants of the test of a uniform beam."""
 def fit_document(fit: Mapping[str, Any]) -> Document:
     """Return a fit of the record as a dictionary for JSON that has a limited size.
 
-    `fit` has the format of `RunResult.fit`.
+    `fit` has the format of `SessionResult.fit`.
     """
     return {
         fit_key: _shortened_value(fit[fit_key]) for fit_key in _PUBLISHED_FIT_KEYS if fit_key in fit

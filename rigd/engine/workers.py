@@ -46,7 +46,7 @@ class Worker:
     module: str
     """Module that is run as ``python -m module``; empty for the supervisor."""
     sends: tuple[str, ...] = ()
-    """Classes of its messages, by name; the first one that a `SessionWorker` sends means that it is
+    """Classes of its messages, by name; the first one that a `WorkerClient` sends means that it is
     ready. Empty for a program, whose results are files and an exit code."""
     loss: Literal["fault", "warning", "nothing"]
     """What the operator gets if the process dies or hangs: a fault, a warning, or no message."""

@@ -20,8 +20,8 @@ from rigd.live.messages import (
 )
 from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._session_worker import SessionWorker
-from rigd.runner.request import Order
+from rigd.runner._worker_client import WorkerClient
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.sweep_response import sweep_ticks
 from rigd.view import Subject, linear_sweep_band_hz
@@ -37,7 +37,7 @@ _MAX_FIT_MODES = 4
 """Maximum number of modes whose fits are plotted; more plots would be too small to read."""
 
 
-class LiveView(SessionWorker):
+class LiveViewClient(WorkerClient):
     """Client of the publisher process."""
 
     worker = LIVE
@@ -51,7 +51,7 @@ class LiveView(SessionWorker):
         self._is_session_shown = False
         self._restart()
 
-    def show(self, order: Order, stop: StopRequest) -> str:
+    def show(self, order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the view for the next session; return text with its address, or why none."""
 
         def is_not_stopped() -> bool:
@@ -124,7 +124,7 @@ class LiveView(SessionWorker):
         self.address = None
 
 
-def subject_of(order: Order, *, fast: bool = False) -> Subject:
+def subject_of(order: SessionOrder, *, fast: bool = False) -> Subject:
     """Return the data of a session that the live view shows, such as beam, sweep and limits."""
     rig_parameters, excitation = order.profile.rig, order.excitation
     absent_plots: set[str] = set()
@@ -153,7 +153,7 @@ def subject_of(order: Order, *, fast: bool = False) -> Subject:
     )
 
 
-def _fit_modes(order: Order) -> int | None:
+def _fit_modes(order: SessionOrder) -> int | None:
     """Return the number of modes whose fits are plotted: those expected in the excited band.
 
     Returns None if the session makes no fits.

@@ -20,7 +20,7 @@ from rigd.runner._precision_search import (
     target_estimates,
     targets_json,
 )
-from rigd.runner._session_worker import SessionWorker
+from rigd.runner._worker_client import WorkerClient
 
 if TYPE_CHECKING:
     from rigd.engine.reference import ReferenceSpec
@@ -39,7 +39,7 @@ _STORED_KEYS: Final = (
 """Keys of the last estimate that are stored in the session file."""
 
 
-class FitSupervisor(SessionWorker):
+class FitClient(WorkerClient):
     """Client of the fit process of one session, which collects the estimates.
 
     If the session lasts until a precision is reached, it ends with its last planned segment after

@@ -26,17 +26,17 @@ from rigd.engine.shared_state import SharedState, StateField, StopReason
 from rigd.engine.workers import CONTROL, LIVE
 from rigd.errors import FailureError
 from rigd.profile import Profile
-from rigd.runner._live_view import LiveView
+from rigd.runner._live_view import LiveViewClient
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner.request import Order
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import (
     ProgressCallback,
-    RunResult,
     SessionFailedError,
-    SessionRun,
+    SessionResult,
+    SessionSupervisor,
     can_always_receive_stop,
 )
-from rigd.runner.signal_blocks import SignalBlock, SignalReader
+from rigd.runner.signal_blocks import SignalBlock, SignalBlockReader
 from rigd.runner.status import RigStatus, StatusReader
 from rigd.runtime import StopRequest
 
@@ -95,12 +95,12 @@ class Rig:
         self._live = live
         self._group = group
         self._connection: DevicesConnected | None = None
-        self._view: LiveView | None = None
+        self._view: LiveViewClient | None = None
         self._is_zero_set = False
         self._raised_priority: RaisedPriority | None = None
         self._status_lock = threading.Lock()
         self._status_reader = StatusReader(profile.rig.rate_hz)
-        self._signal_reader = SignalReader(profile)
+        self._signal_reader = SignalBlockReader(profile)
         self.connected = False
         self.zero_lost = False
 
@@ -175,18 +175,18 @@ class Rig:
             self.disconnect()
             raise RigError(str(error)) from None
         if LIVE in group:
-            self._view = LiveView(group, self._profile.name, fast=self._fast)
+            self._view = LiveViewClient(group, self._profile.name, fast=self._fast)
         self.connected = True
         self.zero_lost |= self._is_zero_set
         self._is_zero_set = False
 
     def run(
         self,
-        order: Order,
+        order: SessionOrder,
         stop: StopRequest,
         on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool] = can_always_receive_stop,
-    ) -> RunResult:
+    ) -> SessionResult:
         """Run one session to its end, and return its result.
 
         Parameters
@@ -196,7 +196,7 @@ class Rig:
         stop
             Stop request of the operator, which ends the session.
         on_progress, can_receive_stop
-            See :class:`rigd.runner.session.SessionRun`.
+            See :class:`rigd.runner.session.SessionSupervisor`.
 
         Raises
         ------
@@ -216,7 +216,7 @@ class Rig:
             self._raised_priority.raise_new_threads()
         _reset_session_fields(group.channels.shared_state)
         group.channels.clear()
-        session_run = SessionRun(
+        session_run = SessionSupervisor(
             order, group, self._connection, self._view, on_progress, can_receive_stop
         )
         end_outcome = end_reason = ""
@@ -237,7 +237,7 @@ class Rig:
             # and a long series would take 4 kB more for each session.
             gc.collect()
 
-    def show(self, order: Order, stop: StopRequest) -> str:
+    def show(self, order: SessionOrder, stop: StopRequest) -> str:
         """Prepare the live view for the next session, and return its address.
 
         Parameters

@@ -17,7 +17,7 @@ from rigd.engine.shared_state import LogEvent
 from rigd.engine.workers import TOUCH
 from rigd.excitation import Excitation
 from rigd.profile import Profile
-from rigd.runner._session_worker import SessionWorker
+from rigd.runner._worker_client import WorkerClient
 from rigd.session.touches import packed_touches, touch_line
 
 if TYPE_CHECKING:
@@ -102,7 +102,7 @@ def _reading_noise(profile: Profile) -> "ChannelNoise":
     )
 
 
-class TouchEstimates(SessionWorker):
+class TouchClient(WorkerClient):
     """Client of the touch process of one session, which collects the estimates."""
 
     worker = TOUCH

@@ -77,7 +77,7 @@ class SessionPrediction:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class SessionPlan:
     """Prediction of a session before any motion, and whether the limits allow the session."""
 
     prediction: SessionPrediction
@@ -243,7 +243,7 @@ def excitation_for(
 
 def plan_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
-) -> Plan:
+) -> SessionPlan:
     """Return the plan of a session; raise if checks or limits of the profile forbid the session.
 
     Parameters
@@ -270,7 +270,7 @@ def plan_session(
 
 def predict_session(
     profile: Profile, excitation: Excitation, *, force: bool = False, accept: Sequence[str] = ()
-) -> Plan:
+) -> SessionPlan:
     """Return the plan of a session; its field `refused` states why it is not allowed, if so.
 
     Parameters
@@ -331,7 +331,7 @@ def predict_session(
         ]
     if excitation.approach is not None and not any(profile.rig.sensor.shear_projection):
         warnings.append(_UNKNOWN_FORCE_WARNING)
-    return Plan(
+    return SessionPlan(
         prediction,
         warnings=tuple(warnings),
         tip_in_words=tip_in_words(prediction.tip, profile.rig.beam, excitation),
@@ -422,7 +422,7 @@ def largest_amplitude(
     return float(f"{digit_count * digit_step_rad:.3g}") if digit_count else None
 
 
-def plan_document(profile: Profile, excitation: Excitation, plan: Plan) -> dict[str, Any]:
+def plan_document(profile: Profile, excitation: Excitation, plan: SessionPlan) -> dict[str, Any]:
     """Return the plan of a session as a dictionary for JSON.
 
     Parameters

@@ -18,7 +18,7 @@ from typing import Any, Final
 from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.printable import printable
-from rigd.runner.session import RunResult
+from rigd.runner.session import SessionResult
 from rigd.runtime import processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
@@ -74,7 +74,7 @@ class QuickLook:
             return [f"No quick look at {self.session.name}: {self.error}"]
         return [printable(str(text_line)) for text_line in self.content["text"]]
 
-    def note(self, results: list[RunResult]) -> None:
+    def add_path_to_results(self, results: list[SessionResult]) -> None:
         """Add the path of the quick look to the result of its session in a list of results."""
         for result_index, run_result in enumerate(results):
             if run_result.path == self.session:
@@ -85,7 +85,7 @@ class QuickLook:
         return {"path": str(self.session), "look": self.content, "error": self.error}
 
 
-class QuickLooks:
+class QuickLookQueue:
     """Queue of sessions at which quick looks are made, one at a time, while no session runs.
 
     Parameters

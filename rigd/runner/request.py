@@ -57,7 +57,7 @@ class NoRoomError(RefusedError):
 
 
 @dataclass(frozen=True, slots=True)
-class Order:
+class SessionOrder:
     """Session to run, which was already checked against the limits of the profile."""
 
     profile: Profile
@@ -311,11 +311,11 @@ def part_path(path: Path) -> Path:
 def _unused_path(session_path: Path) -> Path:
     """Return a path at which no session file exists, with a number appended if necessary."""
     while session_path.exists() or part_path(session_path).exists():
-        session_path = another_path(session_path)
+        session_path = next_free_path(session_path)
     return session_path
 
 
-def another_path(session_path: Path) -> Path:
+def next_free_path(session_path: Path) -> Path:
     """Return the next path for a session file if its path is used: X.mcap → X_2.mcap → X_3.mcap."""
     base_stem, _, number_text = session_path.stem.rpartition("_")
     if base_stem and number_text.isdecimal():
@@ -366,7 +366,9 @@ def remaining_file_text(session_path: Path | None) -> str:
     )
 
 
-def file_header(order: Order, connection: DevicesConnected, tare: Mapping[str, str]) -> FileHeader:
+def file_header(
+    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
+) -> FileHeader:
     """Return the metadata, segments and attachments with which a session file begins.
 
     Parameters
@@ -391,7 +393,7 @@ def file_header(order: Order, connection: DevicesConnected, tare: Mapping[str, s
 
 
 def _session_metadata(
-    order: Order, connection: DevicesConnected, tare: Mapping[str, str]
+    order: SessionOrder, connection: DevicesConnected, tare: Mapping[str, str]
 ) -> dict[str, str]:
     """Return the record ``session`` of a session file: key → text."""
     rig = order.profile.rig

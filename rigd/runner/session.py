@@ -33,11 +33,11 @@ from rigd.engine.reference import covers_reference, write_reference
 from rigd.engine.shared_state import LogEvent, Phase, StateField, StopReason, read_events
 from rigd.engine.workers import CONTROL, RECORDER
 from rigd.errors import FailureError
-from rigd.runner._live_view import LiveView
-from rigd.runner._online_fit import FitSupervisor
+from rigd.runner._live_view import LiveViewClient
+from rigd.runner._online_fit import FitClient
 from rigd.runner._process_group import ProcessGroup
-from rigd.runner._touch_search import TouchEstimates
-from rigd.runner.request import Order, another_path, file_header, part_path
+from rigd.runner._touch_search import TouchClient
+from rigd.runner.request import SessionOrder, file_header, next_free_path, part_path
 from rigd.runtime import StopRequest
 
 _POLL_S = 0.02
@@ -84,7 +84,7 @@ class SessionFailedError(FailureError):
     counts: Mapping[str, int] = _ZERO_COUNTS
     hardware: bool | None = None
 
-    def result(self) -> "RunResult":
+    def result(self) -> "SessionResult":
         """Return the failed session's result; call this after its processes have ended."""
         partial_path, complete_path = self.saved_path, None
         if partial_path is None and self.path is not None:
@@ -95,7 +95,7 @@ class SessionFailedError(FailureError):
                     complete_path = self.path  # the recorder was only slow, and completed the file
             except OSError:
                 partial_path = part_path(self.path)  # the folder cannot be read
-        return RunResult(
+        return SessionResult(
             path=complete_path,
             outcome="fault",
             reason=str(self),
@@ -116,7 +116,7 @@ class _FileExistsError(SessionFailedError):
 
 
 @dataclass(frozen=True, slots=True)
-class RunResult:
+class SessionResult:
     """Result of a session: how it ended, its file, and counts of ticks."""
 
     path: Path | None
@@ -155,7 +155,7 @@ class RunResult:
     """Result of the fit during the session, as in JSON documents; None if not requested."""
 
     @property
-    def went_well(self) -> bool:
+    def is_successful(self) -> bool:
         """Whether the session is complete and no reason for an early end is stated."""
         return self.outcome == "complete" and not self.reason
 
@@ -203,7 +203,7 @@ ProgressCallback = Callable[[SessionProgress, list[LogEvent]], None]
 MessageType = TypeVar("MessageType")
 
 
-class SessionRun:
+class SessionSupervisor:
     """Supervisor of one session; :meth:`run` may be called once.
 
     Parameters
@@ -216,7 +216,7 @@ class SessionRun:
         Message that the control process sent after it had connected to the devices.
     live
         Live view that shows the session, or None.
-    watcher
+    on_progress
         Called about fifty times a second with the progress and the events since the last call.
     can_receive_stop
         Returns whether this process can receive a stop request. If not, this process stops its
@@ -230,11 +230,11 @@ class SessionRun:
 
     def __init__(
         self,
-        order: Order,
+        order: SessionOrder,
         group: ProcessGroup,
         connection: DevicesConnected,
-        live: LiveView | None,
-        watcher: ProgressCallback,
+        live: LiveViewClient | None,
+        on_progress: ProgressCallback,
         can_receive_stop: Callable[[], bool],
     ) -> None:
         self._order = order
@@ -243,7 +243,7 @@ class SessionRun:
         self._live = live
         self._shared_state = group.channels.shared_state
         self._events = Observer(group.channels.events)
-        self._watcher = watcher
+        self._on_progress = on_progress
         self._can_receive_stop = can_receive_stop
         self._is_virtual_clock = connection.realtime["clock"] == "virtual"
         self._recorder_failure: str | None = None
@@ -252,11 +252,11 @@ class SessionRun:
         self._final_drive_state = "The drive is disabled."
         self._opened_path: Path | None = None
         self._saved_path: Path | None = None
-        self._touches: TouchEstimates | None = None
-        self._fit: FitSupervisor | None = None
+        self._touches: TouchClient | None = None
+        self._fit: FitClient | None = None
         self.device_failed = False
 
-    def run(self, stop: StopRequest) -> RunResult:
+    def run(self, stop: StopRequest) -> SessionResult:
         """Run the session to its end, or until a stop is requested, and return its result.
 
         Raises
@@ -287,7 +287,7 @@ class SessionRun:
         """Request the control process to stop the session."""
         self._shared_state[StateField.STOP] = StopReason.OPERATOR
 
-    def _run(self) -> RunResult:
+    def _run(self) -> SessionResult:
         """Start the processes of the session, supervise them to the end, and close the file."""
         process_group, precision_search = self._group, self._order.excitation.search
         try:
@@ -305,12 +305,12 @@ class SessionRun:
         profile = session_order.profile
         realtime_settings = None if self._is_virtual_clock else profile.realtime
         if session_order.touch is not None:
-            self._touches = TouchEstimates(
+            self._touches = TouchClient(
                 process_group, session_order.touch, profile.rig.rate_hz, realtime_settings
             )
             self._touches.await_ready(self._report_and_check_stop)
         if precision_search is not None or session_order.watch_fit:
-            self._fit = FitSupervisor(
+            self._fit = FitClient(
                 process_group, profile, reference_spec, precision_search, realtime_settings
             )
             failure_reason = self._fit.await_ready(self._report_and_check_stop)
@@ -363,7 +363,7 @@ class SessionRun:
                 opened_reply = self._await_recorder(FileOpened, _RECORDER_START_TIMEOUT_S)
             except _FileExistsError as error:
                 name_error = error
-                self._order = replace(self._order, path=another_path(self._order.path))
+                self._order = replace(self._order, path=next_free_path(self._order.path))
             else:
                 self._opened_path = self._order.path
                 recorder_settings = {
@@ -530,7 +530,7 @@ class SessionRun:
         return recorder_message
 
     def _report(self) -> None:
-        """Signal this process's heartbeat, and pass progress, events and fits to the watcher."""
+        """Signal this process's heartbeat, and report progress, events and fits."""
         shared_state = self._shared_state
         if self._can_receive_stop():
             shared_state.beat(StateField.SUPERVISOR_BEAT)
@@ -547,7 +547,7 @@ class SessionRun:
             new_fits = self._fit.take_new_estimates()
             if self._live is not None:
                 self._live.show_fits(new_fits)
-        self._watcher(
+        self._on_progress(
             SessionProgress(
                 Phase(shared_state[StateField.PHASE]),
                 shared_state[StateField.SCHEDULED],
@@ -558,7 +558,7 @@ class SessionRun:
             new_events,
         )
 
-    def _close(self, finished: SessionFinished) -> RunResult:
+    def _close(self, finished: SessionFinished) -> SessionResult:
         """Complete touches and fit, make the recorder close the file, and return the result."""
         self._report()
         touch_documents = None
@@ -597,7 +597,7 @@ class SessionRun:
         outcome_text, end_reason = finished.outcome, outcome_record["reason"]
         if closed_reply.path is not None:
             outcome_text, end_reason = closed_reply.outcome, closed_reply.reason
-        return RunResult(
+        return SessionResult(
             path=closed_reply.path,
             outcome=outcome_text,
             reason=end_reason,
@@ -617,7 +617,7 @@ class SessionRun:
         )
 
 
-def results_document(results: Sequence[RunResult]) -> dict[str, Any]:
+def results_document(results: Sequence[SessionResult]) -> dict[str, Any]:
     """Return the results of a series of sessions as a dictionary for JSON.
 
     Parameters

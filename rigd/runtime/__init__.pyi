@@ -13,8 +13,8 @@ from ._locks import LockFile as LockFile
 from ._locks import LockHeldError as LockHeldError
 from ._locks import RigBusyError as RigBusyError
 from ._locks import RigLock as RigLock
-from ._locks import held_rig as held_rig
-from ._locks import holds_rig as holds_rig
+from ._locks import holds_rig_lock as holds_rig_lock
+from ._locks import locked_rig as locked_rig
 from ._plain_files import open_plain_file as open_plain_file
 from ._plain_files import read_plain_file as read_plain_file
 from ._session_signals import STOP_SIGNAL as STOP_SIGNAL

@@ -16,8 +16,8 @@ from processes import children, eventually, state_of
 from rigd.engine.processes import ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.runner import quick_looks
-from rigd.runner.quick_looks import QuickLook, QuickLooks
-from rigd.runner.session import RunResult
+from rigd.runner.quick_looks import QuickLook, QuickLookQueue
+from rigd.runner.session import SessionResult
 from rigd.runtime import processor_use
 from rigd.session.quick_look import quick_look_path
 
@@ -56,7 +56,7 @@ def looks(tmp_path, monkeypatch, started):
     program = replace(QUICK_LOOK, module="look_program", niceness=0)
     monkeypatch.setattr(quick_looks, "QUICK_LOOK", program)
     told = []
-    looks = QuickLooks(told.append)
+    looks = QuickLookQueue(told.append)
     looks.told = told
     yield looks
     looks.close()
@@ -207,10 +207,10 @@ def test_closing_ends_one_that_is_suspended(looks, tmp_path, started):
 def test_a_look_is_noted_and_told_as_an_event():
     path = Path("out/a.mcap")
     look = QuickLook(path, quick_look_path(path), {"text": ["Look\x1b[2J"]}, "")
-    result = RunResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
+    result = SessionResult(path, "complete", "", 1, 1, 0, 0, 0, fault=False)
     other = replace(result, path=Path("out/b.mcap"))
     results = [other, result]
-    look.note(results)
+    look.add_path_to_results(results)
     assert results == [other, replace(result, quick_look=look.path)]
     assert results[1].as_dict()["look"] == "out/a.look.json"
     assert other.as_dict()["look"] is None

@@ -9,8 +9,8 @@ from shipped_profile import load_shipped
 
 from rigd.engine.messages import DevicesConnected, FileClosed, SessionFinished
 from rigd.excitation import hold
-from rigd.runner.request import Order
-from rigd.runner.session import SessionFailedError, SessionRun, can_always_receive_stop
+from rigd.runner.request import SessionOrder
+from rigd.runner.session import SessionFailedError, SessionSupervisor, can_always_receive_stop
 
 KILLED = "The fit process was killed by signal 9."
 STOPPED = "Stopped by the operator."
@@ -23,14 +23,14 @@ def close():
 
     def closed(finished, failure, unmet_reason="", *, recorded=True, slow=lambda poll: poll):
         profile = load_shipped("sim")
-        order = Order(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
+        order = SessionOrder(profile, hold(rate_hz=1000.0, duration_s=1.0), Path("a.mcap"))
         group = MagicMock()
         group.channels.shared_state.__getitem__.return_value = 0
         group.channels.events = MagicMock(
             oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
         connected = DevicesConnected({}, {}, {"clock": "virtual"}, simulated=True)
-        session = SessionRun(
+        session = SessionSupervisor(
             order, group, connected, None, lambda *_: None, can_always_receive_stop
         )
         session._fit = MagicMock(search_failure=failure, unmet_reason=unmet_reason, segments={})

@@ -17,7 +17,7 @@ _POLL_S: Final = 0.05
 """Time in seconds to wait for a message at once."""
 
 
-class SessionWorker(ABC):
+class WorkerClient(ABC):
     """Client of a worker without which a session continues.
 
     A subclass names the worker, sends its job by `_start`, and processes its messages.
@@ -50,7 +50,7 @@ class SessionWorker(ABC):
         """
         start_timeout_s = self.worker.start_timeout_s
         if not self._wait(lambda: self._is_ready, start_timeout_s, call_while_waiting):
-            self._lose(
+            self._restart_or_give_up(
                 f"The {self.worker.name} process was not ready within {start_timeout_s:g} s."
             )
         return self.failure
@@ -67,7 +67,7 @@ class SessionWorker(ABC):
             limit_s = self.worker.max_silence_s if self._is_ready else self.worker.start_timeout_s
             if self._group.stalled_s(self.worker) > limit_s:
                 self._group[self.worker].kill()
-                self._lose(
+                self._restart_or_give_up(
                     f"The {self.worker.name} process was killed: no response for {limit_s:g} s."
                 )
 
@@ -84,7 +84,7 @@ class SessionWorker(ABC):
                     if self._is_done:  # the worker may end now
                         break
             except ChildError as error:
-                self._lose(str(error))
+                self._restart_or_give_up(str(error))
         return not (self.failure or self._is_done)
 
     def _start(self, *messages: object) -> None:
@@ -103,7 +103,7 @@ class SessionWorker(ABC):
             try:
                 self._group[self.worker].send(message)
             except ChildError as error:
-                self._lose(str(error))
+                self._restart_or_give_up(str(error))
 
     def _wait(
         self,
@@ -124,7 +124,7 @@ class SessionWorker(ABC):
                 return is_met() or bool(self.failure)
         return True
 
-    def _lose(self, reason: str) -> None:
+    def _restart_or_give_up(self, reason: str) -> None:
         """Restart the lost process, or give it up after its number of restarts."""
         self._restart_count += 1
         if self._restart_count > self.worker.restarts:
