@@ -123,18 +123,22 @@ def margin_rows(profile: Profile) -> Iterator[CheckRow]:
         yield CheckRow("loop", "margins", skip_reason, "", CheckResult.SKIPPED)
         return
     period_s = 1.0 / profile.rig.rate_hz
-    for cut_margins in loop_margins(closed_loop):
+    for opening_margins in loop_margins(closed_loop):
         min_gain_factor = (
-            MIN_ANGLE_GAIN_FACTOR if cut_margins.cut == "angle reading" else MIN_TORQUE_GAIN_FACTOR
+            MIN_ANGLE_GAIN_FACTOR
+            if opening_margins.opening == "angle reading"
+            else MIN_TORQUE_GAIN_FACTOR
         )
-        yield from _margin_rows(cut_margins, min_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s)
+        yield from _margin_rows(
+            opening_margins, min_gain_factor, MIN_DELAY_MARGIN_PERIODS * period_s
+        )
 
 
 def _margin_rows(
     margins: "Margins", min_gain_factor: float, min_delay_s: float
 ) -> Iterator[CheckRow]:
     """Yield check results on the stability margins at one signal of the loop."""
-    row_group = f"loop, {margins.cut}"
+    row_group = f"loop, {margins.opening}"
     gain_up_text = (
         "any"
         if margins.gain_up == inf

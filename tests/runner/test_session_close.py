@@ -27,7 +27,7 @@ def close():
         group = MagicMock()
         group.channels.shared_state.__getitem__.return_value = 0
         group.channels.events = MagicMock(
-            oldest=0, written=0, capacity=16, record_size=1, buffer=bytes(1000)
+            oldest_index=0, written_count=0, capacity=16, record_size=1, buffer=bytes(1000)
         )
         connected = DevicesConnected({}, {}, {"clock": "virtual"}, simulated=True)
         session = SessionSupervisor(

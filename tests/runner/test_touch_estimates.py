@@ -17,7 +17,7 @@ class Group(dict):
     """Processes, of which any is the same one."""
 
     def __init__(self, messages):
-        self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written=0))
+        self.channels = SimpleNamespace(specs=None, samples=SimpleNamespace(written_count=0))
         self.child = SimpleNamespace(send=lambda _: None, messages=messages)
 
     def idle_process(self, _):
