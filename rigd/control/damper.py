@@ -41,7 +41,7 @@ class DamperSettings:
     """Lead time that compensates the lag of the loop."""
     high_pass_rad_s: float
     """Corner frequency below which torques are filtered out."""
-    fast_rad_s: float
+    low_pass_rad_s: float
     """Corner frequency above which torques are filtered out."""
 
 
@@ -148,7 +148,7 @@ def design_damper(closed_loop: "ClosedLoop") -> DamperSettings | None:
         gain_rad_per_nm_s=_DAMPING_STRENGTH / (plant.beam.inertia_kg_m2 * first_rad_s),
         lead_s=2.0 / loop_model.settings.pole_rad_s,
         high_pass_rad_s=_HIGH_PASS_CORNER_OVER_MODE * first_rad_s,
-        fast_rad_s=4.0 * loop_model.settings.pole_rad_s,
+        low_pass_rad_s=4.0 * loop_model.settings.pole_rad_s,
     )
     bending_stiffness_n_m2 = plant.beam.bending_stiffness_n_m2
     beams = [

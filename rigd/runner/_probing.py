@@ -140,7 +140,7 @@ def probing_announcement(profile: Profile) -> str:
     return (
         "Probing move, which verifies the scales of motor, encoder and sensor: strokes of up to "
         f"{probe_plan.travel_rad:.2g} rad to one side and back at {probe_plan.speed_rad_s:.2g} and "
-        f"{probe_plan.fast_rad_s:.2g} rad/s, at most {probe_plan.torque_limit_nm:.2g} N·m."
+        f"{probe_plan.fast_speed_rad_s:.2g} rad/s, at most {probe_plan.torque_limit_nm:.2g} N·m."
     )
 
 
