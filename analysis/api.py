@@ -180,7 +180,7 @@ def fit(
         from analysis.suited import record_band_hz
 
         return fit_record(
-            Measurement.of_record(record),
+            Measurement.from_record(record),
             [STRUCTURES[type_name] for type_name in types or STRUCTURES],
             fixed=fixed,
             band_hz=record_band_hz(record, band_hz),

@@ -322,7 +322,7 @@ class OnlineEstimator:
             record = self.record(up_to_tick)
             end_tick = round((record.time_s[-1]) * record.rate_hz) + 1
             duration_s = record.time_s.size / record.rate_hz
-            measurement, band_hz = Measurement.of_record(record), record_band_hz(record)
+            measurement, band_hz = Measurement.from_record(record), record_band_hz(record)
             order_verdicts: tuple[OrderVerdict, ...] = ()
             fit_in_air = None
             if whole:

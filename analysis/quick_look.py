@@ -161,7 +161,7 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
             )
         else:
             headline, findings, _ = fit_freest_alone(
-                Measurement.of_record(record), record_band_hz(record)
+                Measurement.from_record(record), record_band_hz(record)
             )
             validity = record_validity(
                 record.metadata, record.angle_rad, record.rate_hz, headline.fit.plant
@@ -198,7 +198,7 @@ def _model_document(
 
     if not headline.explained or headline.drag_speed_m_s is not None or len(shown_hz) == 0:
         return None
-    shown_model = ShownModel.of(headline, record)
+    shown_model = ShownModel.from_headline(headline, record)
     peaks_hz = [mode.frequency_hz for mode in shown_model.modes]
     response_band = shown_model.band(dense_grid(min(shown_hz), max(shown_hz), peaks_hz))
     magnitude, magnitude_limits = np.abs(response_band.response), response_band.magnitude_limits()
@@ -443,7 +443,7 @@ def _text_lines(document: Mapping[str, Any]) -> Iterator[str]:
     for mode in shown_modes:
         yield f"  {mode.line()}"
     if shown_modes:
-        validity = Validity.of_document(document.get("validity"))
+        validity = Validity.from_document(document.get("validity"))
         yield f"  {validity.sentence}"
         if validity.uniform_beam is not None:
             yield f"  {validity.uniform_beam.sentence}"

@@ -325,7 +325,7 @@ def whole_record(
     from analysis.suited import record_band_hz
 
     band_hz = record_band_hz(record, band_hz)
-    selection = select(Measurement.of_record(record), fixed=fixed, band_hz=band_hz)
+    selection = select(Measurement.from_record(record), fixed=fixed, band_hz=band_hz)
     return WholeRecord(record, selection, band_hz, fixed)
 
 

@@ -398,7 +398,7 @@ def _sensor_filter(session: Session, rate_hz: float) -> SensorFilter:
         )
     record_count = round(1 / (1 - delay_fraction))
     spacing_s = delay_fraction / rate_hz / max(record_count - 1, 1)
-    return SensorFilter.of_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
+    return SensorFilter.for_records(corner_hz, filter_order, filter_kind, record_count, spacing_s)
 
 
 def _shear_projection(session: Session) -> tuple[float, ...] | None:

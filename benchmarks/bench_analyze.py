@@ -48,7 +48,7 @@ record = analysis.record.load_record(Path(sys.argv[1]))
 mark("reading")
 welch = analysis.paper.analyse(record, WelchSettings())
 mark("the paper's route")
-selection = analysis.identify.select(Measurement.of_record(record))
+selection = analysis.identify.select(Measurement.from_record(record))
 mark("whole record")
 from analysis.results import RecordResult, WholeRecord
 from analysis.report import frf_figure, illustrations, write_report

@@ -172,7 +172,7 @@ def _modal_estimate(
 ) -> ModalEstimate:
     """Return the modal estimate of some modes from the vector of constants and background."""
     constants, background = np.split(joint_values, [len(modes) * len(MODE_CONSTANT_NAMES)])
-    modal_model = ModalModel.of_constants(constants, background.tolist())
+    modal_model = ModalModel.from_constants(constants, background.tolist())
     return ModalEstimate(modal_model, modes, constants, joint_covariance)
 
 

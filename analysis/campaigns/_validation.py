@@ -144,7 +144,7 @@ def left_out_errors(
     try:
         record = load_record(path, highest_hz=highest_frequency_hz(band_hz))
         band_hz = record_band_hz(record, band_hz)
-        comparison = Comparison.of(Measurement.of_record(record), band_hz)
+        comparison = Comparison.from_measurement(Measurement.from_record(record), band_hz)
     except session_error_types() as why:
         return LostTrial(path, str(why))
     except MemoryError:

@@ -115,7 +115,7 @@ class Comparison:
     last_poles_rad_s: list[complex] = field(default_factory=list)
 
     @classmethod
-    def of(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
+    def from_measurement(cls, measurement: Measurement, band_hz: tuple[float, float]) -> Comparison:
         """Return a measurement filtered to a frequency band, ready for comparison.
 
         The mean of the residual is never compared, since it contains the zero offset of the torque

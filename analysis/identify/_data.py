@@ -215,7 +215,7 @@ class Measurement:
     torque_extremes: tuple[TorqueExtreme, ...] = ()
 
     @classmethod
-    def of_record(cls, record: Record) -> Measurement:
+    def from_record(cls, record: Record) -> Measurement:
         """Return the measurement in a record that was read from a session file.
 
         Raises

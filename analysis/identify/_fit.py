@@ -102,12 +102,14 @@ def fit_record(
     if invalid_names:
         raise ValueError(f"{invalid_names} cannot be fixed: choose from {SETTINGS}.")
     free_names = free_settings(fixed)
-    comparison = Comparison.of(measurement, band_hz)
+    comparison = Comparison.from_measurement(measurement, band_hz)
     nominal = measurement.nominal
     coarse_response = CoarseResponse(comparison)
     searches = [
-        StructureSearch.of(Objective(comparison, unknowns), coarse_response)
-        for unknowns in (Unknowns.of(structure, nominal, free_names) for structure in structures)
+        StructureSearch.start(Objective(comparison, unknowns), coarse_response)
+        for unknowns in (
+            Unknowns.for_structure(structure, nominal, free_names) for structure in structures
+        )
     ]
     closest_index = min(range(len(searches)), key=lambda i: searches[i].minima[0].cost)
     reference_descent = searches[closest_index].lowest_coarse_minimum()
@@ -124,7 +126,7 @@ def fit_record(
         comparison = reference_descent.objective.comparison
         coarse_response = CoarseResponse(comparison)
         searches = [
-            StructureSearch.of(Objective(comparison, search.unknowns), coarse_response)
+            StructureSearch.start(Objective(comparison, search.unknowns), coarse_response)
             for search in searches
         ]
     # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is
@@ -145,7 +147,7 @@ def fit_record(
         if updated_descent is reference_descent:
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
-    return RecordAnalysis.of(fits, noise, comparison)
+    return RecordAnalysis.from_fits(fits, noise, comparison)
 
 
 def refit_record(
@@ -175,7 +177,9 @@ def refit_record(
     MeasurementError
         The record cannot be used.
     """
-    comparison = Comparison.of(measurement, band_hz).use_reference_coherent_angle(plant)
+    comparison = Comparison.from_measurement(measurement, band_hz).use_reference_coherent_angle(
+        plant
+    )
     descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
     descent = descent.descend_to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
     descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
@@ -186,7 +190,9 @@ def refit_record(
     if not _residual_is_noise(descent, noise):
         return None
     comparison = descent.objective.comparison
-    return RecordAnalysis.of([summary(descent.objective, descent.x, noise)], noise, comparison)
+    return RecordAnalysis.from_fits(
+        [summary(descent.objective, descent.x, noise)], noise, comparison
+    )
 
 
 def _descend_with_noise(

@@ -210,7 +210,9 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         ).white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
-        unknowns = Unknowns.of(_FREEST_STRUCTURE, measurement.nominal, candidate_set.free)
+        unknowns = Unknowns.for_structure(
+            _FREEST_STRUCTURE, measurement.nominal, candidate_set.free
+        )
         refit_at_start = partial(
             Refit.descend,
             comparison_with_hum,

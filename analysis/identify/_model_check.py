@@ -63,7 +63,7 @@ class ModelCheck:
     temporal_changes: tuple[TemporalChange, ...] = ()
 
     @classmethod
-    def of(
+    def run(
         cls,
         candidate_set: CandidateSet,
         modal_fit: ModalFit | None,

@@ -132,7 +132,7 @@ class RecordAnalysis:
     comparison: Comparison
 
     @classmethod
-    def of(
+    def from_fits(
         cls, fits: Iterable[RecordFit], noise: NoiseSpectrum, comparison: Comparison
     ) -> RecordAnalysis:
         """Return the analysis that contains fits to the same data under the same noise.

@@ -221,7 +221,7 @@ def coarse_minima(
     start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
-    descent_steps = Steps.of(unknowns)
+    descent_steps = Steps.for_unknowns(unknowns)
     minima = [
         descend(
             lambda x: coarse_response.normal_equations(unknowns, x),
@@ -295,7 +295,7 @@ class Descent:
         hopeless : tuple of int and float, optional
             Number of evaluations and cost above which `descend` gives up.
         """
-        descent_steps = Steps.of(self.objective.unknowns)
+        descent_steps = Steps.for_unknowns(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
             self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
         )
@@ -388,7 +388,7 @@ class StructureSearch:
     minima: list[Minimum]
 
     @classmethod
-    def of(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
+    def start(cls, objective: Objective, coarse_response: CoarseResponse) -> StructureSearch:
         """Search the whole range of the unknowns for minima of the coarse response."""
         start_vectors = initial_guesses(coarse_response, objective.unknowns)
         return cls(

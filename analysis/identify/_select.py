@@ -253,7 +253,9 @@ def _select_with_known_impacts(
         if earlier_candidates
         else None
     )
-    linear_candidates = refitted_candidates or CandidateSet.of(measurement, fixed, band_hz)
+    linear_candidates = refitted_candidates or CandidateSet.from_measurement(
+        measurement, fixed, band_hz
+    )
     model = fit_linear_model(linear_candidates, band_hz)
     if not (model.explains_record or measurement.knocks):
         for impact in find_impacts(linear_candidates, obvious=True):
@@ -277,7 +279,7 @@ def _select_with_known_impacts(
         candidate_set, determined_orders, compute=should_compute_profiles
     )
     leading_candidates = candidate_set.with_leading_candidate(candidate_set.freest)
-    check = ModelCheck.of(
+    check = ModelCheck.run(
         leading_candidates, modal_fit, band_hz, model.nonlinear_forces, model.temporal_changes
     )
     alpha_verdict, lambda_verdict = (
@@ -340,7 +342,7 @@ def _select_with_known_impacts(
         candidates=candidate_set.candidates,
         linear_candidates=linear_candidates.candidates,
         headline=reported_headline,
-        analysis=RecordAnalysis.of(
+        analysis=RecordAnalysis.from_fits(
             (c.fit for c in candidate_set.candidates), candidate_set.noise, candidate_set.comparison
         ),
         verdict=Verdict(
@@ -470,7 +472,9 @@ def _fit_freest_with_known_impacts(
     measurement: Measurement, band_hz: tuple[float, float]
 ) -> _Assessment[tuple[Headline, tuple[Finding, ...], RecordAnalysis]]:
     """Fit the structure with most free parameters, with the impacts that the measurement states."""
-    misread_findings = tuple(sign_and_unit_findings(Comparison.of(measurement, band_hz)))
+    misread_findings = tuple(
+        sign_and_unit_findings(Comparison.from_measurement(measurement, band_hz))
+    )
     additional_structures = () if misread_findings else (ORDER_ONE_STRUCTURE,)
     candidate_set = replace(
         CandidateSet.fit_freest_structure(measurement, (), band_hz, additional_structures),
@@ -487,7 +491,7 @@ def _fit_freest_with_known_impacts(
     if modes_with_drag is not None:
         modal_fit = modes_with_drag.modal_fit
     visible_numbers = visible_mode_numbers(candidate_set, modal_fit)
-    check = ModelCheck.of(candidate_set, modal_fit, band_hz)
+    check = ModelCheck.run(candidate_set, modal_fit, band_hz)
     reported_headline = headline_of_fit(
         candidate_set.best.name,
         candidate_set.best.fit,
@@ -509,7 +513,7 @@ def _fit_freest_with_known_impacts(
         for candidate in candidate_set.candidates
         if candidate.structure is ORDER_ONE_STRUCTURE
     )
-    record_analysis = RecordAnalysis.of(
+    record_analysis = RecordAnalysis.from_fits(
         (reported_headline.fit, *other_fits), candidate_set.noise, candidate_set.comparison
     )
     return _Assessment((reported_headline, all_findings, record_analysis), check)

@@ -134,7 +134,9 @@ def fit_structure(
         return None
     noise = selection.analysis.noise
     comparison = selection.analysis.comparison
-    settings = Unknowns.of(UNDAMPED, comparison.measurement.nominal, free_settings(fixed))
+    settings = Unknowns.for_structure(
+        UNDAMPED, comparison.measurement.nominal, free_settings(fixed)
+    )
     unknowns = StructureUnknowns(
         structure,
         settings.nominal,

@@ -85,7 +85,7 @@ class Unknowns:
     omega_rad_s: tuple[float, float]
 
     @classmethod
-    def of(
+    def for_structure(
         cls, structure: Structure, nominal: Plant, free_settings: tuple[Setting, ...]
     ) -> Unknowns:
         """Return the unknowns of a structure with some settings of the rig free.
@@ -434,7 +434,7 @@ class Steps:
     linear_below: float = 0.0
 
     @classmethod
-    def of(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
+    def for_unknowns(cls, unknowns: Unknowns, linear_below: float = 0.0) -> Steps:
         """Return the rule of the steps for the unknowns of a structure.
 
         Parameters

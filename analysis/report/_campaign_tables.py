@@ -100,7 +100,7 @@ def session_list_table(campaign: CampaignResult) -> Table:
         if experiment
         for metadata_name in experiment.added
     )
-    return Table.of(
+    return Table.from_rows(
         "session_list",
         "Sessions, as their files state them",
         (
@@ -311,7 +311,7 @@ def sessions_table(campaign: CampaignResult) -> Table:
         (failure.name, "left out", None, None, ABSENT_TEXT, failure.message)
         for failure in campaign.failures
     ]
-    return Table.of(
+    return Table.from_rows(
         "sessions",
         "Sessions, each by itself",
         (

@@ -270,7 +270,7 @@ def _curves_json(whole_record: WholeRecord) -> dict[str, Any]:
     first_hz, last_hz = whole_record.band_hz
     frequency_hz = np.geomspace(max(first_hz, last_hz / 200), last_hz, _CURVE_POINTS)
     model, loss_model = (
-        ShownModel.of(whole_record.headline, whole_record.record),
+        ShownModel.from_headline(whole_record.headline, whole_record.record),
         loss_estimate(whole_record),
     )
     model_band = model.band(frequency_hz)

@@ -71,7 +71,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
                 " ".join(sorted(unreported_parameters(fit.structure, unsupported_orders))),
             )
         )
-    return Table.of(
+    return Table.from_rows(
         "structures",
         "All structures on the whole record",
         (
@@ -122,7 +122,7 @@ def added_structures_tables(whole_record: WholeRecord) -> tuple[Table, ...]:
         for fit in whole_record.added
         for parameter in fit.structure.parameters
     ]
-    table = Table.of(
+    table = Table.from_rows(
         "added_structures",
         "Structures of installed packages on the whole record",
         (
@@ -244,7 +244,7 @@ def welch_fits_table(analysis: WelchAnalysis, unsupported_orders: Collection[str
         Orders that the whole record does not support. They are marked.
     """
     fits = [model.fit for model in analysis.models]
-    return Table.of(
+    return Table.from_rows(
         "welch_fits",
         "Fits to Welch's estimate, as in the paper",
         (
@@ -312,7 +312,7 @@ def summary_table(analyses: Sequence[WelchAnalysis]) -> Table:
                 ),
             )
         )
-    return Table.of(
+    return Table.from_rows(
         "welch_summary",
         f"Mean ± standard deviation over {len(analyses)} files",
         (
@@ -350,7 +350,7 @@ def peaks_table(analysis: WelchAnalysis) -> Table:
         *(2 * math.pi * p.frequency_hz if p else None for p in analysis.peaks),
         *(p.magnitude_db if p else None for p in analysis.peaks),
     )
-    return Table.of(
+    return Table.from_rows(
         "welch_peaks",
         "Resonant peaks of Welch's estimate, and deviations of the models' peaks from them",
         (
@@ -419,7 +419,7 @@ def welch_modes_table(analysis: WelchAnalysis) -> Table | None:
         )
     if not all(is_underdamped) or not all(fitted_model.modes for fitted_model in fitted_models):
         table_notes.append(f"{ABSENT_TEXT} overdamped in this fit.")
-    return Table.of(
+    return Table.from_rows(
         "welch_modes",
         "Modes of the fits to Welch's estimate",
         (

@@ -547,7 +547,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
     from analysis.report._signal_figures import signals_figure
 
     highest_hz, headline = whole_record.band_hz[1], whole_record.headline
-    model = ShownModel.of(headline, whole_record.record)
+    model = ShownModel.from_headline(headline, whole_record.record)
     analysis = model.compared(whole_record.analysis)
     modes_text = ", ".join(f"{mode.frequency_hz:.3g}" for mode in model.modes)
     frf, _, loss_name, residual_name, signals_name = FIGURES

@@ -467,7 +467,7 @@ def record_page(whole_record: WholeRecord) -> ChartPage:
 
     measured_with_delay, shown_model = (
         measured_response(whole_record),
-        ShownModel.of(whole_record.headline, whole_record.record),
+        ShownModel.from_headline(whole_record.headline, whole_record.record),
     )
     grid_hz = measured_with_delay.frequency_hz
     delay_phasor = np.exp(2j * np.pi * shown_model.delay_s * grid_hz)
@@ -661,7 +661,7 @@ def write_rerun_file(result: RecordResult, path: Path) -> None:
 
         torque = torque_in_band(
             whole_record.record,
-            ShownModel.of(whole_record.headline, whole_record.record).transfer,
+            ShownModel.from_headline(whole_record.headline, whole_record.record).transfer,
             whole_record.band_hz[1],
         )
         result_tabs.append(record_tab(whole_record, torque))

@@ -128,7 +128,7 @@ def torque_in_band(record: Record, plant: Plant | ModalModel, highest_hz: float)
     The model's torque is computed from the measured angle. Above the limit the measured torque is
     noise, and the model's torque is the encoder's quantisation.
     """
-    angle = Measurement.of_record(record).angle_from_rest(highest_hz)
+    angle = Measurement.from_record(record).angle_from_rest(highest_hz)
     band_hz = (0.0, highest_hz)
     # Followed by its mirror image, the angle has no step at its end, to which the model would
     # respond before it in so narrow a band.

@@ -157,7 +157,7 @@ def uniformity_table(uniformity_test: UniformBeamTest) -> Table:
                 number_cell(deviation / std, "+.1f"), number_cell(deviation, "+#.2g", _PERCENT),
             )
         )  # fmt: skip
-    return Table.of(
+    return Table.from_rows(
         "modal_constants",
         "Modal constants measured and of a uniform beam",
         (

@@ -269,7 +269,7 @@ def _follow_series(
                     progress_line, ended_sessions = ProgressLine(), daemon_event["number"]
                 case "quick_look" if daemon_event["path"] in awaited_quick_looks:
                     awaited_quick_looks.discard(daemon_event["path"])
-                    quick_look = QuickLook.of_event(daemon_event)
+                    quick_look = QuickLook.from_event(daemon_event)
                     if quick_look.path is not None:
                         quick_look_paths[daemon_event["path"]] = str(quick_look.path)
                     for log_text in quick_look.lines:

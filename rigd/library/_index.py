@@ -209,7 +209,9 @@ class Index:
         column_values["modes"] = usable_modes(json.loads(str(column_values["modes"])))
         validity_document = json.loads(str(column_values["validity"]))
         column_values["validity"] = (
-            None if validity_document is None else Validity.of_document(validity_document).as_json()
+            None
+            if validity_document is None
+            else Validity.from_document(validity_document).as_json()
         )
         column_values["meta"] = dict(json.loads(str(column_values["meta"])))
         column_values["report"] = None if report_name is None else self._folder / str(report_name)

@@ -260,7 +260,7 @@ def _with_validity(modes: tuple[EstimatedMode, ...], document: object) -> Docume
     if not modes:
         return {}
     validity_document = document.get("validity") if isinstance(document, dict) else None
-    return {"modes": modes, "validity": Validity.of_document(validity_document).as_json()}
+    return {"modes": modes, "validity": Validity.from_document(validity_document).as_json()}
 
 
 def _read_json(path: Path) -> object:

@@ -74,7 +74,7 @@ def _sensor_filter(rig: RigParameters) -> "SensorFilter":
     if serial_settings is None:
         return SensorFilter(*low_pass_hz_and_order)
     records_per_tick = serial_settings.records_per_tick(rig.rate_hz)
-    return SensorFilter.of_records(
+    return SensorFilter.for_records(
         *low_pass_hz_and_order,
         serial_settings.filter,
         records_per_tick,

@@ -57,7 +57,7 @@ class QuickLook:
         return cls(session_path, None, None, error)
 
     @classmethod
-    def of_event(cls, event: Mapping[str, Any]) -> "QuickLook":
+    def from_event(cls, event: Mapping[str, Any]) -> "QuickLook":
         """Return the quick look that an event of the daemon reports."""
         session_path, report_content = Path(event["path"]), event["look"]
         return cls(

@@ -105,7 +105,7 @@ class RunningResponse:
             longest_gap_ticks=round(LONGEST_GAP_S * rate_hz),
             end_tick=record_length,
         )
-        self._sums = CrossSpectra.of_zero_segments(bin_count)
+        self._sums = CrossSpectra.empty(bin_count)
         self._reference_power = np.zeros(bin_count)
         self._summed_up_to = 0
 

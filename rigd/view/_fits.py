@@ -215,7 +215,7 @@ def fit_table(fit: Fit | None) -> str:
     if modes_not_visible := unseen_modes(modes):
         paragraphs.append(f"Not visible so far: {modes_not_visible}.")
     if mode_rows:
-        validity = Validity.of_document(fit.get("validity"))
+        validity = Validity.from_document(fit.get("validity"))
         paragraphs.append(validity.sentence)
         if validity.uniform_beam is not None:
             paragraphs.append(validity.uniform_beam.sentence)

@@ -224,7 +224,7 @@ class OperatorPageServer:
             if event_name == "session":
                 self._start_search(self._find_specimens())
             elif event_name == "quick_look":
-                self.pages.log("info", "\n".join(QuickLook.of_event(message).lines))
+                self.pages.log("info", "\n".join(QuickLook.from_event(message).lines))
 
     def _process_status(self, status: Document) -> None:
         """Send the daemon's status to the open pages, and prepare for a new session."""
@@ -266,7 +266,7 @@ class OperatorPageServer:
     def _process_signals(self, event: Document) -> None:
         """Send a block of signals and the gauges to the open pages."""
         if event["count"]:
-            signal_block = PageSignalBlock.of_event(event)
+            signal_block = PageSignalBlock.from_event(event)
             self.pages.send(self._envelopes.feed(signal_block))
             if self._response is not None:
                 self._response.feed(signal_block)

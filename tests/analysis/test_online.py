@@ -76,7 +76,7 @@ def test_the_last_estimate_is_that_of_the_file(session):
 def test_the_quick_estimate_is_that_of_the_file(session):
     live = fed(session).estimate()
     record = load_record(session.path)
-    told, found, _ = fit_freest_alone(Measurement.of_record(record), record_band_hz(record))
+    told, found, _ = fit_freest_alone(Measurement.from_record(record), record_band_hz(record))
     assert live.headline.parameters == told.parameters
     assert live.headline.modes == told.modes
     assert live.findings == found
@@ -204,9 +204,9 @@ def test_what_the_last_judgement_does_not_explain_is_searched_for(session):
     time_s = np.arange(signals.torque_nm.size) / 1000
     hum_nm = 2e-2 * np.sin(2 * np.pi * 16.4 * time_s)
     humming = replace(signals, torque_nm=signals.torque_nm + hum_nm)
-    before = select(Measurement.of_record(fed_with(signals, session).record(6_000)))
+    before = select(Measurement.from_record(fed_with(signals, session).record(6_000)))
     assert before.verdict.adequate
-    record = Measurement.of_record(fed_with(humming, session).record())
+    record = Measurement.from_record(fed_with(humming, session).record())
     again, alone = (select(record, earlier=each) for each in (before, None))
     assert again.headline.parameters == alone.headline.parameters
     assert again.headline.modes == alone.headline.modes

@@ -214,7 +214,7 @@ def test_a_long_record_is_fitted_by_the_freest_structure_alone(chirps, selection
 
 @pytest.mark.process
 def test_the_freest_structure_alone_flags_what_it_does_not_explain(short_chirps):
-    measurement = Measurement.of_record(load_record(short_chirps[0]))
+    measurement = Measurement.from_record(load_record(short_chirps[0]))
     cubic = measurement.torque_nm + 4e3 * measurement.angle_rad**3
     told, found, _ = fit_freest_alone(replace(measurement, torque_nm=cubic))
     assert {mode.frequency_hz.flag for mode in told.modes if mode.shown} == {

@@ -161,9 +161,9 @@ def test_the_folder_holds_every_figure_and_table(done, tmp_path):
     assert found.validity.sentence in text
     assert found.validity.sentence in page
     of_beam = content["headlines"][-1]["validity"].pop("uniform_beam")
-    of_campaign = found.validity.as_json()
-    assert content["validity"].pop("uniform_beam") is of_campaign.pop("uniform_beam") is None
-    assert content["validity"] == content["headlines"][-1]["validity"] == of_campaign
+    from_campaign = found.validity.as_json()
+    assert content["validity"].pop("uniform_beam") is from_campaign.pop("uniform_beam") is None
+    assert content["validity"] == content["headlines"][-1]["validity"] == from_campaign
     assert of_beam["status"] == found.modal.uniform_beam.status == "passed"
     assert len(content["uniform_beam"]) == len(of_beam["constants"]) == 12
     alpha = next(row for row in content["parameters"] if row["parameter"] == "alpha")

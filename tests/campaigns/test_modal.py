@@ -40,7 +40,7 @@ def sessions_of(make_session, make_experiment):
         for number in range(first, first + count):
             own = constants + std * np.random.default_rng(number).normal(size=std.size)
             modal = ModalEstimate(
-                ModalModel.of_constants(own, (0.0,) * 5),
+                ModalModel.from_constants(own, (0.0,) * 5),
                 MODES,
                 own,
                 np.diag(np.concatenate([std**2, np.ones(5)])),

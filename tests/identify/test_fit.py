@@ -252,8 +252,8 @@ def test_the_wrong_structures_are_far_off(all_seven):
 def test_no_descent_from_elsewhere_ends_lower(sessions, name):
     measurement = sessions("VI").measured(noise_nm=1e-2, seed=9)
     analysis = fit_record(measurement, [STRUCTURES[name]])
-    comparison = Comparison.of(measurement, (0.0, 50.0))
-    unknowns = Unknowns.of(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
+    comparison = Comparison.from_measurement(measurement, (0.0, 50.0))
+    unknowns = Unknowns.for_structure(STRUCTURES[name], Plant(LINK, Damping()), SETTINGS)
     objective = Objective(comparison, unknowns)
     weight = analysis.noise.weight
     rng = np.random.default_rng(6)
@@ -264,7 +264,7 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
         found = descend(
             lambda x: objective.normal_equations(x, weight),
             unknowns.start(np.array(sizes)),
-            Steps.of(unknowns),
+            Steps.for_unknowns(unknowns),
             relative_tolerance=1e-10,
             max_evaluations=40,
         )

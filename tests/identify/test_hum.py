@@ -81,7 +81,9 @@ def test_a_hum_while_the_beam_rings(sessions):
 
 
 def test_a_mode_that_a_fit_has_beyond_the_band(sessions):
-    comparison = Comparison.of(sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0))
+    comparison = Comparison.from_measurement(
+        sessions("VI").measured(noise_nm=NOISE_NM, seed=21), (0.0, 50.0)
+    )
     pole = Pole(3, complex(-2.0, 2 * np.pi * 80), np.zeros(0))
     plant, nothing = Plant(comparison.measurement.beam, Damping()), np.zeros(comparison.samples)
     noise = estimate_noise(

@@ -46,7 +46,7 @@ def record_result(make_signals, write_session, tmp_path_factory):
         metadata={"note": HOSTILE, "operator": "<i>Rossi</i>", "specimen": "</td>"},
     )
     record = load_record(path)
-    analysis = fit_record(Measurement.of_record(record), [STRUCTURES[name] for name in TYPES])
+    analysis = fit_record(Measurement.from_record(record), [STRUCTURES[name] for name in TYPES])
     candidates = [Candidate(fit.structure, fit) for fit in analysis.fits]
     selection = Selection(
         verdict(

@@ -215,7 +215,7 @@ def test_a_look_is_noted_and_told_as_an_event():
     assert results[1].as_dict()["look"] == "out/a.look.json"
     assert other.as_dict()["look"] is None
     event = json.loads(json.dumps({"event": "quick_look", **look.as_dict()}))
-    assert QuickLook.of_event(event) == look
+    assert QuickLook.from_event(event) == look
     assert look.lines == ["Look?[2J"]
     none = QuickLook(path, None, None, "why.")
-    assert QuickLook.of_event(none.as_dict()) == none
+    assert QuickLook.from_event(none.as_dict()) == none
