@@ -120,7 +120,7 @@ def _add_flags(
     return replace(
         estimates,
         parameters={
-            parameter_name: parameter.flagged(
+            parameter_name: parameter.with_flag(
                 mixture_flag(parameter_name) or order_flags.get(parameter_name)
             )
             for parameter_name, parameter in estimates.parameters.items()
@@ -128,10 +128,10 @@ def _add_flags(
         modes=tuple(
             replace(
                 mode,
-                frequency_hz=mode.frequency_hz.flagged(
+                frequency_hz=mode.frequency_hz.with_flag(
                     mixture_flag(f"frequency_hz_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
-                damping_ratio=mode.damping_ratio.flagged(
+                damping_ratio=mode.damping_ratio.with_flag(
                     mixture_flag(f"damping_ratio_{mode.number}") if mode.shown else _NOT_SHOWN_FLAG
                 ),
             )
@@ -211,7 +211,7 @@ def _reported_loss_factors(
     """Return the loss factors with their flags."""
     order_flags = _order_flags(orders)
     return tuple(
-        loss_factor.flagged(common_flag or order_flags.get(loss_factor.order))
+        loss_factor.with_flag(common_flag or order_flags.get(loss_factor.order))
         for loss_factor in pooled_estimate.sizes
     )
 

@@ -76,7 +76,7 @@ class PooledOrder:
     std: float | None = None
     exact: PooledOrder | None = None
 
-    def doubted(self, reason: str) -> PooledOrder:
+    def with_doubt(self, reason: str) -> PooledOrder:
         """Return this order with a reason against its interpretation.
 
         Its status becomes "open" if it has an interval. An order that already has a reason is
@@ -176,11 +176,11 @@ def tolerant_pooled_order(
         exact=exact_order,
     )
     if exact_order.mixture and exact_order.reason is not None:
-        return replace(tolerant_order.doubted(exact_order.reason), mixture=True)
+        return replace(tolerant_order.with_doubt(exact_order.reason), mixture=True)
     if not _nearly_all_adequate(verdicts):
-        return tolerant_order.doubted(_UNEXPLAINED_REASON)
+        return tolerant_order.with_doubt(_UNEXPLAINED_REASON)
     final_reason = effective_reason(order, refused=refused)
-    return tolerant_order if final_reason is None else tolerant_order.doubted(final_reason)
+    return tolerant_order if final_reason is None else tolerant_order.with_doubt(final_reason)
 
 
 def _nearly_all_adequate(verdicts: Sequence[Verdict]) -> bool:

@@ -307,7 +307,7 @@ def _final_order(
             exact_order, modal_model.tolerant, verdicts, refused=is_beam_refused
         )
     refusal_reason = uniform_beam_refusal_reason(modal_model.uniform_beam)
-    return exact_order if refusal_reason is None else exact_order.doubted(refusal_reason)
+    return exact_order if refusal_reason is None else exact_order.with_doubt(refusal_reason)
 
 
 def _describe_parameters(

@@ -89,7 +89,7 @@ class WelchBias:
     record_wmse: float
 
     @property
-    def significant(self) -> tuple[ParameterBias, ...]:
+    def significant_parameters(self) -> tuple[ParameterBias, ...]:
         """Parameters whose bias is significant."""
         return tuple(parameter for parameter in self.parameters if parameter.significant)
 

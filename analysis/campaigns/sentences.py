@@ -609,7 +609,7 @@ def describe_welch_bias(
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
         significant_parameters = [
-            one for one in bias.significant if one.parameter not in omitted_parameters
+            one for one in bias.significant_parameters if one.parameter not in omitted_parameters
         ]
         if not significant_parameters:
             continue

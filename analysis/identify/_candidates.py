@@ -323,7 +323,9 @@ class CandidateSet:
         candidate_set = self
         for _ in range(MAX_ANGLE_REESTIMATES):
             best = candidate_set.best
-            comparison = candidate_set.comparison.renewed(best.fit.plant, candidate_set.noise)
+            comparison = candidate_set.comparison.with_reestimated_angle(
+                best.fit.plant, candidate_set.noise
+            )
             if comparison is candidate_set.comparison:
                 break
             set_of_best = replace(candidate_set, comparison=comparison, candidates=(best,))

@@ -400,7 +400,7 @@ class Comparison:
             incoherent_nm - self.incoherent_nm, unknown_tick_nm - self.incoherent_in_gaps_nm
         )
 
-    def renewed(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
+    def with_reestimated_angle(self, plant: Plant | ModalModel, noise: NoiseSpectrum) -> Comparison:
         """Return the comparison with the reference-coherent angle estimated with a better plant.
 
         Parameters

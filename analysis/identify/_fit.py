@@ -131,7 +131,9 @@ def fit_record(
         ]
     # The incoherent part of the angle may contain the beam's motion, and not noise alone. It is
     # re-estimated with the closest structure, before and after all others are fitted.
-    updated_descent = reference_descent.renewed(reference_descent.noise(), _ROUGH_COST_TOLERANCE)
+    updated_descent = reference_descent.with_reestimated_angle(
+        reference_descent.noise(), _ROUGH_COST_TOLERANCE
+    )
     descents: list[Descent] = []
     for _ in range(_MAX_REFERENCE_ESTIMATES):
         if updated_descent is not reference_descent:
@@ -143,7 +145,7 @@ def fit_record(
         reference_descent = descents[closest_index]
         if not _residual_is_noise(reference_descent, noise):
             break  # none of these explains it, so a further pass does not distinguish them better
-        updated_descent = reference_descent.renewed(noise, _ROUGH_COST_TOLERANCE)
+        updated_descent = reference_descent.with_reestimated_angle(noise, _ROUGH_COST_TOLERANCE)
         if updated_descent is reference_descent:
             break
     fits = (summary(descent.objective, descent.x, noise) for descent in descents)
@@ -182,7 +184,7 @@ def refit_record(
     )
     descent = Descent(Objective(comparison, unknowns), unknowns.vector(plant))
     descent = descent.descend_to_minimum(descent.noise(), _ROUGH_COST_TOLERANCE)
-    descent = descent.renewed(descent.noise(), _ROUGH_COST_TOLERANCE)
+    descent = descent.with_reestimated_angle(descent.noise(), _ROUGH_COST_TOLERANCE)
     if descent.hum():
         return None
     noise = descent.noise(with_lines=True)

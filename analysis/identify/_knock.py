@@ -104,7 +104,7 @@ class DetectedImpact:
     residual_power_ratio: float
 
     @property
-    def evident(self) -> bool:
+    def is_evident(self) -> bool:
         """Return whether the impact explains most of the torque residual and begins abruptly."""
         return (
             self.explained_fraction > _EVIDENT_FRACTION
@@ -112,7 +112,7 @@ class DetectedImpact:
         )
 
     @property
-    def obvious(self) -> bool:
+    def is_obvious(self) -> bool:
         """Return whether the impact explains so much that no other effect is tested first."""
         return (
             self.explained_fraction > _OBVIOUS_FRACTION
@@ -131,7 +131,7 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
     if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
         return
     found_in_whole = find_impact(candidate_set)
-    if found_in_whole is not None and found_in_whole.obvious:
+    if found_in_whole is not None and found_in_whole.is_obvious:
         yield found_in_whole
         found_in_whole = None
     if obvious:
@@ -207,7 +207,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
         fit, used_bins = analysis.fits[0], analysis.noise.counts
         if not whiteness(
             fit.residual[used_bins], analysis.comparison.frequency_hz[used_bins]
-        ).white:
+        ).is_white:
             continue
         comparison_with_hum = comparison.remove_hum(()).recompute_incoherent_torque(fit.plant)
         unknowns = Unknowns.for_structure(

@@ -193,7 +193,7 @@ class ModalFit(ModalEstimate):
     @property
     def explained(self) -> bool:
         """Return whether only noise remains in the residual of the modal model."""
-        return self.whiteness.white and not self.input_relation.related
+        return self.whiteness.is_white and not self.input_relation.related
 
     @property
     def visible(self) -> tuple[int, ...]:
@@ -354,7 +354,7 @@ class _ModalSearch:
             comparison = search.comparison
             # A torque that the modal model lacks would change which part of the angle follows it.
             if not (len(search.effect_spectra) or comparison.drag):
-                comparison = comparison.renewed(modal_model, search.noise)
+                comparison = comparison.with_reestimated_angle(modal_model, search.noise)
             comparison = comparison.fill_unknown_torque(modal_model)
             noise_power = smooth_power(residual_spectrum, finely=True)
             noise_power = noise_power_with_peaks(

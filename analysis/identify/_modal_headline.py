@@ -102,7 +102,7 @@ def replace_by_modal_model(
         Half width of the modes' 95 % intervals, in standard deviations.
     """
     refusal = uniform_beam_refusal_reason(test)
-    exact_estimates = exact if refusal is None else exact.doubted(refusal)
+    exact_estimates = exact if refusal is None else exact.with_flag_on_all(refusal)
     # The effect of drag depends on how a mode decays, which the beam model includes.
     modes_of_beam = test.status == "passed" and (tolerant is None or "drag" in exact.parameters)
     modes = _reported_modes(exact_estimates, modal, mode_doubt, half_width, from_beam=modes_of_beam)
@@ -120,7 +120,7 @@ def replace_by_modal_model(
             **_reported_parameters(tolerant, doubt, refused=refusal is not None),
         },
         sizes=tuple(
-            loss_factor_found.flagged(doubt)
+            loss_factor_found.with_flag(doubt)
             for loss_factor_found in loss_factors_with_geometry_tolerance(test, tolerant)
         ),
         structures=_structure_status(exact_estimates, tolerant),
@@ -153,7 +153,7 @@ def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) ->
     """
     parameters = {
         name: _flag_contradicted(
-            estimate, [(getattr(cause.damping, name), cause.words) for cause in causes]
+            estimate, [(getattr(cause.damping, name), cause.phrase) for cause in causes]
         )
         if name in ("zeta", "alpha")
         else estimate
@@ -167,7 +167,7 @@ def flag_contradicted_damping(headline: Headline, causes: Sequence[CauseFit]) ->
             size=_flag_contradicted(
                 loss_factor.size,
                 [
-                    (cause.damping.internal_loss_factor(loss_factor.omega_rad_s), cause.words)
+                    (cause.damping.internal_loss_factor(loss_factor.omega_rad_s), cause.phrase)
                     for cause in causes
                 ],
             ),
@@ -188,7 +188,7 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
         Modes whose damping ratio depends on air drag of unknown size.
     """
     modes = tuple(
-        replace(mode, damping_ratio=mode.damping_ratio.flagged(_CHANGED_BY_DRAG))
+        replace(mode, damping_ratio=mode.damping_ratio.with_flag(_CHANGED_BY_DRAG))
         if mode.number in mode_numbers
         else mode
         for mode in headline.modes
@@ -197,14 +197,14 @@ def flag_modes_changed_by_drag(headline: Headline, mode_numbers: Sequence[int]) 
 
 
 def _flag_contradicted(estimate: Estimate, rivals: Sequence[tuple[float, str]]) -> Estimate:
-    """Return an estimate with a flag if a cause, given by value and words, has another value."""
+    """Return an estimate with a flag if a cause, given by value and phrase, has another value."""
     if estimate.interval_95 is None:
         return estimate
     low, high = estimate.interval_95
-    for value, words in rivals:
+    for value, phrase in rivals:
         half_width = high - estimate.value if value > estimate.value else estimate.value - low
         if abs(value - estimate.value) > _CONTRADICTION_STDS / NORMAL_95 * half_width:
-            return estimate.flagged(f"{words} would explain the modes, too, with {value:.3g}")
+            return estimate.with_flag(f"{phrase} would explain the modes, too, with {value:.3g}")
     return estimate
 
 

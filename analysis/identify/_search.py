@@ -21,7 +21,7 @@ from analysis.identify.free_decay import count_decay_spectra
 from analysis.identify.noise import Hum, NoiseSpectrum, estimate_noise
 from analysis.identify.parametrization import Steps
 from analysis.optimizer import NormalEquations, descend
-from analysis.paper import thinned
+from analysis.paper import representative_points
 from rigd.beam import ResponseGrid
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ class CoarseResponse:
             torque_spectrum[is_excited] / angle_spectrum[is_excited],
             angle_power[is_excited],
         )
-        selected_bins, self._weights = thinned(
+        selected_bins, self._weights = representative_points(
             measured_response, response_weights / response_weights.sum(), _COARSE_POINTS
         )
         self._measured = measured_response[selected_bins]
@@ -305,14 +305,14 @@ class Descent:
         """Return the sum of squares at the current point under a noise spectrum."""
         return self.objective.normal_equations(self.x, noise.weight).cost
 
-    def renewed(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
+    def with_reestimated_angle(self, noise: NoiseSpectrum, tolerance: float) -> Descent:
         """Re-estimate the motor angle from the reference angle, and descend until it converges.
 
         Return `self` if it has converged already.
         """
         descent = self
         for _ in range(MAX_ANGLE_REESTIMATES):
-            comparison = descent.objective.comparison.renewed(descent.plant, noise)
+            comparison = descent.objective.comparison.with_reestimated_angle(descent.plant, noise)
             if comparison is descent.objective.comparison:
                 break
             descent = Descent(Objective(comparison, descent.objective.unknowns), descent.x)

@@ -230,7 +230,7 @@ def _assess_with_impacts(
             impact_assessment = assess_measurement(
                 add_known_impact(candidate_set.comparison.measurement, impact)
             )
-            if impact_assessment.explained or impact.evident:
+            if impact_assessment.explained or impact.is_evident:
                 better_assessment = impact_assessment
             if impact_assessment.explained:
                 break
@@ -288,10 +288,10 @@ def _select_with_known_impacts(
     )
     order_verdicts = alpha_verdict, lambda_verdict
     reported_headline = headline(
-        candidate_set, order_verdicts, visible_numbers, unexplained=check.model_reason
+        candidate_set, order_verdicts, visible_numbers, unexplained_reason=check.model_reason
     )
     if check.doubt_reason is not None:
-        reported_headline = reported_headline.doubted(check.doubt_reason)
+        reported_headline = reported_headline.with_flag_on_all(check.doubt_reason)
     reported_headline = _add_modal_model(reported_headline, measurement, beam_test, check)
     reported_headline = flag_modes_changed_by_drag(reported_headline, model.modes_changed_by_drag)
     effect_findings = model.findings
@@ -413,7 +413,7 @@ def _add_modal_model(
         return exact_headline
     estimate_with_tolerance = None
     if measurement.axis_tilt_deg:
-        exact_headline = exact_headline.doubted(_TILTED_AXIS_REASON)
+        exact_headline = exact_headline.with_flag_on_all(_TILTED_AXIS_REASON)
     if measurement.uniformity or beam_test.status == "refused" or measurement.axis_tilt_deg:
         estimate_with_tolerance = tolerant_estimate(
             check.modal_fit,
@@ -497,7 +497,7 @@ def _fit_freest_with_known_impacts(
         candidate_set.best.fit,
         visible_numbers,
         {} if misread_findings else _unidentifiable_orders(candidate_set, visible_numbers),
-        unexplained=check.model_reason,
+        unexplained_reason=check.model_reason,
         both=None if misread_findings else candidate_set.fit_with_both_dampings(candidate_set.best),
     )
     beam_test = _uniform_beam_test(measurement, modal_fit)
@@ -507,7 +507,7 @@ def _fit_freest_with_known_impacts(
         reported_headline, () if modes_with_drag is None else (modes_with_drag.finding(),)
     )
     if check.clipped_reason is not None:
-        reported_headline = reported_headline.doubted(check.clipped_reason)
+        reported_headline = reported_headline.with_flag_on_all(check.clipped_reason)
     other_fits = (
         candidate.fit
         for candidate in candidate_set.candidates

@@ -112,7 +112,7 @@ class TemporalChange:
         return _EFFECT_NAMES[self.what]
 
     @property
-    def certain(self) -> bool:
+    def is_certain(self) -> bool:
         """Return whether no model without this change explains the record as well."""
         return self.bic_difference < -BIC_DECISIVE
 
@@ -164,7 +164,7 @@ def find_temporal_changes(
         for c, _ in possible_changes
         if c.bic_difference < best_change.bic_difference + BIC_DECISIVE
     )
-    if not best_change.certain or len(equivalent_changes) > 1:
+    if not best_change.is_certain or len(equivalent_changes) > 1:
         return candidate_set, equivalent_changes
     return candidate_set.refit_with_effect_spectra(
         best_refit.columns, best_refit.residual_noise()
@@ -459,7 +459,9 @@ _FINDING_KINDS: Final[dict[Effect, Kind]] = {
 """Kind of the finding on each effect."""
 
 
-def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool) -> bool:
+def is_single_change_established(
+    equivalent_changes: tuple[TemporalChange, ...], *, is_single_sweep: bool
+) -> bool:
     """Return whether the record establishes exactly one change as its explanation.
 
     A change with time is never established by one sweep: it may depend on frequency instead.
@@ -472,7 +474,7 @@ def established(equivalent_changes: tuple[TemporalChange, ...], *, is_single_swe
     is_single_sweep : bool
         Whether the excitation is a single sweep.
     """
-    if len(equivalent_changes) != 1 or not equivalent_changes[0].certain:
+    if len(equivalent_changes) != 1 or not equivalent_changes[0].is_certain:
         return False
     return equivalent_changes[0].what == "play" or not is_single_sweep
 
@@ -491,7 +493,7 @@ def temporal_change_findings(
     """
     for change in equivalent_changes:
         finding = _established_finding(change)
-        if established(equivalent_changes, is_single_sweep=is_single_sweep):
+        if is_single_change_established(equivalent_changes, is_single_sweep=is_single_sweep):
             yield finding
         else:
             rival_names = "the others named" if len(equivalent_changes) > 1 else "any other model"

@@ -3,7 +3,7 @@ from ._estimate import SettingsError as SettingsError
 from ._estimate import estimate as estimate
 from ._fit import fit_frf as fit_frf
 from ._fit import fit_many as fit_many
-from ._fit import thinned as thinned
+from ._fit import representative_points as representative_points
 from ._route import LARGEST_FREQUENCY_SHIFT as LARGEST_FREQUENCY_SHIFT
 from ._route import FittedModel as FittedModel
 from ._route import Indices as Indices

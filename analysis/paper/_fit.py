@@ -189,7 +189,7 @@ def fit_many(
     grids_by_weighting: list[tuple[_FrequencyGrid, _FrequencyGrid]] = []
     for weighting in weightings:
         all_weights = weights(omega_rad_s, weighting)
-        point_index, point_weights = thinned(response, all_weights, _FEW_POINTS)
+        point_index, point_weights = representative_points(response, all_weights, _FEW_POINTS)
         thinned_model = FrequencyResponseModel(frequency_hz[point_index], beam, tool_inertia_kg_m2)
         grids_by_weighting.append(
             (
@@ -363,7 +363,7 @@ def _check_response(
 # Representative points
 
 
-def thinned(
+def representative_points(
     measured_response: NDArray[np.complex128], weights: NDArray[np.float64], point_count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
     """Choose representative points of a response, densest near peaks and at large weights.

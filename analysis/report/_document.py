@@ -183,7 +183,7 @@ def record_entries(
                 "covariance": fit.covariance.tolist(),
                 "internal_size": _damping_size_json(fit.internal),
                 "external_size": _damping_size_json(fit.external),
-                "ringing": {**asdict(fit.ringing), "significant": fit.ringing.significant},
+                "ringing": {**asdict(fit.ringing), "significant": fit.ringing.is_significant},
                 "indices": welch_indices,
                 "indices_whole_record": record_indices,
             }

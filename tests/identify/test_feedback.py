@@ -212,10 +212,10 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
     found = fit_record(measured, [STRUCTURES["III"]])
     plant = found.fits[0].plant
     first = comparison.use_reference_coherent_angle(plant)
-    assert first.renewed(plant, found.noise) is first
-    other = first.renewed(
+    assert first.with_reestimated_angle(plant, found.noise) is first
+    other = first.with_reestimated_angle(
         replace(plant, beam=replace(LINK, density_kg_per_m=5.2e-3)), found.noise
-    ).renewed(plant, found.noise)
+    ).with_reestimated_angle(plant, found.noise)
     assert other.angle_rad + other.incoherent_rad == pytest.approx(
         first.angle_rad + first.incoherent_rad
     )
@@ -223,7 +223,7 @@ def test_what_followed_is_told_anew_where_the_first_beam_does_not(controlled):
         retained = each.torque_nm[each.retained] + each.incoherent_nm
         assert retained == pytest.approx(comparison.torque_nm[comparison.retained])
     # Nothing was taken out there.
-    assert comparison.renewed(plant, found.noise) is comparison
+    assert comparison.with_reestimated_angle(plant, found.noise) is comparison
 
 
 @pytest.mark.fit
@@ -234,8 +234,8 @@ def test_what_rings_in_narrow_bands_is_followed_with_the_torque_it_makes(in_narr
         plant
     )
     noise = fit_record(in_narrow_bands, [STRUCTURES["III"]]).noise
-    wrong = first.renewed(Plant(LINK, DAMPED), noise)
-    told = wrong.renewed(plant, noise)
+    wrong = first.with_reestimated_angle(Plant(LINK, DAMPED), noise)
+    told = wrong.with_reestimated_angle(plant, noise)
     assert loaded.tip_mass_kg == plant.tip_mass_kg
     rest, told_rest = (np.std(each.incoherent_rad[each.retained]) for each in (first, told))
     assert told_rest < 0.2 * rest

@@ -286,7 +286,7 @@ def test_a_size_for_an_order_that_was_only_assumed_is_not_told(record_result, pa
 
 def test_what_is_unexplained_makes_every_number_a_condition(record_result, retold, page_of):
     spoilt = headline_of_fit(
-        "VI", record_result.whole.fit, (1, 2, 3), unexplained="part is unexplained"
+        "VI", record_result.whole.fit, (1, 2, 3), unexplained_reason="part is unexplained"
     )
     told = page_of(spoilt).partition("the antenna's damping ratio would be ")[2]
     assert told

@@ -156,7 +156,7 @@ def test_of_modes_that_do_not_show_no_damping_is_told(careful, retold, as_text):
     none = headline_of_fit("VI", careful.whole.fit, ())
     assert "damping ratio is" in told
     assert "damping ratio" not in verdict(retold(careful, headline=none))
-    misread = careful.whole.headline.doubted(CONTRADICTED_FILE_REASON)
+    misread = careful.whole.headline.with_flag_on_all(CONTRADICTED_FILE_REASON)
     assert "damping ratio" not in verdict(retold(careful, headline=misread))
 
 

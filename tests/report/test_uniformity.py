@@ -36,7 +36,7 @@ def unexplained_losses(modal_result, retold):
     told = modal_result.whole.headline
     reason = "no beam explains the losses"
     test = replace(told.uniform_beam, status="refused", p_value=2e-18)
-    parameters = {name: each.flagged(reason) for name, each in told.parameters.items()}
+    parameters = {name: each.with_flag(reason) for name, each in told.parameters.items()}
     tolerant = replace(told.tolerant, basis="none")
     return retold(
         modal_result,
