@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from analysis.campaigns import CampaignResult
     from analysis.identify import RecordAnalysis, Selection, Setting
     from analysis.models import WelchSettings
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.record_part import PartOption
     from rigd.spectral import FrequencyResponse
@@ -187,7 +187,7 @@ def fit(
         )
     if method == "welch":
         from analysis.models import PAPER_TYPES, PAPER_WEIGHTINGS, WelchSettings
-        from analysis.paper import analyse
+        from analysis.paper.welch_analysis import analyse
         from analysis.suited import welch_settings
 
         settings = WelchSettings(

@@ -21,7 +21,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final
 
 from rigd.estimates import change_between, modes_from_json, unseen_modes
-from rigd.runtime import raise_on_signals, use_one_thread
+from rigd.runtime import raise_on_signals
+from rigd.runtime.background import use_one_thread
 from rigd.session import SessionError, Validity
 from rigd.session.quick_look import (
     QUICK_LOOK_VERSION,

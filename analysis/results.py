@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from analysis.identify.headline import Headline
     from analysis.identify.verdict import OrderVerdict, Verdict
     from analysis.models import WelchSettings
-    from analysis.paper import WelchAnalysis
+    from analysis.paper.welch_analysis import WelchAnalysis
     from analysis.record import Record
     from analysis.record_part import PartOption
     from analysis.structures import AddedStructure

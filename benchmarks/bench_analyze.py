@@ -20,7 +20,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 RUNS = 5
 LIMITS_S = {
@@ -46,7 +46,7 @@ from analysis.identify import BAND_HZ, Measurement
 mark("imports of the analysis")
 record = analysis.record.load_record(Path(sys.argv[1]))
 mark("reading")
-welch = analysis.paper.analyse(record, WelchSettings())
+welch = analysis.paper.welch_analysis.analyse(record, WelchSettings())
 mark("the paper's route")
 selection = analysis.identify.select(Measurement.from_record(record))
 mark("whole record")

@@ -22,7 +22,8 @@ from rigd.engine.workers import LIVE
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
 from rigd.runner.request import SessionOrder
-from rigd.runtime import StopRequest, use_one_thread
+from rigd.runtime import StopRequest
+from rigd.runtime.background import use_one_thread
 from rigd.session import read_session
 
 RATE_HZ = 1000.0

@@ -53,7 +53,7 @@ from analysis.exchange import write_session
 from analysis.models import WelchSettings
 from analysis.report import document, document_text
 from analysis.results import Routes, record_result
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 
 _STATED = {
     "id": "defect",

@@ -29,7 +29,7 @@ from independent_records import (
 )
 
 from analysis.campaigns import CampaignResult, campaign
-from rigd.runtime import use_one_thread
+from rigd.runtime.background import use_one_thread
 from rigd.testing import Signals, write_session
 
 BEAM = Truth(zeta=7.1e-5, alpha=0.996, gamma=5.5e-2, lambda_=0.594)

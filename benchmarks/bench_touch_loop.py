@@ -33,7 +33,8 @@ from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RigPreview
 from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionProgress
-from rigd.runtime import StopRequest, use_one_thread
+from rigd.runtime import StopRequest
+from rigd.runtime.background import use_one_thread
 from rigd.session import read_session
 from rigd.session.layout import Status
 

@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import Candidate, ModeEstimate
-    from analysis.paper import FittedModel, Indices
+    from analysis.paper.welch_analysis import FittedModel, Indices
     from rigd.beam import Damping, Plant
 
 

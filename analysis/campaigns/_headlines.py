@@ -5,8 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, Final
 
-from analysis.identify import headline_json, replace_by_modal_model
+from analysis.identify import headline_json
 from analysis.identify.headline import ConditionalEstimate, Estimates, ReportedLossFactor
+from analysis.identify.modal_headline import replace_by_modal_model
 from analysis.models import STRUCTURES
 from analysis.statistics import BIC_DECISIVE, student_t_quantile
 from rigd.beam import COEFFICIENT_OF, DAMPING_PARAMETERS

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Final, Literal
 
 from analysis.campaigns.pooling import freest_estimate
-from analysis.identify import effective_reason, order_status_with_geometry_tolerance
+from analysis.identify.modal_headline import effective_reason, order_status_with_geometry_tolerance
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION
 from analysis.identify.verdict import too_few_modes
 from analysis.models import ORDER_RANGE, STRUCTURES

@@ -11,7 +11,7 @@ import numpy as np
 from analysis.campaigns._estimates import RecordEstimate, WelchFit
 from analysis.campaigns._experiment import Experiment, SessionFailure, session_error_types
 from analysis.models import RECORD_BAND_HZ, WelchSettings
-from analysis.paper import Indices, fit_indices
+from analysis.paper.welch_analysis import Indices, fit_indices
 from analysis.results import RecordResult, whole_record, with_uniformity
 from rigd.session import Validity, sample_digests
 from rigd.spectral import FrequencyResponse
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
     from analysis.identify import Candidate, ModalEstimate, Setting
     from analysis.identify.verdict import Verdict
-    from analysis.paper import Peak
+    from analysis.paper.welch_analysis import Peak
     from analysis.results import WholeRecord
     from rigd.beam import Beam, Plant
 

@@ -19,7 +19,10 @@ from analysis.campaigns._orders import (
     tolerant_pooled_order,
 )
 from analysis.campaigns.pooling import freest_estimate
-from analysis.identify import loss_factors_with_geometry_tolerance, uniform_beam_refusal_reason
+from analysis.identify.modal_headline import (
+    loss_factors_with_geometry_tolerance,
+    uniform_beam_refusal_reason,
+)
 from analysis.identify.sentences import uniformity
 from analysis.statistics import BIC_DECISIVE, BIC_TIE
 from rigd.units import interval_text

@@ -27,7 +27,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any, Final, TypeVar
 
 from analysis.campaigns._experiment import CampaignError
-from rigd.runtime import SINGLE_THREADED, use_one_thread
+from rigd.runtime.background import SINGLE_THREADED, use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator, Mapping, Sequence

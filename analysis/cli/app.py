@@ -38,7 +38,8 @@ from analysis.cli.welch_options import (
 )
 from analysis.results import FIGURE_FORMATS, Routes
 from rigd.printable import readable_errors
-from rigd.runtime import raise_on_signals, use_one_thread
+from rigd.runtime import raise_on_signals
+from rigd.runtime.background import use_one_thread
 
 if TYPE_CHECKING:
     from collections.abc import Sequence

@@ -19,12 +19,6 @@ from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._fit import BAND_HZ
 from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts
-from analysis.identify._modal_headline import (
-    flag_contradicted_damping,
-    flag_modes_changed_by_drag,
-    order_verdict_with_geometry_tolerance,
-    replace_by_modal_model,
-)
 from analysis.identify._model_check import (
     MODES_WITHOUT_REDUNDANCY,
     ModelCheck,
@@ -45,6 +39,12 @@ from analysis.identify.headline import (
     Headline,
     headline,
     headline_of_fit,
+)
+from analysis.identify.modal_headline import (
+    flag_contradicted_damping,
+    flag_modes_changed_by_drag,
+    order_verdict_with_geometry_tolerance,
+    replace_by_modal_model,
 )
 from analysis.identify.profile_likelihood import MAX_IDENTIFIABLE_FRACTION, profile_both_orders
 from analysis.identify.sentences import experiments, headline_sentences

@@ -18,7 +18,7 @@ import numpy as np
 
 import rigd
 from analysis.models import FrequencyResponseModel
-from analysis.paper import fit_indices
+from analysis.paper.welch_analysis import fit_indices
 from analysis.report._shown_model import ShownModel
 from analysis.report.bands import loss_estimate, loss_factors, supported_band_hz
 from analysis.report.table import unreported_parameters
@@ -32,7 +32,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import DampingSize, RecordFit, StructureFit
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report.bands import LossFactor
     from analysis.results import RecordResult, WholeRecord

@@ -8,7 +8,7 @@ from statistics import fmean, stdev
 from typing import TYPE_CHECKING, Final
 
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
-from analysis.paper import LARGEST_FREQUENCY_SHIFT
+from analysis.paper.welch_analysis import LARGEST_FREQUENCY_SHIFT
 from analysis.report._document import response_fit_percent
 from analysis.report.table import (
     ABSENT_TEXT,
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from collections.abc import Collection, Mapping, Sequence
 
     from analysis.models import Structure
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.results import WholeRecord
 
 _AT_LIMIT_NOTE: Final = "* at the limit of the search range: not determined by the data."

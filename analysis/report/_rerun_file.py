@@ -44,7 +44,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
     from rerun import RecordingStream
 
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.report._signal_figures import TorqueInBand
     from analysis.results import RecordResult, WholeRecord
     from rigd.view.chart import Axis

@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.ticker import MaxNLocator
 
 from analysis.identify import Measurement, TorquePredictor
-from analysis.paper import band_limited, largest_oscillation_time_s, modelled_torque
+from analysis.paper.welch_analysis import band_limited, largest_oscillation_time_s, modelled_torque
 from analysis.report import _style as style
 from rigd.beam import undamped_frequencies_rad_s
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify import ModalModel
-    from analysis.paper import FittedModel, WelchAnalysis
+    from analysis.paper.welch_analysis import FittedModel, WelchAnalysis
     from analysis.record import Record
     from analysis.report._shown_model import ShownModel
     from rigd.beam import Plant

@@ -359,7 +359,7 @@ def _figures_with_data(campaign: CampaignResult) -> dict[str, tuple[Callable[[],
 
 def _draw_example_signals(campaign: CampaignResult) -> Figure:
     """Draw the first session's signals as an example, as the paper does."""
-    from analysis.paper import analyse
+    from analysis.paper.welch_analysis import analyse
     from analysis.record import load_record
     from analysis.report._signal_figures import paper_signals_figure as signals_figure
 

@@ -17,7 +17,7 @@ from pathlib import Path
 from rigd.check_rows import CheckResult, CheckRow, grade
 from rigd.engine.realtime import MEMORY_LOCKED, REFUSED, isolated_cores
 from rigd.profile import RealtimeSettings
-from rigd.runtime import OWN_PYTHON
+from rigd.runtime.background import OWN_PYTHON
 
 # Rights
 

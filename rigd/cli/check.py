@@ -178,7 +178,7 @@ def _run_bench(profile: "Profile", *, rate_hz: float, seconds: float, spin_us: f
 
     from rigd.bench import Bench
     from rigd.devices import ActuationTarget, actuation_target
-    from rigd.runtime import RigLock
+    from rigd.runtime.locks import RigLock
 
     moves_hardware = actuation_target(profile.rig) is ActuationTarget.HARDWARE
     console = Console(stderr=True)

@@ -23,8 +23,9 @@ from rigd.daemon.address import GROUP_FOLDER, SOCKET_SUFFIX, own_sockets, peer_a
 from rigd.daemon.client import UNKNOWN_STATE, await_end, stop_session
 from rigd.engine import IDLE_NAME, SESSION_NAME, supervisor_of_control
 from rigd.errors import RigdError
-from rigd.runtime import STOP_SIGNAL, holds_rig_lock, locked_rig
+from rigd.runtime import STOP_SIGNAL
 from rigd.runtime.addresses import file_name, folder_fault, known_folders
+from rigd.runtime.locks import holds_rig_lock, locked_rig
 from rigd.runtime.processes import RunningProcess, read_processes, send_signal
 
 _END_TIMEOUT_S: Final = 10.0

@@ -24,14 +24,13 @@ from rigd.engine._ring import shared_memory_fd
 from rigd.engine.messages import MessageReader, encode, is_ready
 from rigd.engine.workers import Worker
 from rigd.errors import FailureError
-from rigd.runtime import (
+from rigd.runtime import signal_when_orphaned, signals_blocked
+from rigd.runtime.background import (
     OWN_PYTHON,
     RUN_PROGRAM,
     SINGLE_THREADED,
     give_way,
     prefer_oom_kill,
-    signal_when_orphaned,
-    signals_blocked,
 )
 
 _WRITE_PATIENCE_S = 5.0

@@ -23,7 +23,8 @@ from rigd.runner._tip_slope import with_tip_slope
 from rigd.runner.quick_looks import QuickLook, QuickLookQueue
 from rigd.runner.request import load_rig, remaining_file_text
 from rigd.runner.session import SessionFailedError, SessionProgress, SessionResult
-from rigd.runtime import RigLock, StopRequest
+from rigd.runtime import StopRequest
+from rigd.runtime.locks import RigLock
 
 _QUICK_LOOK_MAX_RUN_TIME_S: Final = 10.0
 """Maximum run time in seconds of the last quick look after the sessions. Time in which it waits for

@@ -20,8 +20,9 @@ from rigd.profile import Profile
 from rigd.runner._process_group import ProcessGroup
 from rigd.runner._rig import Rig
 from rigd.runner.request import load_rig
-from rigd.runtime import RigLock, StopRequest
+from rigd.runtime import StopRequest
 from rigd.runtime.addresses import runtime_folder
+from rigd.runtime.locks import RigLock
 from rigd.safety.probe_estimate import ProbeEstimate, contradiction, doubts
 from rigd.safety.probing_move import PROBED_KEYS, ProbeEnd, plan_probe
 

@@ -19,7 +19,7 @@ from rigd.engine.processes import ChildError, ChildProcess
 from rigd.engine.workers import QUICK_LOOK
 from rigd.printable import printable
 from rigd.runner.session import SessionResult
-from rigd.runtime import processor_use
+from rigd.runtime.background import processor_use
 from rigd.session.quick_look import quick_look_path, read_quick_look
 
 _MAX_RUN_TIME_S: Final = 60.0

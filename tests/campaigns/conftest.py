@@ -19,7 +19,7 @@ from analysis.campaigns import (
 from analysis.campaigns._experiment import Experiment
 from analysis.identify import ModeEstimate
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper import Indices, Peak
+from analysis.paper.welch_analysis import Indices, Peak
 from rigd.beam import Beam, Damping, Plant
 from rigd.testing import PAPER_BEAM, chirp_signals, write_session
 

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import sentences
-from analysis.paper import Indices
+from analysis.paper.welch_analysis import Indices
 
 pytestmark = pytest.mark.fit
 

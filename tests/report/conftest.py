@@ -9,7 +9,7 @@ from analysis.identify import Candidate, Measurement, Selection, fit_record
 from analysis.identify.headline import headline_of_fit
 from analysis.identify.verdict import OrderVerdict, Verdict
 from analysis.models import STRUCTURES, WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report.record_report import write_report
 from analysis.results import RecordResult, WholeRecord

@@ -12,7 +12,7 @@ from typer.testing import CliRunner
 from analysis.cli.app import app
 from analysis.decimation import fast_length
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import write_rerun_file
 from analysis.report.folder import OutputError

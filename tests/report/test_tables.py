@@ -4,7 +4,7 @@ from dataclasses import replace
 import pytest
 
 from analysis.models import WelchSettings
-from analysis.paper import analyse
+from analysis.paper.welch_analysis import analyse
 from analysis.record import load_record
 from analysis.report import result_text, summary_table
 from analysis.report.table import (

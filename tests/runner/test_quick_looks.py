@@ -18,7 +18,7 @@ from rigd.engine.workers import QUICK_LOOK
 from rigd.runner import quick_looks
 from rigd.runner.quick_looks import QuickLook, QuickLookQueue
 from rigd.runner.session import SessionResult
-from rigd.runtime import processor_use
+from rigd.runtime.background import processor_use
 from rigd.session.quick_look import quick_look_path
 
 pytestmark = pytest.mark.process

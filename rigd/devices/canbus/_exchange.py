@@ -28,7 +28,7 @@ from rigd.devices.canbus.port import (
 from rigd.devices.contracts import DeviceError
 from rigd.devices.parameters import CanBus
 from rigd.devices.running_simulator import SimulatorAddress
-from rigd.runtime import LockFile, LockHeldError
+from rigd.runtime.locks import LockFile, LockHeldError
 
 # Pairing of replies
 

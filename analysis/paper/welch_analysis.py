@@ -129,7 +129,7 @@ def resonant_peaks(
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.paper import resonant_peaks
+    >>> from analysis.paper.welch_analysis import resonant_peaks
     >>> frequency_hz = np.linspace(1, 4, 301)
     >>> response = 1 / (2.5**2 - frequency_hz**2 + 0.05j * frequency_hz)
     >>> (peak,) = resonant_peaks(frequency_hz, response, np.array([2.5]))
@@ -178,7 +178,7 @@ def peak_deviation(measured_peak: Peak, model_peak: Peak) -> PeakDeviation:
 
     Examples
     --------
-    >>> from analysis.paper import Peak, peak_deviation
+    >>> from analysis.paper.welch_analysis import Peak, peak_deviation
     >>> found = peak_deviation(Peak(2.55, -10.0), Peak(2.56, -10.4))
     >>> print(f"{found.frequency_rad_s:.4f} rad/s, {found.magnitude_db:.1f} dB")
     0.0628 rad/s, 0.4 dB
@@ -279,7 +279,7 @@ def largest_oscillation_time_s(
     Examples
     --------
     >>> import numpy as np
-    >>> from analysis.paper import largest_oscillation_time_s
+    >>> from analysis.paper.welch_analysis import largest_oscillation_time_s
     >>> t = np.arange(10_000) / 1000
     >>> values = np.exp(-((t - 4) ** 2)) * np.sin(2 * np.pi * 5 * t)
     >>> print(f"{largest_oscillation_time_s(values, 1000, 5.0):.2f} s")
