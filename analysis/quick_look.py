@@ -143,9 +143,9 @@ def _fit_headline(record: Record) -> tuple[Headline | None, Validity, list[str]]
 
     The estimates are None if the record is not fitted.
     """
+    from analysis.applicability import record_band_hz
     from analysis.identify import Measurement, MeasurementError, fit_freest_alone
     from analysis.results import whole_record
-    from analysis.suited import record_band_hz
     from analysis.validity import record_validity, stated_validity
 
     sentences = []
@@ -221,8 +221,8 @@ def _response_document(record: Record) -> tuple[dict[str, Any] | None, dict[str,
     """
     import numpy as np
 
+    from analysis.applicability import welch_exclusion_reason
     from analysis.models import LARGEST_FRACTION_OF_RATE
-    from analysis.suited import welch_exclusion_reason
     from rigd.spectral import SpectralError, segmentation_of
     from rigd.sweep_response import FIRST_HZ, LAST_HZ, LOW_COHERENCE, response_decimation
 

@@ -138,7 +138,7 @@ class Touch:
 
 
 @dataclass(frozen=True, slots=True)
-class TouchedSession:
+class SessionTouches:
     """Touches found in one session.
 
     Attributes
@@ -187,7 +187,7 @@ class TouchAnalysis:
 
     def session(
         self, path: Path, on_step: Callable[[str], None] = lambda _: None
-    ) -> TouchedSession:
+    ) -> SessionTouches:
         """Return the touches of a session.
 
         Parameters
@@ -253,7 +253,7 @@ class TouchAnalysis:
             readable_texts(session.metadata, "keys of the metadata")[0],
             samples["angle_rad"], rate_hz, touch_model.plant,
         )  # fmt: skip
-        return TouchedSession(
+        return SessionTouches(
             path, tuple(touches), detection_source, touch_model, rate_hz,
             shear_coefficients is not None, tuple(warnings), validity,
         )  # fmt: skip

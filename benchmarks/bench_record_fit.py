@@ -33,7 +33,7 @@ from analysis.identify import (
     RecordFit,
     fit_record,
 )
-from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.parametrization import StepRule, Unknowns
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
 from rigd.beam import Beam, Damping, Plant, transfer
@@ -183,7 +183,7 @@ def tool_inertia_of_either_sign(
     unknowns = Unknowns.for_structure(analysis.fits[0].structure, Plant(LINK, Damping()), SETTINGS)
     weight = analysis.noise.weight
     objective = Objective(comparison, unknowns)
-    steps = Steps.for_unknowns(unknowns)
+    steps = StepRule.for_unknowns(unknowns)
     place = unknowns.names.index("tool_inertia_kg_m2")
     steps.lower[place] = -steps.upper[place]
     first, second = unknowns.omega_rad_s

@@ -79,7 +79,7 @@ def line(case: Case, found: CampaignResult) -> str:
         stds = f"{leading.between_std_in_own_stds:.0f} std"
         mixed = f"yes, {sizes or 'no groups'}, by {leading.quantity} ({stds})"
     worst = "" if alike.mixed else f"{worst_error(case, found):.1f}"
-    lost = len(found.failures) + len(found.lost_trials)
+    lost = len(found.failures) + len(found.failed_predictions)
     return (
         f"| {case.name} | {alone} | {mixed} | {least:.2g} of {len(alike.quantities)} "
         f"| {worst} | {lost} |"

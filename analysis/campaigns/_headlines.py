@@ -49,7 +49,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
         together. Without whole-record fits the list is empty.
     """
     documents = [dict(session.headline) for session in campaign.sessions if session.headline]
-    common_estimates, verdict = campaign_numbers(campaign), campaign.verdict
+    common_estimates, verdict = campaign_estimates(campaign), campaign.verdict
     if common_estimates is not None and verdict is not None:
         pooled_orders = (verdict.alpha, verdict.lambda_)
         named_findings = (
@@ -62,7 +62,7 @@ def headlines(campaign: CampaignResult) -> list[dict[str, Any]]:
     return documents
 
 
-def campaign_numbers(campaign: CampaignResult) -> Estimates | None:
+def campaign_estimates(campaign: CampaignResult) -> Estimates | None:
     """Collect the estimates from all sessions together, with flags on doubtful ones.
 
     Parameters

@@ -102,7 +102,7 @@ class Heterogeneity:
         return self.between_std_in_own_stds**2 / (1 + self.between_std_in_own_stds**2)
 
     @property
-    def of_rig(self) -> bool:
+    def is_of_rig(self) -> bool:
         """Whether the quantity is a property of the rig and not of the specimen."""
         return self.quantity in _RIG_PARAMETERS
 
@@ -133,7 +133,7 @@ class Homogeneity:
         Modes take precedence over parameters.
         """
         mixed_scatters = [
-            scatter for scatter in self.quantities if scatter.mixed and not scatter.of_rig
+            scatter for scatter in self.quantities if scatter.mixed and not scatter.is_of_rig
         ]
         mode_scatters = [
             scatter
@@ -152,7 +152,7 @@ class Homogeneity:
         return self.leading is not None
 
     @property
-    def one_specimen(self) -> bool:
+    def is_one_specimen(self) -> bool:
         """Whether neither the files nor the estimates contradict a single specimen."""
         return len(self.specimens) < _MIN_SESSIONS and not self.mixed
 

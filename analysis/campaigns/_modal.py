@@ -50,7 +50,7 @@ _RESIDUE_PHASE_INDEX: Final = MODE_CONSTANT_NAMES.index("residue_phase_rad")
 
 
 @dataclass(frozen=True, slots=True)
-class PooledModal(ModalEstimate):
+class PooledModalModel(ModalEstimate):
     """Modal model (frequencies, damping ratios, residues) pooled over all sessions.
 
     Attributes
@@ -110,7 +110,7 @@ class PooledModal(ModalEstimate):
         return tuple(pooled_modes)
 
 
-def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
+def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModalModel | None:
     """Pool the modal constants of the sessions; None unless two sessions show a common mode.
 
     Parameters
@@ -154,7 +154,7 @@ def pooled_modal(sessions: Sequence[SessionAnalysis]) -> PooledModal | None:
             stated_uniformities[-1],
             is_uniform=beam_test.status != "refused",
         )
-    return PooledModal(
+    return PooledModalModel(
         model=modal_estimate.model,
         numbers=common_modes,
         constants=modal_estimate.constants,

@@ -20,7 +20,7 @@ from typing import TYPE_CHECKING, Final, Literal
 
 import numpy as np
 
-from analysis.identify import SETTINGS, damping_size
+from analysis.identify import SETTINGS, pivot_loss_factor
 from analysis.identify.headline import ReportedLossFactor
 from analysis.models import STRUCTURES
 from analysis.statistics import chi_square_p_value, student_t_quantile
@@ -298,7 +298,7 @@ class PooledEstimate:
         plant_values = self.plant.parameters
         first_rad_s = float(undamped_frequencies_rad_s(self.plant.beam, 1)[0])
         for damping, coefficient, order in _DAMPING_PARAMETERS:
-            loss_factor = damping_size(
+            loss_factor = pivot_loss_factor(
                 coefficient, order, plant_values, parameter_names, self.covariance, first_rad_s
             )
             if loss_factor is not None:

@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._experiment import StatedSpecimen
     from analysis.campaigns._homogeneity import Heterogeneity, Homogeneity, SessionValues
     from analysis.campaigns._orders import PooledOrder
-    from analysis.campaigns._validation import LeftOutError, LostTrial
+    from analysis.campaigns._validation import FailedPrediction, LeaveOneOutResult
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
     from analysis.identify.headline import ReportedLossFactor
@@ -183,7 +183,7 @@ def _describe_different_specimens(
     other_labels = [
         label(scatter.quantity)[0]
         for scatter in homogeneity.quantities
-        if scatter.mixed and not scatter.of_rig and scatter is not leading_scatter
+        if scatter.mixed and not scatter.is_of_rig and scatter is not leading_scatter
     ]
     others_sentence = f" The same holds of {', '.join(other_labels)}." if other_labels else ""
     return [
@@ -301,7 +301,7 @@ def describe_orders(
     freest_fit: PooledEstimate,
     alpha: PooledOrder,
     lambda_: PooledOrder,
-    validation: Sequence[LeftOutError],
+    validation: Sequence[LeaveOneOutResult],
 ) -> str:
     """Describe the order of each damping, and the prediction errors of two structures.
 
@@ -313,7 +313,7 @@ def describe_orders(
         Pooled estimate of the freest structure.
     alpha, lambda_ : PooledOrder
         Orders of internal and external damping.
-    validation : sequence of LeftOutError
+    validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
     """
     conjunction = " and " if alpha.exact is None else "; "
@@ -593,7 +593,7 @@ def describe_welch_bias(
         Estimate of the reported structure.
     biases : sequence of WelchBias
         Biases of the Welch fits of all structures and weightings.
-    withheld : collection of str
+    withheld_orders : collection of str
         Orders that are not reported; their coefficients are not reported either.
     comparable : bool
         Whether the sessions are of one specimen and a uniform beam predicts its modes. If not,
@@ -718,7 +718,7 @@ def describe_scatter(pooled_estimate: PooledEstimate) -> str:
 
 
 def describe_prediction_errors(
-    pooled_estimate: PooledEstimate, validation: Sequence[LeftOutError], sessions: int
+    pooled_estimate: PooledEstimate, validation: Sequence[LeaveOneOutResult], sessions: int
 ) -> list[str]:
     """Describe how well a damping structure predicts a session from the other sessions.
 
@@ -726,7 +726,7 @@ def describe_prediction_errors(
     ----------
     pooled_estimate : PooledEstimate
         Estimate of the structure.
-    validation : sequence of LeftOutError
+    validation : sequence of LeaveOneOutResult
         Errors of sessions predicted from the others.
     sessions : int
         Number of sessions.
@@ -759,12 +759,12 @@ def describe_prediction_errors(
     ]
 
 
-def lost_trials(lost_sessions: Sequence[LostTrial], requested: int) -> list[str]:
+def failed_predictions(lost_sessions: Sequence[FailedPrediction], requested: int) -> list[str]:
     """List the sessions that could not be predicted from the others, with the reasons.
 
     Parameters
     ----------
-    lost_sessions : sequence of LostTrial
+    lost_sessions : sequence of FailedPrediction
         Sessions that were not predicted.
     requested : int
         Number of sessions that were to be predicted.

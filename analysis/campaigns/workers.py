@@ -44,7 +44,7 @@ fault."""
 
 
 @dataclass(frozen=True, slots=True)
-class LostTask:
+class FailedTask:
     """Result of a task whose worker process ended each time it ran the task.
 
     Attributes
@@ -86,7 +86,7 @@ class Workers:
     _max_in_progress: int | None = None
     """Most tasks in progress at once; the fewer, the fewer have to run again after a process
     ended."""
-    _lost_task_reason: str
+    _failed_task_reason: str
     """Reason reported for a task whose process ended twice."""
     _no_workers_message: str | None = None
     """Message of the error raised if no task survives; None: each lost task is reported by
@@ -100,7 +100,7 @@ class Workers:
         function: Callable[..., Result],
         arguments: Sequence[tuple[Any, ...]],
         on_done: Callable[[int], None] = _ignore_progress,
-    ) -> list[Result | LostTask]:
+    ) -> list[Result | FailedTask]:
         """Call a function with every tuple of arguments, in parallel.
 
         Parameters
@@ -115,20 +115,20 @@ class Workers:
         Returns
         -------
         list
-            Results in the order of the arguments; `LostTask` if a task's process ended each time.
+            Results in the order of the arguments; `FailedTask` if a task's process ended each time.
 
         Raises
         ------
         CampaignError
             There are no workers any more.
         """
-        task_results: dict[int, Result | LostTask] = {}
+        task_results: dict[int, Result | FailedTask] = {}
 
         def submit(task_index: int) -> Future[Result]:
             """Start a task by its index."""
             return self._executor.submit(function, *arguments[task_index])
 
-        def store_result(task_index: int, task_result: Result | LostTask) -> None:
+        def store_result(task_index: int, task_result: Result | FailedTask) -> None:
             """Store the result of a task and report its completion."""
             task_results[task_index] = task_result
             on_done(task_index)
@@ -140,10 +140,10 @@ class Workers:
                 for task_index in interrupted_tasks:
                     self._replace_executor(alone=True)
                     if self._run_until_process_ends(deque([task_index]), submit, store_result):
-                        store_result(task_index, LostTask(self._lost_task_reason))
+                        store_result(task_index, FailedTask(self._failed_task_reason))
             if interrupted_tasks:
                 any_finished = any(
-                    not isinstance(task_result, LostTask) for task_result in task_results.values()
+                    not isinstance(task_result, FailedTask) for task_result in task_results.values()
                 )
                 if (
                     self._no_workers_message
@@ -242,7 +242,7 @@ def process_pool(jobs: int) -> Iterator[Workers]:
 class _LocalWorkers(Workers):
     """Worker processes of a pool on this machine."""
 
-    _lost_task_reason = "its worker process ended by itself twice, most often for lack of memory"
+    _failed_task_reason = "its worker process ended by itself twice, most often for lack of memory"
     _no_workers_message = (
         "The worker processes ended by themselves, most often for lack of memory: use fewer "
         "--jobs. A script that calls campaign() must do so under if __name__ == '__main__':"
@@ -368,7 +368,7 @@ class _DaskWorkers(Workers):
     The scheduler repeats a task at another worker if its worker ended, and drops it after several.
     """
 
-    _lost_task_reason = (
+    _failed_task_reason = (
         "every Dask worker that ran it ended by itself, most often for lack of memory; see the "
         "workers' logs"
     )

@@ -107,7 +107,7 @@ def campaign_command(
     if outputs.json_to_stdout:
         json_content = campaign_document(campaign_result, with_paper=with_paper)
         print(document_text(json_content, ascii_only=True), end="")  # noqa: T201 - the requested output
-    return 1 if campaign_result.failures or campaign_result.lost_trials else 0
+    return 1 if campaign_result.failures or campaign_result.failed_predictions else 0
 
 
 def _analyse_and_write(
@@ -144,7 +144,7 @@ def _analyse_and_write(
     report_error = partial(print_readable, progress.console)
     for session_failure in campaign_result.failures:
         report_error(f"Error: {session_failure.message}")
-    for lost_trial in campaign_result.lost_trials:
+    for lost_trial in campaign_result.failed_predictions:
         report_error(
             f"Error: {lost_trial.path} is not predicted from the others: {lost_trial.reason}"
         )

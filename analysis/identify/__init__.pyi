@@ -14,8 +14,8 @@ from ._candidate import Candidate as Candidate
 from ._comparison import Comparison as Comparison
 from ._data import Measurement as Measurement
 from ._data import MeasurementError as MeasurementError
-from ._estimates import DampingSize as DampingSize
 from ._estimates import ModeEstimate as ModeEstimate
+from ._estimates import PivotLossFactor as PivotLossFactor
 from ._finding import Finding as Finding
 from ._fit import BAND_HZ as BAND_HZ
 from ._fit import fit_record as fit_record
@@ -37,4 +37,4 @@ from ._settings import SETTINGS as SETTINGS
 from ._settings import Setting as Setting
 from ._structure_fit import StructureFit as StructureFit
 from ._structure_fit import fit_structure as fit_structure
-from ._uncertainty import damping_size as damping_size
+from ._uncertainty import pivot_loss_factor as pivot_loss_factor

@@ -12,7 +12,7 @@ _RINGING_P_VALUE: Final = 1e-4
 
 
 @dataclass(frozen=True, slots=True)
-class DampingSize:
+class PivotLossFactor:
     """Loss factor of one damping at its pivot frequency, where it depends least on the order.
 
     Attributes

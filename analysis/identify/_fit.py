@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from analysis.identify._data import Measurement
-    from analysis.identify._problem import Projected
+    from analysis.identify._problem import ProjectedResidual
     from analysis.identify._settings import Setting
     from analysis.identify.noise import NoiseSpectrum
     from analysis.models import Structure
@@ -353,7 +353,7 @@ def summary(objective: Objective, x: NDArray[np.float64], noise: NoiseSpectrum) 
 def _compared_jacobian(
     objective: Objective,
     x: NDArray[np.float64],
-    projected: Projected,
+    projected: ProjectedResidual,
     noise: NoiseSpectrum,
 ) -> NDArray[np.complex128]:
     """Return the whitened derivatives of the measured torque's spectrum by the unknowns, (k, K).

@@ -31,7 +31,7 @@ from analysis.identify._modal_model import (
 )
 from analysis.identify.noise import noise_power_with_peaks, smooth_power
 from analysis.identify.residual_tests import input_relation, whiteness
-from analysis.optimizer import Box, NormalEquations, RecentValues, descend
+from analysis.optimizer import ConstantBounds, NormalEquations, RecentValues, descend
 from rigd.beam import Pole
 
 if TYPE_CHECKING:
@@ -337,7 +337,7 @@ class _ModalSearch:
         minimum = descend(
             self.problem().normal_equations,
             self.x,
-            Box(lower_bounds.ravel(), upper_bounds.ravel()),
+            ConstantBounds(lower_bounds.ravel(), upper_bounds.ravel()),
             relative_tolerance=_RELATIVE_TOLERANCE,
             max_evaluations=60,
         )

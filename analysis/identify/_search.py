@@ -19,7 +19,7 @@ from analysis.identify._hum import find_hum_near_modes, resonance_half_width_hz
 from analysis.identify._problem import Objective
 from analysis.identify.free_decay import count_decay_spectra
 from analysis.identify.noise import Hum, NoiseSpectrum, estimate_noise
-from analysis.identify.parametrization import Steps
+from analysis.identify.parametrization import StepRule
 from analysis.optimizer import NormalEquations, descend
 from analysis.paper import representative_points
 from rigd.beam import ResponseGrid
@@ -221,7 +221,7 @@ def coarse_minima(
     start_vectors: Iterable[NDArray[np.float64]],
 ) -> list[Minimum]:
     """Return the distinct minima of the coarse cost from some start vectors, the lowest first."""
-    descent_steps = Steps.for_unknowns(unknowns)
+    descent_steps = StepRule.for_unknowns(unknowns)
     minima = [
         descend(
             lambda x: coarse_response.normal_equations(unknowns, x),
@@ -295,7 +295,7 @@ class Descent:
         hopeless : tuple of int and float, optional
             Number of evaluations and cost above which `descend` gives up.
         """
-        descent_steps = Steps.for_unknowns(self.objective.unknowns)
+        descent_steps = StepRule.for_unknowns(self.objective.unknowns)
         objective, minimum = self.objective.minimum(
             self.x, noise.weight, descent_steps, relative_tolerance=tolerance, hopeless=hopeless
         )

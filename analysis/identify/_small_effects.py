@@ -16,7 +16,7 @@ import numpy as np
 
 from analysis.identify._finding import Finding
 from analysis.identify._nonlinear import NonlinearForceSpectra, NonlinearTerm
-from analysis.identify._time_varying import UNIT_PLAY_RAD, play_spectrum
+from analysis.identify._time_varying import UNIT_BACKLASH_RAD, backlash_spectrum
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -142,7 +142,7 @@ def _possible_effects(
     yield (
         "play",
         "Backlash between encoder and beam",
-        play_spectrum(comparison, plant) / UNIT_PLAY_RAD,
+        backlash_spectrum(comparison, plant) / UNIT_BACKLASH_RAD,
     )
     yield "friction", "Dry friction between sensor and beam", _friction_spectrum(comparison)
     model_torque_nm = comparison.prediction.torque(modal.model)[0]

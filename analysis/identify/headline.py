@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
     from analysis.identify._candidate import Candidate
     from analysis.identify._candidates import CandidateSet
-    from analysis.identify._estimates import DampingSize, ModeEstimate
+    from analysis.identify._estimates import ModeEstimate, PivotLossFactor
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify._result import RecordFit
@@ -95,7 +95,7 @@ class ReportedLossFactor:
     omega_rad_s : float or None
         Pivot frequency in rad/s. None if the order is fixed: `size` is the coefficient then.
     size : Estimate
-        Value of the loss factor, as in `DampingSize`.
+        Value of the loss factor, as in `PivotLossFactor`.
     """
 
     damping: Damping
@@ -523,7 +523,7 @@ def _reported_parameter(
 
 
 def reported_loss_factor(
-    damping: Damping, damping_size: DampingSize, invalid_reason: str | None
+    damping: Damping, pivot_loss_factor: PivotLossFactor, invalid_reason: str | None
 ) -> ReportedLossFactor:
     """Return the loss factor of a damping as reported, with 95 % interval and flag.
 
@@ -531,21 +531,21 @@ def reported_loss_factor(
     ----------
     damping : str
         "internal" or "external".
-    damping_size : DampingSize
+    pivot_loss_factor : PivotLossFactor
         Estimated loss factor.
     invalid_reason : str or None
         Flag of the reported value. None if it is valid.
     """
     # A loss factor is positive and uncertain by a factor, so its interval is logarithmic.
-    relative_half_width = NORMAL_95 * damping_size.std / damping_size.value
+    relative_half_width = NORMAL_95 * pivot_loss_factor.std / pivot_loss_factor.value
     interval_95 = (
-        damping_size.value * math.exp(-relative_half_width),
-        damping_size.value * math.exp(min(relative_half_width, 300.0)),
+        pivot_loss_factor.value * math.exp(-relative_half_width),
+        pivot_loss_factor.value * math.exp(min(relative_half_width, 300.0)),
     )
     return ReportedLossFactor(
         damping,
-        damping_size.omega_rad_s,
-        Estimate(damping_size.value, damping_size.std, interval_95, invalid_reason),
+        pivot_loss_factor.omega_rad_s,
+        Estimate(pivot_loss_factor.value, pivot_loss_factor.std, interval_95, invalid_reason),
     )
 
 

@@ -11,7 +11,7 @@ from __future__ import annotations
 from dataclasses import replace
 from typing import TYPE_CHECKING, Final, TypeVar
 
-from analysis.identify._uncertainty import damping_size
+from analysis.identify._uncertainty import pivot_loss_factor
 from analysis.identify.headline import (
     DAMPING_PARAMETER_NAMES,
     Estimates,
@@ -342,7 +342,7 @@ def loss_factors_with_geometry_tolerance(
     parameter_values = dict(estimate.values)
     reported_factors = []
     for damping, (coefficient_name, order_name) in DAMPING_PARAMETER_NAMES.items():
-        loss_factor = damping_size(
+        loss_factor = pivot_loss_factor(
             coefficient_name,
             order_name,
             parameter_values,

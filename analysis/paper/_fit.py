@@ -44,7 +44,7 @@ from analysis.models import (
     weighting_name,
     weights,
 )
-from analysis.optimizer import Box, Minimum, NormalEquations, RecentValues, descend
+from analysis.optimizer import ConstantBounds, Minimum, NormalEquations, RecentValues, descend
 from rigd.beam import DAMPING_PARAMETERS, Beam, Damping
 
 # Fits
@@ -261,7 +261,7 @@ def _fit(
 ) -> FrfFit:
     """Fit a damping structure: descents on few points, then refinement on all points."""
     unknowns = DampingUnknowns.for_beam(structure, whole_grid.model.beam)
-    bounds = Box(*unknowns.bounds)
+    bounds = ConstantBounds(*unknowns.bounds)
     thinned_problem, whole_problem = (
         _FrfProblem(unknowns, few_points_grid),
         _FrfProblem(unknowns, whole_grid),
@@ -301,7 +301,7 @@ def _fit(
     )
 
 
-def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: Box) -> Minimum:
+def _refine(frf_problem: _FrfProblem, rough_minimum: Minimum, bounds: ConstantBounds) -> Minimum:
     """Continue a less accurate descent to the minimum."""
     return descend(
         frf_problem.normal_equations,

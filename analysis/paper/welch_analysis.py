@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 
 @dataclass(frozen=True, slots=True)
-class Indices:
+class FitIndices:
     """Fit indices: distances between a measured and a modelled frequency response.
 
     Attributes
@@ -58,7 +58,7 @@ def fit_indices(
     omega_rad_s: NDArray[np.float64],
     measured_response: NDArray[np.complex128],
     model_response: NDArray[np.complex128],
-) -> Indices:
+) -> FitIndices:
     """Return the fit indices of a model (Eqs. 28 to 30), from the deviations ``|G - Ĝ|``.
 
     Parameters
@@ -75,7 +75,7 @@ def fit_indices(
     """
     absolute_deviation = np.abs(measured_response - model_response)
     squared_deviation = absolute_deviation**2
-    return Indices(
+    return FitIndices(
         mse=float(squared_deviation.mean()),
         wmse=float(weights(omega_rad_s, "omega") @ squared_deviation),
         md=float(absolute_deviation.max()),
@@ -316,7 +316,7 @@ class FittedModel:
         The fit.
     response : ndarray of complex, shape (n,)
         Response of the model, with the tool inertia, at the fitted bins, in N·m/rad.
-    indices : Indices
+    indices : FitIndices
         Distances from the measured response.
     modes : tuple of Mode
         Modes of the beam without tool inertia, from its poles; empty if strong damping leaves a
@@ -332,7 +332,7 @@ class FittedModel:
 
     fit: FrfFit
     response: NDArray[np.complex128]
-    indices: Indices
+    indices: FitIndices
     modes: tuple[Mode, ...]
     followed: tuple[bool, ...]
     peaks: tuple[Peak | None, ...]

@@ -120,7 +120,7 @@ def pooled_figure(campaign: CampaignResult) -> Figure:
 
     estimate = campaign.headline
     assert estimate is not None
-    unsupported_orders = campaign.verdict.withheld if campaign.verdict else ()
+    unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else ()
     not_reported = unreported_parameters(STRUCTURES[estimate.structure], unsupported_orders)
     subtitle_note = (
         f"  ·  {NOT_REPORTED_MARK} not reported: not supported by the data" if not_reported else ""
@@ -472,10 +472,10 @@ def validation_figure(campaign: CampaignResult) -> Figure:
 
 def _predicted_sessions_text(campaign: CampaignResult) -> str:
     """Return how many of the sessions were predicted, as text."""
-    completed_trials = campaign.trials - len(campaign.lost_trials)
+    completed_trials = campaign.trials - len(campaign.failed_predictions)
     return (
         f"{completed_trials} of {campaign.trials}"
-        if campaign.lost_trials
+        if campaign.failed_predictions
         else str(completed_trials)
     )
 

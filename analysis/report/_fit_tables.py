@@ -43,7 +43,7 @@ def structures_table(whole_record: WholeRecord) -> Table:
     Fractional orders that the data do not determine are marked.
     """
     lowest_cost = min(fit.cost for fit in whole_record.fits.values())
-    unsupported_orders = whole_record.unsupported
+    unsupported_orders = whole_record.unsupported_orders
     delta_bic = whole_record.delta_bic
     status_by_name = dict(whole_record.headline.structures)
     table_rows: list[tuple[Entry, ...]] = []

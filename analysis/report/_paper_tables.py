@@ -309,7 +309,7 @@ def indices_table(campaign: CampaignResult) -> Table:
 
 def bias_table(campaign: CampaignResult) -> Table:
     """Return the table of the Welch fits' bias relative to pooled whole-record estimates."""
-    unsupported_orders = campaign.verdict.withheld if campaign.verdict else frozenset[str]()
+    unsupported_orders = campaign.verdict.withheld_orders if campaign.verdict else frozenset[str]()
     table_rows: list[Row] = []
     for fit_bias in campaign.welch_biases:
         not_reported = unreported_parameters(STRUCTURES[fit_bias.structure], unsupported_orders)

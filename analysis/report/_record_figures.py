@@ -576,7 +576,7 @@ def illustrations(whole_record: WholeRecord) -> Iterator[Illustration]:
             loss_model,
             (float(measured_frf.frequency_hz[0]), highest_hz),
             supported_band_hz(whole_record),
-            unsupported_orders=whole_record.withheld,
+            unsupported_orders=whole_record.withheld_orders,
             flagged_modes=flagged_modes,
         ),
         _loss_description(whole_record, has_curves=loss_model is not None),
@@ -614,7 +614,7 @@ def _loss_description(whole_record: WholeRecord, *, has_curves: bool) -> str:
         f"Loss factor over frequency with 95 % bands, {_describe_curve_model(whole_record)}; "
         f"points: {points_text}. "
     )
-    if whole_record.withheld:
+    if whole_record.withheld_orders:
         return curves_text + (
             "It is of all damping, not split into internal and external, and drawn between the "
             "modes that show only: elsewhere (grey), and for either part, an order that the data "

@@ -169,7 +169,7 @@ def parameters_table(whole_record: WholeRecord) -> Table:
     states why.
     """
     headline = whole_record.headline
-    parameters_with_scales = whole_record.combined
+    parameters_with_scales = whole_record.parameters_with_scales
     scale_columns = (
         Column("", "combined_std"),
         Column("with scales: from", "combined_low_95"),

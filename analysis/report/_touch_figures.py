@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-    from analysis.touch import Touch, TouchedSession
+    from analysis.touch import SessionTouches, Touch
     from rigd.touch import TouchEstimate
 
 _SHOWN_BEFORE_MS: Final = 25.0
@@ -33,7 +33,7 @@ _SESSION_COLORS: Final = (style.BLUE, style.VERMILION, style.GREEN, style.PURPLE
 """Colours of the sessions in the map."""
 
 
-def touch_illustrations(sessions: Sequence[TouchedSession]) -> Iterator[Illustration]:
+def touch_illustrations(sessions: Sequence[SessionTouches]) -> Iterator[Illustration]:
     """Yield a map of all contacts and a figure of each touch; call it within `figure_style`."""
     if any(touch.point_m is not None for session in sessions for touch in session.touches):
         yield Illustration(
@@ -144,23 +144,18 @@ def _draw_innovations(
 # Map
 
 
-def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
+def map_figure(session_touches: Sequence[SessionTouches]) -> Figure:
     """Draw the points of contact of all sessions as seen from above.
 
     Parameters
     ----------
-    touched_sessions : sequence of TouchedSession
+    session_touches : sequence of SessionTouches
         Sessions with at least one contact point.
     """
     contact_points_m = np.array(
-        [
-            t.point_m
-            for session in touched_sessions
-            for t in session.touches
-            if t.point_m is not None
-        ]
+        [t.point_m for session in session_touches for t in session.touches if t.point_m is not None]
     )
-    length_m = max(session.model.plant.beam.length_m for session in touched_sessions)
+    length_m = max(session.model.plant.beam.length_m for session in session_touches)
     spread_m = float(np.ptp(contact_points_m, axis=0).max())
     has_detail = spread_m < _MAX_DETAIL_FRACTION * length_m
     figure = style.new_figure(9.0, 4.6)
@@ -168,17 +163,17 @@ def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
         1, 1 + has_detail, left=0.075, right=0.97, top=0.93, bottom=0.1, wspace=0.22
     )
     overview_axes = figure.add_subplot(grid[0])
-    _draw_map(overview_axes, touched_sessions, with_numbers=not has_detail)
+    _draw_map(overview_axes, session_touches, with_numbers=not has_detail)
     overview_axes.plot(0.0, 0.0, "o", color=style.INK, markersize=7)
     overview_axes.set_aspect("equal", adjustable="datalim")
     overview_axes.set_title("Seen from above")
     if has_detail:
         detail_axes = figure.add_subplot(grid[1])
-        _draw_map(detail_axes, touched_sessions, with_numbers=True)
+        _draw_map(detail_axes, session_touches, with_numbers=True)
         interval_ends_m = np.concatenate(
             [
                 t.ends_m
-                for session in touched_sessions
+                for session in session_touches
                 for t in session.touches
                 if t.ends_m is not None
             ]
@@ -193,12 +188,12 @@ def map_figure(touched_sessions: Sequence[TouchedSession]) -> Figure:
     for axes in figure.axes:
         axes.set_xlabel("x (m)", labelpad=1)
     overview_axes.set_ylabel("y (m)")
-    if len(touched_sessions) > 1:
+    if len(session_touches) > 1:
         overview_axes.legend(loc="upper left", fontsize=7.5)
     return figure
 
 
-def _draw_map(axes: Axes, sessions: Sequence[TouchedSession], *, with_numbers: bool) -> None:
+def _draw_map(axes: Axes, sessions: Sequence[SessionTouches], *, with_numbers: bool) -> None:
     """Draw the contact points of sessions with their intervals, and the bent antenna."""
     for session_number, session in enumerate(sessions):
         session_color = _SESSION_COLORS[session_number % len(_SESSION_COLORS)]

@@ -50,7 +50,7 @@ def supported_band_hz(whole_record: WholeRecord) -> Band | None:
     tuple of float or None
         First and last frequency in Hz; None if there is no such band.
     """
-    if not whole_record.withheld:
+    if not whole_record.withheld_orders:
         return excited_band_hz(whole_record.record, whole_record.analysis)
     mode_frequencies_hz = [
         mode.frequency_hz.value for mode in whole_record.headline.modes if mode.shown

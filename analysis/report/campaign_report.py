@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Final
 from rich.console import Group
 from rich.text import Text
 
-from analysis.campaigns.sentences import lost_trials, specimens
+from analysis.campaigns.sentences import failed_predictions, specimens
 from analysis.identify.headline import EXACTLY_UNIFORM_CONDITION
 from analysis.report._campaign_document import campaign_document
 from analysis.report._campaign_tables import all_tables, main_tables, sessions_table, shown_tables
@@ -59,7 +59,7 @@ def _verdict_sentences(campaign: CampaignResult) -> tuple[str, ...]:
     return (
         *specimens(campaign.homogeneity),
         *([_NO_VERDICT_SENTENCE] if has_estimates else []),
-        *lost_trials(campaign.lost_trials, campaign.trials),
+        *failed_predictions(campaign.failed_predictions, campaign.trials),
     )
 
 
@@ -169,7 +169,7 @@ def _warning_texts(campaign: CampaignResult) -> list[str]:
         *(f"Left out: {failure.message}" for failure in campaign.failures),
         *(
             f"Not predicted from the others: {lost_trial.path}: {lost_trial.reason}"
-            for lost_trial in campaign.lost_trials
+            for lost_trial in campaign.failed_predictions
         ),
         *(
             f"{session.name}: {warning_text}"

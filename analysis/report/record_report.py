@@ -342,7 +342,7 @@ def report_tables(result: RecordResult) -> tuple[Table, tuple[Table, ...], tuple
         ()
         if welch_analysis is None
         else (
-            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported),
+            fit_tables.welch_fits_table(welch_analysis, whole_record.unsupported_orders),
             fit_tables.peaks_table(welch_analysis),
         )
     )

@@ -8,11 +8,11 @@ import pytest
 from cases import further
 from processes import eventually
 
+from analysis.applicability import record_band_hz
 from analysis.identify import Measurement, fit_freest_alone, select
 from analysis.online import OnlineEstimate, OnlineEstimator
 from analysis.record import load_record
 from analysis.results import whole_record
-from analysis.suited import record_band_hz
 from rigd.beam import Beam, Damping, Plant, clamped_free_eigenvalues, modes
 from rigd.runner.fit_process import EstimateRequest, EstimationError, EstimatorThread
 from rigd.session import read_session
@@ -276,7 +276,7 @@ def test_damping_that_does_not_show_counts_as_uncertainty(session):
     estimate = fed_with(signals, session).estimate()
     told = estimate.headline
     assert told.name == "IV"
-    assert "gamma" in estimate.predicting.determined
+    assert "gamma" in estimate.predictive_fit.determined
     mode, alone = told.modes[0].damping_ratio, told.fit.modes[0]
     assert mode.std > 3 * alone.damping_ratio_std
     true = 0.5 * (2e-4 * 16.1 + 5e-4 / (0.05206 * 16.1))

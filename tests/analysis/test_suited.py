@@ -9,17 +9,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from analysis.identify import Comparison, Measurement
-from analysis.models import WelchSettings
-from analysis.paper import FrequencyResponseError, SettingsError
-from analysis.record import load_record
-from analysis.suited import (
+from analysis.applicability import (
     record_band_hz,
     remarks,
     welch_analysis,
     welch_exclusion_reason,
     welch_settings,
 )
+from analysis.identify import Comparison, Measurement
+from analysis.models import WelchSettings
+from analysis.paper import FrequencyResponseError, SettingsError
+from analysis.record import load_record
 
 
 @pytest.fixture

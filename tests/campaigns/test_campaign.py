@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from analysis.campaigns import CampaignError, SessionTask, analyse_session, campaign
-from analysis.campaigns._validation import left_out_errors, models_without_session
+from analysis.campaigns._validation import leave_one_out_results, models_without_session
 from analysis.identify import BAND_HZ
 from analysis.models import FrequencyResponseModel
 from analysis.record import load_record
@@ -98,7 +98,7 @@ def test_error_of_a_forecast_is_that_of_the_torque(done, short_sessions, truth):
     true = replace(forecast, plant=Plant(link, damping), own=None)
     light = replace(link, density_kg_per_m=1e-12, bending_stiffness_n_m2=1e-12)
     none = replace(true, plant=Plant(light, damping))
-    exact, nothing = left_out_errors(short_sessions[0], [true, none], BAND_HZ)
+    exact, nothing = leave_one_out_results(short_sessions[0], [true, none], BAND_HZ)
     best = min(e.own_error for e in found.validation if e.own_error is not None)
     assert exact.error == pytest.approx(best, rel=0.1)
     assert nothing.error == pytest.approx(1.0, abs=1e-6)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from analysis.campaigns import sentences
-from analysis.paper.welch_analysis import Indices
+from analysis.paper.welch_analysis import FitIndices
 
 pytestmark = pytest.mark.fit
 
@@ -29,7 +29,7 @@ def make_sessions(make_fit, make_estimate, make_session):
             sessions.append(
                 make_session(
                     f"{number}.mcap",
-                    fits=[replace(fit, indices=Indices(0.5, 0.5, 0.5))],
+                    fits=[replace(fit, indices=FitIndices(0.5, 0.5, 0.5))],
                     estimates=[make_estimate("VI", values, covariance, names, cost=cost)],
                 )
             )

@@ -5,7 +5,7 @@ import pytest
 from cases import further
 
 from analysis.identify import SETTINGS, Comparison, MeasurementError, Objective, fit_record
-from analysis.identify.parametrization import Steps, Unknowns
+from analysis.identify.parametrization import StepRule, Unknowns
 from analysis.identify.residual_tests import whiteness
 from analysis.models import STRUCTURES
 from analysis.optimizer import descend
@@ -264,7 +264,7 @@ def test_no_descent_from_elsewhere_ends_lower(sessions, name):
         found = descend(
             lambda x: objective.normal_equations(x, weight),
             unknowns.start(np.array(sizes)),
-            Steps.for_unknowns(unknowns),
+            StepRule.for_unknowns(unknowns),
             relative_tolerance=1e-10,
             max_evaluations=40,
         )

@@ -4,7 +4,7 @@ import pytest
 from analysis.identify import SETTINGS, Comparison, Objective
 from analysis.identify._refit import Refit
 from analysis.identify.noise import NoiseSpectrum
-from analysis.identify.parametrization import VANISHING_LOSS, Steps, Unknowns
+from analysis.identify.parametrization import VANISHING_LOSS, StepRule, Unknowns
 from analysis.models import STRUCTURES
 from rigd.beam import Beam, Damping, Plant
 
@@ -71,7 +71,7 @@ def test_torques_are_put_anew_where_a_descent_has_ended(
     _, found = Objective(comparison, unknowns).minimum(
         unknowns.start(np.array([-4.6, 1.1, -3.0, 0.8])),
         np.ones(comparison.frequency_hz.size),
-        Steps.for_unknowns(unknowns, VANISHING_LOSS),
+        StepRule.for_unknowns(unknowns, VANISHING_LOSS),
         relative_tolerance=1e-8,
         max_evaluations=most,
         hopeless=hopeless,

@@ -80,8 +80,8 @@ def test_of_absent_damping_no_fit_tells_the_order(record_result, retold):
     known = SimpleNamespace(order="alpha", status="fractional", value=0.8, interval=(0.7, 0.9))
     verdict = replace(record_result.whole.verdict, alpha=known, lambda_=absent)
     result = retold(record_result, verdict=verdict)
-    assert not result.whole.withheld
-    assert result.unsupported == {"lambda"}
+    assert not result.whole.withheld_orders
+    assert result.unsupported_orders == {"lambda"}
     _modes, (*_others, structures), (welch, _peaks) = report_tables(result)
     for table in (structures, welch):
         assert any(NOT_REPORTED_MARK in note and "λ" in note for note in table.notes)
