@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from analysis.campaigns._homogeneity import Homogeneity
     from analysis.campaigns.pooling import PooledEstimate, PooledParameter
-    from analysis.identify.profile_likelihood import SessionOrder
+    from analysis.identify.profile_likelihood import OrderName
     from analysis.identify.uniform_beam import TolerantEstimate
     from analysis.identify.verdict import Verdict
 
@@ -66,7 +66,7 @@ class PooledOrder:
         of different specimens and do not all determine it.
     """
 
-    order: SessionOrder
+    order: OrderName
     status: PooledStatus
     value: float | None
     interval: tuple[float, float] | None
@@ -88,7 +88,7 @@ class PooledOrder:
 
 
 def pooled_order(
-    order: SessionOrder,
+    order: OrderName,
     ranked_estimates: Sequence[PooledEstimate],
     verdicts: Sequence[Verdict],
     homogeneity: Homogeneity,
@@ -203,7 +203,7 @@ def rival_estimates(
 
 
 def _status_and_reason(
-    order: SessionOrder,
+    order: OrderName,
     ranked_estimates: Sequence[PooledEstimate],
     freest_fit: PooledEstimate,
     verdicts: Sequence[Verdict],
@@ -245,7 +245,7 @@ def _status_and_reason(
     return ("fractional" if is_one_excluded else "open"), None
 
 
-def _has_order_one(estimate: PooledEstimate, order: SessionOrder) -> bool:
+def _has_order_one(estimate: PooledEstimate, order: OrderName) -> bool:
     """Return whether a damping structure has this kind of damping with a fixed order of 1."""
     return STRUCTURES[estimate.structure].fixed.get(order) == 1.0
 

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._estimates import RecordEstimate
     from analysis.campaigns._session import SessionAnalysis
     from analysis.identify.headline import Damping
-    from analysis.identify.profile_likelihood import SessionOrder
+    from analysis.identify.profile_likelihood import OrderName
 
 
 # Random effects
@@ -208,7 +208,7 @@ def _pool_quantity(estimates: Sequence[tuple[float, float]]) -> tuple[float, flo
 
 _MIN_SESSIONS: Final = 2
 """Smallest number of sessions that can be pooled."""
-_DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, SessionOrder], ...]] = (
+_DAMPING_PARAMETERS: Final[tuple[tuple[Damping, str, OrderName], ...]] = (
     ("internal", "zeta", "alpha"),
     ("external", "gamma", "lambda"),
 )

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from analysis.campaigns._welch_bias import ParameterBias, WelchBias
     from analysis.campaigns.pooling import PooledEstimate, PooledMode
     from analysis.identify.headline import ReportedLossFactor
-    from analysis.identify.profile_likelihood import SessionOrder
+    from analysis.identify.profile_likelihood import OrderName
 
 
 # Names and numbers
@@ -283,7 +283,7 @@ def _list_files(file_names: Sequence[str]) -> str:
 
 _DAMPING_OF_ORDER: Final = {"alpha": "internal damping", "lambda": "external damping"}
 """Name of the damping whose order each parameter is."""
-_ORDER_NAMES: Final[tuple[SessionOrder, ...]] = ("alpha", "lambda")
+_ORDER_NAMES: Final[tuple[OrderName, ...]] = ("alpha", "lambda")
 """Names of the orders of internal and of external damping."""
 _CLASSICAL_STRUCTURE: Final = "III"
 """Structure with internal and external damping, both of order 1."""

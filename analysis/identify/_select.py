@@ -71,7 +71,7 @@ if TYPE_CHECKING:
     from analysis.identify._modal_fit import ModalFit
     from analysis.identify._result import RecordFit
     from analysis.identify._settings import Setting
-    from analysis.identify.profile_likelihood import SessionOrder
+    from analysis.identify.profile_likelihood import OrderName
     from analysis.identify.uniform_beam import UniformBeamTest
 
 
@@ -123,7 +123,7 @@ class Selection:
         return self.headline.fit
 
     @property
-    def determined(self) -> frozenset[SessionOrder]:
+    def determined(self) -> frozenset[OrderName]:
         """Return the damping orders, "alpha" or "lambda", that the record determines precisely."""
         order_verdicts = (self.verdict.alpha, self.verdict.lambda_)
         return frozenset(

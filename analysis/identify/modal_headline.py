@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from analysis.identify._explanations import CauseFit
     from analysis.identify._modal_model import ModalEstimate
     from analysis.identify.headline import Headline, ReportedLossFactor, StructureStatus
-    from analysis.identify.profile_likelihood import LikelihoodProfile, SessionOrder
+    from analysis.identify.profile_likelihood import LikelihoodProfile, OrderName
     from analysis.identify.uniform_beam import TolerantEstimate, UniformBeamTest
 
 NOT_UNIFORM: Final = (
@@ -280,17 +280,24 @@ def _reason_undetermined(estimate: TolerantEstimate, parameter_name: str) -> str
     if estimate.basis == "none":
         return NO_ORDER
     for order_name, coefficient_name in COEFFICIENT_OF.items():
-        if parameter_name in (order_name, coefficient_name) and not identifiable(
+        if parameter_name in (order_name, coefficient_name) and not is_order_identifiable(
             estimate, order_name
         ):
             return ORDER_NOT_DETERMINED_REASON
     return None
 
 
-def identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
+def is_order_identifiable(estimate: TolerantEstimate, order_name: str) -> bool:
     """Return whether the modes determine a damping order.
 
     Its 95 % interval must be narrower than a quarter of its range, and its damping significant.
+
+    Parameters
+    ----------
+    estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
+    order_name : str
+        "alpha" or "lambda".
     """
     order_low, order_high = estimate.interval[order_name]
     widest_interval = MAX_IDENTIFIABLE_FRACTION * (ORDER_RANGE[1] - ORDER_RANGE[0])
@@ -373,7 +380,7 @@ def effective_reason(parameter_name: str, *, refused: bool) -> str | None:
 
 
 def order_verdict_with_geometry_tolerance(
-    order: SessionOrder,
+    order: OrderName,
     estimate: TolerantEstimate,
     profile: LikelihoodProfile,
     doubt: str | None,
@@ -382,9 +389,19 @@ def order_verdict_with_geometry_tolerance(
 ) -> OrderVerdict:
     """Return the verdict on one damping order, with a tolerance of the geometry.
 
-    `profile` is the likelihood profile of the order on an exactly uniform beam, `doubt` the reason
-    against every number of the record. With `refused`, a uniform beam does not predict the modes:
-    the cause may have a loss of its own, so no order is excluded.
+    Parameters
+    ----------
+    order : str
+        "alpha" or "lambda".
+    estimate : TolerantEstimate
+        Parameters of a beam with a tolerance of the geometry.
+    profile : LikelihoodProfile
+        Likelihood profile of the order on an exactly uniform beam.
+    doubt : str or None
+        Reason against every number of the record.
+    refused : bool
+        Whether a uniform beam does not predict the modes. No order is excluded then, because the
+        cause may have a loss of its own.
     """
     status, reason = order_status_with_geometry_tolerance(order, estimate, refused=refused)
     if reason is not None:
@@ -397,7 +414,7 @@ def order_verdict_with_geometry_tolerance(
 
 
 def order_status_with_geometry_tolerance(
-    order: SessionOrder, estimate: TolerantEstimate, *, refused: bool
+    order: OrderName, estimate: TolerantEstimate, *, refused: bool
 ) -> tuple[Status, str | None]:
     """Return the status of one damping order, and the reason if it is not identifiable.
 
@@ -412,7 +429,7 @@ def order_status_with_geometry_tolerance(
     """
     if estimate.basis == "none":
         return "not identifiable", NO_ORDER
-    if not identifiable(estimate, order):
+    if not is_order_identifiable(estimate, order):
         return "not identifiable", ORDER_NOT_DETERMINED_REASON
     order_low, order_high = estimate.interval[order]
     if order_low <= 1 <= order_high:

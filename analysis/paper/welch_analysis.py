@@ -100,7 +100,9 @@ class PeakDeviation:
     """Deviation of one session's resonant peak from a model's: a term of Eqs. (31) and (32)."""
 
     frequency_rad_s: float
+    """Magnitude of the difference in frequency, in rad/s."""
     magnitude_db: float
+    """Magnitude of the difference in magnitude, in dB."""
 
 
 def resonant_peaks(
