@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Final
 
 from analysis.identify._diagnostics import findings, setting_findings, unexplained_residual_finding
 from analysis.identify._finding import with_doubt
-from analysis.identify._knock import impact_findings
+from analysis.identify._impacts import impact_findings
 from analysis.identify._record_model import test_residual
 from analysis.identify._time_varying import is_single_change_established
 from analysis.identify._visible_modes import visible_modes
@@ -160,7 +160,7 @@ class ModelCheck:
             only_harmonics_remain=self.residual_tests.is_noise,
         )
         impacts = impact_findings(
-            self.candidate_set.comparison.measurement.knocks,
+            self.candidate_set.comparison.measurement.impacts,
             explained=self.residual_tests.is_noise,
         )
         if self.residual_tests.is_noise:

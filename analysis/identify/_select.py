@@ -18,7 +18,7 @@ from analysis.identify._drag import (
 from analysis.identify._explanations import explanations
 from analysis.identify._explanations import finding as explanation_finding
 from analysis.identify._fit import BAND_HZ
-from analysis.identify._knock import MAX_IMPACTS, add_known_impact, find_impacts
+from analysis.identify._impacts import MAX_IMPACTS, add_known_impact, find_impacts
 from analysis.identify._model_check import (
     MODES_WITHOUT_REDUNDANCY,
     ModelCheck,
@@ -257,7 +257,7 @@ def _select_with_known_impacts(
         measurement, fixed, band_hz
     )
     model = fit_linear_model(linear_candidates, band_hz)
-    if not (model.explains_record or measurement.knocks):
+    if not (model.explains_record or measurement.impacts):
         for impact in find_impacts(linear_candidates, obvious=True):
             impact_assessment = _select_with_known_impacts(
                 add_known_impact(measurement, impact), fixed, band_hz, None

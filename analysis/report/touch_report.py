@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
     from analysis.report._page import Facts
     from analysis.touch import SessionTouches, Touch
-    from rigd.touch import Estimated
+    from rigd.touch import TouchQuantity
 
 _MAX_INTERVAL_ASYMMETRY = 0.25
 """Asymmetry of an interval above which its ends are shown instead of value and half-width.
@@ -78,7 +78,7 @@ def _touch_row(session: SessionTouches, touch: Touch) -> dict[str, Entry]:
         if estimate is None
         else _KIND_DESCRIPTIONS.get(estimate.kind, estimate.kind),
     }
-    estimate_offsets: dict[str, tuple[Estimated | None, float]] = {}
+    estimate_offsets: dict[str, tuple[TouchQuantity | None, float]] = {}
     if estimate is not None:
         estimate_offsets = {
             "time_s": (estimate.time_s, touch.start_s),
@@ -93,7 +93,7 @@ def _touch_row(session: SessionTouches, touch: Touch) -> dict[str, Entry]:
     return row
 
 
-def _estimate_cell(estimated_quantity: Estimated | None, display_offset: float) -> Cell:
+def _estimate_cell(estimated_quantity: TouchQuantity | None, display_offset: float) -> Cell:
     """Return the cell of an estimate with its 95 % interval; a dash without an estimate."""
     if estimated_quantity is None:
         return number_cell(None)

@@ -12,7 +12,7 @@ from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
 from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
-from rigd.devices.cia402._standing import (
+from rigd.devices.cia402._switch_off import (
     command_off,
     describe_remaining_torque,
     wait_for,

@@ -90,7 +90,7 @@ class DetectedImpact:
 
     Attributes
     ----------
-    knock : RecordedImpact
+    impact : RecordedImpact
         Time, poles and amplitudes of the impact.
     explained_fraction : float
         Fraction of the unexplained cost that the impact explains.
@@ -99,7 +99,7 @@ class DetectedImpact:
         the record once the impact is removed.
     """
 
-    knock: RecordedImpact
+    impact: RecordedImpact
     explained_fraction: float
     residual_power_ratio: float
 
@@ -128,7 +128,7 @@ def find_impacts(candidate_set: CandidateSet, *, obvious: bool = False) -> Itera
     also uses the residual of fits to either half. With `obvious` it is limited to obvious
     impacts.
     """
-    if candidate_set.misread or len(candidate_set.comparison.measurement.knocks) == MAX_IMPACTS:
+    if candidate_set.misread or len(candidate_set.comparison.measurement.impacts) == MAX_IMPACTS:
         return
     found_in_whole = find_impact(candidate_set)
     if found_in_whole is not None and found_in_whole.is_obvious:
@@ -198,7 +198,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
             # The ringing after the impact may be far louder than the response to the reference,
             # and the part that follows the reference then identifies no beam.
             reference_rad=None,
-            knocks=(),
+            impacts=(),
         )
         try:
             analysis = fit_record(half_measurement, (_FREEST_STRUCTURE,), band_hz=band_hz)
@@ -229,7 +229,7 @@ def _fits_to_halves(candidate_set: CandidateSet) -> Iterator[Refit]:
 
 def add_known_impact(measurement: Measurement, impact: DetectedImpact) -> Measurement:
     """Return the measurement with a detected impact added to its known impacts."""
-    return replace(measurement, knocks=(*measurement.knocks, impact.knock))
+    return replace(measurement, impacts=(*measurement.impacts, impact.impact))
 
 
 def impact_findings(impacts: tuple[RecordedImpact, ...], *, explained: bool) -> Iterator[Finding]:
@@ -459,7 +459,7 @@ def _impact_with_amplitudes(refit: Refit, first_sample: int, end_sample: int) ->
         ) : first_sample
     ]
     return DetectedImpact(
-        knock=replace(
+        impact=replace(
             impact,
             sizes=tuple(amplitudes.tolist()),
             largest_nm=float(np.abs(torque_nm[first_second_samples]).max()),
