@@ -146,7 +146,7 @@ def start_sessions(
         if not detach:
             client.ask("watch")
         with _Interrupts.caught() as interrupts:
-            reply = client.ask_unless(lambda: interrupts.count > 0, "start", **request)
+            reply = client.request_unless_stopped(lambda: interrupts.count > 0, "start", **request)
             if reply["reply"] == "stop":
                 typer.echo("Stopped before the session began.", err=True)
                 raise typer.Exit(EXIT_INTERRUPTED)

@@ -333,7 +333,7 @@ def remaining_file_text(session_path: Path | None) -> str:
     session_path
         Path of the session file, or None if no file was begun.
     """
-    from rigd.session import holds_samples
+    from rigd.session import may_contain_samples
 
     if session_path is None:
         return "It has no file."
@@ -348,7 +348,7 @@ def remaining_file_text(session_path: Path | None) -> str:
             if file_exists
             else f"There is no {session_path.name} in {session_path.parent}."
         )
-    if not holds_samples(part_file_path):
+    if not may_contain_samples(part_file_path):
         return f"Nothing was recorded; {part_file_path} holds no sample and can be removed."
     old_path_text, new_path_text = (
         shlex.quote(str(part_path(file_path)))

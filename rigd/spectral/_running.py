@@ -97,7 +97,7 @@ class RunningResponse:
         check_segmentation(self._length, used_segmentation.overlap, self._nfft)
         bin_count = bins_up_to(last_hz, self._nfft, rate_hz)
         self._frequency_hz = np.arange(bin_count) * rate_hz / self._nfft
-        self._transform = LowBins(self._length, self._nfft, bin_count)
+        self._transform = LowBinTransform(self._length, self._nfft, bin_count)
         self._segments = Segments(
             3,
             self._length,
@@ -393,7 +393,7 @@ def bins_up_to(last_hz: float, transform_length: int, rate_hz: float) -> int:
     return 1 + min(transform_length // 2, int(last_hz * transform_length / rate_hz * (1 + 1e-9)))
 
 
-class LowBins:
+class LowBinTransform:
     """Fourier transform in the lowest bins: ``np.fft.rfft(x, nfft)[:bins]`` except for rounding.
 
     With ``2 n k = n² + k² − (k − n)²`` the sum over n becomes a convolution with a chirp, which two

@@ -14,7 +14,7 @@ from typing import Any, Final
 from aiohttp import web
 
 from rigd.beam import Beam, Damping
-from rigd.daemon.client import DaemonGoneError, RefusedByDaemonError, stop_session
+from rigd.daemon.client import DaemonUnreachableError, RefusedByDaemonError, stop_session
 from rigd.engine.messages import PageAddress, ProcessFailed
 from rigd.engine.processes import SupervisorConnection
 from rigd.excitation import KINDS, excitation_options
@@ -173,7 +173,7 @@ class OperatorPageServer:
                 daemon_reply = await self._stop()
             else:
                 daemon_reply = await self._link.send_request(request_object)
-        except (DaemonError, DaemonGoneError) as error:
+        except (DaemonError, DaemonUnreachableError) as error:
             return refusal_response(503, str(error))
         except (BusyError, RefusedByDaemonError) as error:
             return refusal_response(409, str(error))
@@ -194,7 +194,7 @@ class OperatorPageServer:
         """Stop the daemon's session, and return the reply or the reason of a failure."""
         try:
             return await self._stop()
-        except (DaemonGoneError, RefusedByDaemonError) as error:
+        except (DaemonUnreachableError, RefusedByDaemonError) as error:
             return {"ok": False, "error": str(error)}
         finally:
             self._link.request_status()
@@ -307,10 +307,10 @@ class OperatorPageServer:
             recorded_specimens = await self._library.specimens()
             self._specimens = list(dict.fromkeys([*recorded_specimens, *specimen_files()]))
 
-    async def _find_last(self, specimen: str, but: str) -> None:
-        """Send the response of the specimen's last session, except `but`, to the open pages."""
+    async def _find_last(self, specimen: str, excluded_session: str) -> None:
+        """Send the response of the last session of a specimen, except one, to the open pages."""
         with suppress(OSError, ValueError):
-            self._last_response = await self._library.last_response(specimen, but)
+            self._last_response = await self._library.last_response(specimen, excluded_session)
             self.pages.send(self._last_response)
 
 

@@ -11,7 +11,13 @@ from math import tau
 from rigd.devices.canbus.port import CanPort
 from rigd.devices.cia402 import objects
 from rigd.devices.cia402._assignments import parse_assignment
-from rigd.devices.cia402._sdo import EVERY_BIT, SdoAccess, SdoRefusal, ValueNotStored, show_value
+from rigd.devices.cia402._sdo import (
+    EVERY_BIT,
+    SdoAbortError,
+    SdoAccess,
+    ValueNotStoredError,
+    show_value,
+)
 from rigd.devices.cia402._switch_off import (
     command_off,
     describe_remaining_torque,
@@ -262,7 +268,7 @@ class _DriveConfiguration:
             required = self._required_values[row.index, row.sub]
         try:
             present_value = self._sdo.read_or_none(row.index, row.sub)
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             if not (refusal.is_write_only and row.index in MAY_BE_WRITE_ONLY):
                 raise
             self._sdo.write(row.index, row.sub, required)
@@ -271,10 +277,10 @@ class _DriveConfiguration:
             return True
         try:
             self._sdo.configure(row.index, row.sub, required)
-        except ValueNotStored as not_stored:
+        except ValueNotStoredError as not_stored:
             present_value = not_stored.got
             readback_error: DeviceError = not_stored
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             if present_value is None and refusal.is_absent:
                 self._record_missing_object(row)
                 return False
@@ -388,7 +394,7 @@ class _DriveConfiguration:
         try:
             numerator = self._sdo.read_or_none(index, 1)
             denominator = self._sdo.read_or_none(index, 2)
-        except SdoRefusal:
+        except SdoAbortError:
             return None
         if (
             numerator is None
@@ -552,7 +558,7 @@ class _DriveConfiguration:
                     sdo.configure(index, sub, 0)
             try:
                 sdo.configure(index, 1, required_value)
-            except SdoRefusal as refusal:
+            except SdoAbortError as refusal:
                 if refusal.is_absent or refusal.code == _READ_ONLY_ABORT:
                     return False
                 raise
@@ -611,12 +617,12 @@ class _DriveConfiguration:
         pdo_name = "RPDO1" if communication == objects.RPDO_COMMUNICATION else "TPDO1"
         try:
             sdo.configure(mapping_index, 0, 0)
-        except SdoRefusal as refusal:
+        except SdoAbortError as refusal:
             raise DeviceError(f"{refusal} {requirement(mapping_index).sentence}") from None
         for sub, mapping_entry in enumerate(entries, 1):
             try:
                 sdo.configure(mapping_index, sub, mapping_entry)
-            except SdoRefusal as refusal:
+            except SdoAbortError as refusal:
                 row = requirement(mapping_entry >> 16)
                 if refusal.is_absent:
                     raise DeviceError(f"{self._name}: {row.refusal_reason()}") from None
@@ -652,6 +658,6 @@ def _disable_unused_pdos(sdo: SdoAccess, communication: int) -> None:
             sdo.configure(communication + pdo_offset, 1, cob_id | objects.PDO_DISABLED)
 
 
-def _abort_meaning(refusal: SdoRefusal) -> str:
+def _abort_meaning(refusal: SdoAbortError) -> str:
     """Return the short meaning of the abort code of a refusal."""
     return _ABORT_MEANINGS.get(refusal.code, "see CiA 301")

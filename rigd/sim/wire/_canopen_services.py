@@ -23,7 +23,7 @@ _HISTORY_LENGTH = 8
 """Number of error codes in the error history."""
 
 
-class Emergencies:
+class EmergencyMessages:
     """Emergency messages of a node: active errors and error history.
 
     Parameters

@@ -54,7 +54,7 @@ class Abort(Exception):
 
 
 @dataclass(frozen=True, slots=True)
-class Description:
+class EntryDescription:
     """Description of one sub-index in a device's file."""
 
     kind: str
@@ -141,7 +141,7 @@ class Entry:
         self.default_text = self.text
         self._set_range(self.low, self.high)
 
-    def adopt_description(self, description: Description, default: int | None) -> None:
+    def adopt_description(self, description: EntryDescription, default: int | None) -> None:
         """Adopt type, access, mapping and limits from a device's file.
 
         The functions that read, check and react to the value remain.
@@ -274,7 +274,7 @@ class ObjectDictionary:
             self.add(index, sub_entry, sub)
 
     def adopt_file_entries(
-        self, file: Mapping[tuple[int, int], Description], unchanged_indices: Container[int]
+        self, file: Mapping[tuple[int, int], EntryDescription], unchanged_indices: Container[int]
     ) -> None:
         """Restrict the dictionary to the entries of a device's file, and adopt their descriptions.
 
@@ -557,7 +557,7 @@ class DeviceFile:
 
     name: str
     """Name of the file."""
-    entries: Mapping[tuple[int, int], Description]
+    entries: Mapping[tuple[int, int], EntryDescription]
     """Descriptions by index and sub-index."""
 
     def present_offsets(self, first_index: int, last_index: int) -> Iterator[int]:
@@ -610,13 +610,13 @@ def read_device(path: Path, node_id: int) -> DeviceFile:
     return DeviceFile(path.name, descriptions)
 
 
-def _to_description(eds_entry: EdsEntry) -> Description:
+def _to_description(eds_entry: EdsEntry) -> EntryDescription:
     """Convert the entry of an EDS file to a description for a simulated node."""
     sdo_access = _SDO_ACCESS.get(eds_entry.access, eds_entry.access)
     type_letter = _TYPE_LETTERS.get(eds_entry.data_type)
     if type_letter is None:
         size_bytes = _TIME_TYPE_LENGTHS.get(eds_entry.data_type) or (eds_entry.bits or 0) // 8
-        return Description(
+        return EntryDescription(
             "s",
             sdo_access,
             "",
@@ -643,7 +643,7 @@ def _to_description(eds_entry: EdsEntry) -> Description:
     default_value = (
         None if eds_entry.default is None else _to_type_range(eds_entry.default, type_letter)
     )
-    return Description(
+    return EntryDescription(
         type_letter, sdo_access, pdo_directions, default_value, lower_limit, upper_limit
     )
 
