@@ -21,7 +21,7 @@ from rigd.engine.shared_state import Phase
 from rigd.engine.workers import LIVE
 from rigd.excitation import make_excitation
 from rigd.profile import load_profile
-from rigd.runner.request import OrderName
+from rigd.runner.request import SessionOrder
 from rigd.runtime import StopRequest
 from rigd.runtime.background import use_one_thread
 from rigd.session import read_session
@@ -89,7 +89,7 @@ def run(seconds: float, *, live: bool) -> tuple[LoopMeasurement, str, float]:
         tempfile.TemporaryDirectory(prefix="rigd-bench-") as folder,
         loops.connected_rig(profile, live=live) as (rig, group),
     ):
-        order = OrderName(profile, excitation, Path(folder) / "bench.mcap")
+        order = SessionOrder(profile, excitation, Path(folder) / "bench.mcap")
         meters, stop = [], StopRequest()
         if live:
             rig.show(order, stop)

@@ -31,7 +31,7 @@ from rigd.excitation import Excitation, touch
 from rigd.profile import Profile, load_profile
 from rigd.runner._touch_search import touch_search
 from rigd.runner.planning import RigPreview
-from rigd.runner.request import OrderName
+from rigd.runner.request import SessionOrder
 from rigd.runner.session import SessionProgress
 from rigd.runtime import StopRequest
 from rigd.runtime.background import use_one_thread
@@ -67,7 +67,7 @@ def session(name: str, profile: Profile, excitation: Excitation) -> LoopMeasurem
         def watch(progress: SessionProgress, _: object) -> None:
             meter.sample(progress.phase)
 
-        order = OrderName(
+        order = SessionOrder(
             profile,
             excitation,
             Path(folder) / "bench.mcap",

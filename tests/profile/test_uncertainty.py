@@ -9,7 +9,7 @@ import pytest
 
 from rigd.engine.messages import DevicesConnected
 from rigd.profile import load_profile
-from rigd.runner.request import Order, file_header
+from rigd.runner.request import SessionOrder, file_header
 
 SHIPPED = ("sim", "antenna_can", "antenna_serial")
 
@@ -45,7 +45,7 @@ def header_of(loaded):
     def header_of(text, **parameters):
         excitation = SimpleNamespace(kind="chirp", parameters=parameters, segments={})
         connected = DevicesConnected(simulated=True, calibration={}, realtime={}, drive={})
-        order = Order(loaded(text), excitation, Path("a.mcap"))
+        order = SessionOrder(loaded(text), excitation, Path("a.mcap"))
         return file_header(order, connected, {})
 
     return header_of
