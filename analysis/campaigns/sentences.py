@@ -581,7 +581,7 @@ def describe_order(pooled_order: PooledOrder) -> str:
 def describe_welch_bias(
     freest: PooledEstimate,
     biases: Sequence[WelchBias],
-    withheld: Collection[str],
+    withheld_orders: Collection[str],
     *,
     comparable: bool,
 ) -> list[str]:
@@ -605,7 +605,7 @@ def describe_welch_bias(
     best_model_biases = [
         bias for bias in type_biases if (bias.structure, bias.weighting) in PAPER_BEST_MODELS
     ]
-    omitted_parameters = {*withheld, *(COEFFICIENT_OF[order] for order in withheld)}
+    omitted_parameters = {*withheld_orders, *(COEFFICIENT_OF[order] for order in withheld_orders)}
     sentences = []
     for bias in best_model_biases or type_biases[:1]:
         significant_parameters = [
